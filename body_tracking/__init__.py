@@ -1,0 +1,6 @@
+"""Live multi-sensor body tracking: skeletons in, joint angles with an honest uncertainty out.
+
+The library (every module but ``nodes`` and ``messages``) knows neither rclpy nor any message package.
+"""
+
+__version__ = "0.1.0"

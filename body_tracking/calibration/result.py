@@ -1,0 +1,120 @@
+"""What a calibration says of one sensor: where it stands, and how its clock runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ClockModel:
+    """A sensor's clock against the reference sensor's clock.
+
+    ``sensor = reference + offset + drift * (reference - anchor)``; two sensors that count from their own start have an
+    offset of seconds and a drift of some tens of parts per million.
+
+    Attributes:
+        offset_ns: sensor clock minus reference clock at the anchor, nanoseconds.
+        drift_ppm: by how much the sensor's clock runs fast, parts per million.
+        anchor_ns: reference time at which the offset holds exactly.
+    """
+
+    offset_ns: int = 0
+    drift_ppm: float = 0.0
+    anchor_ns: int = 0
+
+    def to_sensor(self, reference_ns: int) -> int:
+        """Reference time to the sensor's time."""
+        return reference_ns + self.offset_ns + round(self.drift_ppm * 1e-6 * (reference_ns - self.anchor_ns))
+
+    def to_reference(self, sensor_ns: int) -> int:
+        """The sensor's time to reference time; the inverse of :meth:`to_sensor` to a nanosecond."""
+        elapsed = (sensor_ns - self.offset_ns - self.anchor_ns) / (1.0 + self.drift_ppm * 1e-6)
+        return self.anchor_ns + round(elapsed)
+
+    @property
+    def offset(self) -> float:
+        """The offset in seconds."""
+        return self.offset_ns / NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorPose:
+    """The pose of ``<sensor>_optical_frame`` (x right, y down, z forward) in ``world``.
+
+    Attributes:
+        sensor: its name.
+        translation: (3,) metres.
+        quat_xyzw: (4,) unit quaternion that takes optical coordinates into ``world``.
+        valid_from_ns: reference time from which it is to be used; 0 for always.
+    """
+
+    sensor: str
+    translation: FloatArray
+    quat_xyzw: FloatArray
+    valid_from_ns: int = 0
+
+    @property
+    def rotation(self) -> FloatArray:
+        """(3, 3) rotation matrix, optical to world."""
+        matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()
+        return matrix
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """(..., 3) optical coordinates into world."""
+        return points @ self.rotation.T + self.translation
+
+
+def level_pose(sensor: str, height: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> SensorPose:
+    """The reference sensor's pose in ``world``: z up, x horizontal along its view.
+
+    Args:
+        sensor: its name.
+        height: metres of the sensor above the world's origin.
+        pitch: radians by which it looks down.
+        roll: radians by which it is turned clockwise about its view, seen from behind it.
+    """
+    optical_to_level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    tilt = Rotation.from_euler("YX", [pitch, roll])
+    rotation = tilt * Rotation.from_matrix(optical_to_level)
+    return SensorPose(sensor, np.array([0.0, 0.0, height]), rotation.as_quat())
+
+
+@dataclass(frozen=True, slots=True)
+class SensorQuality:
+    """How well one sensor's calibration is known.
+
+    Attributes:
+        residual: median distance between what both sensors say of the same joint, metres; NaN before any overlap.
+        rotation_stddev: radians; infinity while unknown.
+        translation_stddev: metres at the place where the person was; infinity while unknown.
+        clock_stddev: seconds; infinity while unknown.
+        frames: pairs of frames that the estimate stands on.
+    """
+
+    residual: float = float("nan")
+    rotation_stddev: float = float("inf")
+    translation_stddev: float = float("inf")
+    clock_stddev: float = float("inf")
+    frames: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """Poses, clocks and quality of every calibrated sensor, the reference among them.
+
+    Attributes:
+        reference: the sensor that defines ``world`` and its time.
+        poses: a pose per calibrated sensor; a sensor that is not calibrated yet is absent.
+        clocks: the clock of each sensor in ``poses``.
+        quality: likewise.
+    """
+
+    reference: str
+    poses: dict[str, SensorPose]
+    clocks: dict[str, ClockModel]
+    quality: dict[str, SensorQuality]

@@ -1,0 +1,8 @@
+"""The base class of every error that the package raises on purpose.
+
+A module owns its own exception, derived from this one; whoever only wants a clear line to show catches the base.
+"""
+
+
+class BodyTrackingError(Exception):
+    """Something outside the program is wrong; the text says what and where, in one line."""

@@ -1,0 +1,377 @@
+"""The only bridge between the library's types and ROS messages.
+
+The same functions serve two families of message classes: those of a ROS install (``rclpy``, live nodes) and those of
+``rosbags`` (recordings, read and written with no ROS at all). Reading needs only attributes, which both have; writing
+goes through a :class:`MessageTypes`, which knows how its family is constructed.
+"""
+
+from __future__ import annotations
+
+import array
+import importlib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+CLOCK = "rosgraph_msgs/msg/Clock"
+
+# sensor_msgs/PointField datatypes
+_UINT8, _UINT16, _FLOAT32 = 2, 4, 7
+_NUMPY = {_UINT8: "u1", _UINT16: "<u2", _FLOAT32: "<f4"}
+
+_BASE_FIELDS = (
+    ("x", _FLOAT32),
+    ("y", _FLOAT32),
+    ("z", _FLOAT32),
+    ("joint", _UINT8),
+    ("tracking_state", _UINT8),
+    ("body", _UINT16),
+)
+_COVARIANCE_FIELDS = tuple((name, _FLOAT32) for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
+_VELOCITY_FIELDS = tuple((name, _FLOAT32) for name in ("vx", "vy", "vz"))
+
+_UPPER = np.triu_indices(3)
+MAX_BODIES = 64
+"""More bodies than this in one message is taken for a malformed one."""
+
+
+class MessageError(BodyTrackingError):
+    """A message does not have the layout that its topic promises."""
+
+
+class MessageTypes(Protocol):
+    """A family of message classes."""
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        """A message of type ``pkg/msg/Name`` with every one of its fields given."""
+
+    def octets(self, data: bytes) -> Any:
+        """The value of a ``uint8[]`` field."""
+
+    def floats(self, values: FloatArray) -> Any:
+        """The value of a ``float64[]`` field."""
+
+
+class RosMessages:
+    """The classes that ``rclpy`` publishes."""
+
+    @staticmethod
+    @cache
+    def _class(type_name: str) -> Any:
+        package, _, name = type_name.split("/")
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        return self._class(type_name)(**fields)
+
+    def octets(self, data: bytes) -> Any:
+        return array.array("B", data)
+
+    def floats(self, values: FloatArray) -> Any:
+        return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+class BagMessages:
+    """The classes of a ``rosbags`` type store."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        return self._types[type_name](**fields)
+
+    def octets(self, data: bytes) -> Any:
+        return np.frombuffer(data, dtype=np.uint8)
+
+    def floats(self, values: FloatArray) -> Any:
+        return np.asarray(values, dtype=np.float64)
+
+
+# --- stamps and headers
+
+
+def to_nanoseconds(stamp: Any) -> int:
+    """``builtin_interfaces/Time`` to integer nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def to_time(nanoseconds: int, types: MessageTypes) -> Any:
+    """Integer nanoseconds to ``builtin_interfaces/Time``."""
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return types.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+
+def to_header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
+    """``std_msgs/Header``."""
+    return types.make("std_msgs/msg/Header", stamp=to_time(stamp_ns, types), frame_id=frame_id)
+
+
+# --- skeletons
+
+
+@cache
+def _cloud_layout(with_covariance: bool, with_velocity: bool) -> tuple[np.dtype[Any], tuple[tuple[str, int], ...]]:
+    """The packed record and its fields; 16, 40 or 52 bytes a point."""
+    fields = (
+        _BASE_FIELDS + (_COVARIANCE_FIELDS if with_covariance else ()) + (_VELOCITY_FIELDS if with_velocity else ())
+    )
+    return np.dtype([(name, _NUMPY[kind]) for name, kind in fields]), fields
+
+
+def skeletons_to_cloud(skeletons: Sequence[Skeleton], types: MessageTypes) -> Any:
+    """Bodies seen at one instant as one ``sensor_msgs/PointCloud2``.
+
+    Args:
+        skeletons: at least one; all with the same stamp, frame and kind (covariances and velocities or not).
+        types: the family of message classes to build.
+
+    Returns:
+        The message; a point per joint and body, joints in SDK order, fields as in the design's topic table.
+    """
+    first = skeletons[0]
+    record, fields = _cloud_layout(first.covariances is not None, first.velocities is not None)
+    points = np.empty((len(skeletons), N_JOINTS), dtype=record)
+    points["joint"] = np.arange(N_JOINTS, dtype=np.uint8)
+    for row, skeleton in zip(points, skeletons, strict=True):
+        row["x"], row["y"], row["z"] = skeleton.positions.T
+        row["tracking_state"] = skeleton.states
+        row["body"] = skeleton.body
+        if skeleton.covariances is not None:
+            upper = skeleton.covariances[:, _UPPER[0], _UPPER[1]]
+            for column, (name, _) in enumerate(_COVARIANCE_FIELDS):
+                row[name] = upper[:, column]
+        if skeleton.velocities is not None:
+            row["vx"], row["vy"], row["vz"] = skeleton.velocities.T
+    offsets = record.fields
+    assert offsets is not None
+    return types.make(
+        POINT_CLOUD,
+        header=to_header(first.stamp_ns, first.frame_id, types),
+        height=1,
+        width=points.size,
+        fields=[
+            types.make("sensor_msgs/msg/PointField", name=name, offset=int(offsets[name][1]), datatype=kind, count=1)
+            for name, kind in fields
+        ],
+        is_bigendian=False,
+        point_step=record.itemsize,
+        row_step=record.itemsize * points.size,
+        data=types.octets(points.tobytes()),
+        is_dense=bool(np.isfinite(first.positions).all()),
+    )
+
+
+def _record_of(cloud: Any) -> np.dtype[Any]:
+    """The numpy record that the message's own field table describes."""
+    wanted = dict(_BASE_FIELDS + _COVARIANCE_FIELDS + _VELOCITY_FIELDS)
+    names: list[str] = []
+    formats: list[str] = []
+    offsets: list[int] = []
+    step = int(cloud.point_step)
+    for field in cloud.fields:
+        if field.name not in wanted or field.name in names:
+            continue
+        if field.datatype != wanted[field.name] or field.count != 1:
+            raise MessageError(
+                f"field {field.name!r} has datatype {field.datatype} x {field.count}, expected {wanted[field.name]} x 1"
+            )
+        if field.offset + np.dtype(_NUMPY[field.datatype]).itemsize > step:
+            raise MessageError(f"field {field.name!r} at offset {field.offset} ends beyond point_step {step}")
+        names.append(field.name)
+        formats.append(_NUMPY[field.datatype])
+        offsets.append(int(field.offset))
+    missing = [name for name, _ in _BASE_FIELDS if name not in names]
+    if missing:
+        raise MessageError(f"missing field(s) {', '.join(missing)}")
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+
+
+def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
+    """The bodies in one ``sensor_msgs/PointCloud2``, by number.
+
+    Joints may come in any order; unknown fields are ignored.
+
+    Raises:
+        MessageError: fields missing or of another type, big-endian data, sizes that contradict each other, no
+            points, a joint missing, repeated or unknown, a tracking state above 2.
+    """
+    if cloud.is_bigendian:
+        raise MessageError("big-endian point data (the skeleton layout is little-endian)")
+    count = int(cloud.width) * int(cloud.height)
+    if count == 0:
+        raise MessageError("0 points")
+    if count % N_JOINTS or count > N_JOINTS * MAX_BODIES:
+        raise MessageError(f"{count} points, expected a multiple of {N_JOINTS} and at most {N_JOINTS * MAX_BODIES}")
+    record = _record_of(cloud)
+    if int(cloud.row_step) != int(cloud.width) * record.itemsize or len(cloud.data) != int(cloud.row_step) * int(
+        cloud.height
+    ):
+        raise MessageError(
+            f"{len(cloud.data)} bytes of data for {count} points of {record.itemsize} bytes (row_step {cloud.row_step})"
+        )
+    points = np.frombuffer(memoryview(cloud.data), dtype=record)
+    worst = int(points["tracking_state"].max())
+    if worst > TrackingState.TRACKED:
+        raise MessageError(f"tracking_state {worst}, expected 0, 1 or 2")
+    order = np.lexsort((points["joint"], points["body"]))
+    points = points[order].reshape(-1, N_JOINTS)
+    if (points["joint"] != np.arange(N_JOINTS)).any() or (points["body"] != points["body"][:, :1]).any():
+        raise MessageError(f"a joint is missing, repeated or above {N_JOINTS - 1}")
+    stamp_ns, frame_id = to_nanoseconds(cloud.header.stamp), str(cloud.header.frame_id)
+    names = record.names or ()
+    return tuple(
+        Skeleton(
+            stamp_ns,
+            frame_id,
+            _columns(row, ("x", "y", "z")),
+            row["tracking_state"].copy(),
+            int(row["body"][0]),
+            _symmetric(row) if "xx" in names else None,
+            _columns(row, ("vx", "vy", "vz")) if "vx" in names else None,
+        )
+        for row in points
+    )
+
+
+def _columns(row: Any, names: Sequence[str]) -> FloatArray:
+    return np.stack([row[name] for name in names], axis=1).astype(np.float64)
+
+
+def _symmetric(row: Any) -> FloatArray:
+    upper = _columns(row, [name for name, _ in _COVARIANCE_FIELDS])
+    full = np.empty((len(row), 3, 3))
+    full[:, _UPPER[0], _UPPER[1]] = upper
+    full[:, _UPPER[1], _UPPER[0]] = upper
+    return full
+
+
+# --- joint angles
+
+
+def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:
+    """Values and standard deviations as two ``sensor_msgs/JointState``.
+
+    Args:
+        angles: radians and radians per second.
+        body: the REP-155 body id; every name ends in ``_<body>``.
+        frame_id: written into both headers.
+        types: the family of message classes to build.
+    """
+    header = to_header(angles.stamp_ns, frame_id, types)
+    names = [f"{name}_{body}" for name in angles.names]
+
+    def joint_state(position: FloatArray, velocity: FloatArray) -> Any:
+        return types.make(
+            JOINT_STATE,
+            header=header,
+            name=names,
+            position=types.floats(position),
+            velocity=types.floats(velocity),
+            effort=types.floats(np.empty(0)),
+        )
+
+    return (
+        joint_state(angles.position, angles.velocity),
+        joint_state(angles.position_stddev, angles.velocity_stddev),
+    )
+
+
+# --- calibration
+
+
+def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:
+    """``geometry_msgs/TransformStamped`` of a sensor's optical frame in ``world``; the stamp is ``valid_from_ns``."""
+    x, y, z = (float(value) for value in pose.translation)
+    qx, qy, qz, qw = (float(value) for value in pose.quat_xyzw)
+    return types.make(
+        TRANSFORM,
+        header=to_header(pose.valid_from_ns, world, types),
+        child_frame_id=f"{pose.sensor}_optical_frame",
+        transform=types.make(
+            "geometry_msgs/msg/Transform",
+            translation=types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+
+
+def transform_to_pose(message: Any) -> SensorPose:
+    """The inverse of :func:`pose_to_transform`.
+
+    Raises:
+        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a quaternion
+            far from unit length.
+    """
+    suffix = "_optical_frame"
+    child = str(message.child_frame_id)
+    if not child.endswith(suffix) or child == suffix:
+        raise MessageError(f"child_frame_id {child!r}, expected <sensor>{suffix}")
+    t, q = message.transform.translation, message.transform.rotation
+    translation, quat_xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
+    norm = float(np.linalg.norm(quat_xyzw))
+    if not np.isfinite(translation).all() or not abs(norm - 1.0) < 1e-3:
+        raise MessageError(f"transform of {child!r}: translation {translation}, quaternion of length {norm:.3g}")
+    return SensorPose(child.removesuffix(suffix), translation, quat_xyzw / norm, to_nanoseconds(message.header.stamp))
+
+
+def clock_to_time_reference(sensor: str, clock: ClockModel, at_ns: int, types: MessageTypes) -> Any:
+    """``sensor_msgs/TimeReference``: at ``header.stamp`` of the reference clock the sensor's clock showed ``time_ref``.
+
+    Args:
+        sensor: written into ``source``.
+        clock: the sensor's clock against the reference clock.
+        at_ns: the reference time from which the relation is valid.
+        types: the family of message classes to build.
+    """
+    return types.make(
+        TIME_REFERENCE,
+        header=to_header(at_ns, "", types),
+        time_ref=to_time(clock.to_sensor(at_ns), types),
+        source=sensor,
+    )
+
+
+def time_reference_to_clock(message: Any) -> tuple[str, int, ClockModel]:
+    """(sensor, valid from in the reference clock, the relation of the clocks from then on)."""
+    at_ns = to_nanoseconds(message.header.stamp)
+    return str(message.source), at_ns, ClockModel(to_nanoseconds(message.time_ref) - at_ns, 0.0, at_ns)
+
+
+# --- diagnostics
+
+
+def diagnostics(
+    stamp_ns: int, name: str, hardware_id: str, level: int, text: str, values: Mapping[str, object], types: MessageTypes
+) -> Any:
+    """One ``diagnostic_msgs/DiagnosticArray`` with one status.
+
+    Args:
+        stamp_ns: node time.
+        name: ``<node>: <what>``.
+        hardware_id: the sensor, or empty.
+        level: 0 OK, 1 warning, 2 error, 3 stale.
+        text: one line for people.
+        values: counters and rates.
+        types: the family of message classes to build.
+    """
+    status = types.make(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=bytes([level]) if isinstance(types, RosMessages) else level,
+        name=name,
+        message=text,
+        hardware_id=hardware_id,
+        values=[types.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()],
+    )
+    return types.make(DIAGNOSTICS, header=to_header(stamp_ns, "", types), status=[status])

@@ -1,0 +1,76 @@
+"""An ament_python package for colcon, and an ordinary one for pip."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "body_tracking"
+NODES = [
+    "kinect_skeleton",
+    "calibration",
+    "fusion",
+    "skeleton_filter",
+    "joint_angles",
+    "bag_player",
+    "bag_recorder",
+]
+
+
+def share(folder: str, pattern: str) -> tuple[str, list[str]]:
+    """A ``data_files`` entry: the files of a folder of the project, under the package's share."""
+    return f"share/{NAME}/{folder}", [path.as_posix() for path in sorted(Path(folder).glob(pattern))]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Live multi-sensor human body tracking with an honest uncertainty on every joint angle (ROS 2)",
+    license="Apache-2.0",
+    author="body_tracking maintainers",
+    python_requires=">=3.11",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        share("config", "*.yaml"),
+        share("launch", "*.launch.py"),
+        share("rviz", "*.rviz"),
+        *(share(bag.as_posix(), "*.*") for bag in sorted(Path("bags").iterdir()) if bag.is_dir()),
+    ],
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "pyyaml>=6",
+        "matplotlib>=3.8",
+        "filterpy>=1.4.5",
+        "mcap>=1.2",
+        "rosbags>=0.10,<0.12",
+    ],
+    extras_require={
+        "ros": [
+            "ros-jazzy-rclpy==7.1.6",
+            "ros-jazzy-common-interfaces==5.3.6",
+            "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
+        ],
+        "test": [
+            "pytest>=8",
+            "hypothesis>=6.100",
+            "ruff==0.17.5",
+            "mypy==2.4.1",
+            "types-PyYAML",
+            "catkin_pkg>=1.0",
+            "colcon-common-extensions",
+            "colcon-ros",
+            "psutil",
+        ],
+        "bench": ["psutil"],
+    },
+    entry_points={
+        "console_scripts": [
+            "body_tracking = body_tracking.cli:main",
+            *(f"{node} = body_tracking.nodes.{node}:main" for node in NODES),
+        ]
+    },
+    zip_safe=True,
+)
