@@ -1,0 +1,74 @@
+# Everything on a fresh machine with nothing but make and Python >= 3.11; `make help` lists the targets.
+# pip takes its index, proxy and certificates from the environment.
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+DEMO_BAG := bags/tpose_torso_twist
+DEMO := demo_output
+
+# Nothing of a sourced ROS install or of another virtual environment may leak into this one. The ROS wheels re-execute
+# Python once to find their libraries and mark that in the environment; with another environment's mark set they
+# would not look, and with its libraries on the path they might load the wrong ones.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE VIRTUAL_ENV PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH
+unexport ROS_LOCALHOST_ONLY ROS_STATIC_PEERS ROS_DISCOVERY_SERVER FASTRTPS_DEFAULT_PROFILES_FILE FASTDDS_DEFAULT_PROFILES_FILE
+ifdef LD_LIBRARY_PATH
+export LD_LIBRARY_PATH := $(shell printf %s "$$LD_LIBRARY_PATH" | tr : '\n' | grep -v -e '/ros_[^/]*\.libs/*$$' -e '^/opt/ros/' | paste -s -d : -)
+endif
+
+# The graph stays on this machine, and two runs at the same time do not hear each other.
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+export ROS_DOMAIN_ID := $(shell echo $$(( $$(od -An -N2 -tu2 /dev/urandom) % 100 + 1 )))
+export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
+export MPLBACKEND := Agg
+export PYTHONUNBUFFERED := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench docs clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+setup: $(STAMP) ## create .venv with everything in it
+
+# The first Python that is new enough; `make PYTHON=/path/to/python3` chooses another.
+$(STAMP): setup.py setup.cfg
+	@python='$(PYTHON)'; \
+	if [ -z "$$python" ]; then \
+	  for candidate in python3 python3.12 python3.13 python3.11 python3.14; do \
+	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+	  done; \
+	fi; \
+	if [ -z "$$python" ]; then \
+	  echo "make: no Python >= 3.11 found; install one, or say which: make PYTHON=/path/to/python3" >&2; exit 1; \
+	fi; \
+	if ! "$$python" -c 'import venv, ensurepip' 2>/dev/null; then \
+	  echo "make: $$python has no venv module; on Debian or Ubuntu: apt install python3-venv" >&2; exit 1; \
+	fi; \
+	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
+	@echo "installing into $(VENV) (the first time about 300 MB)"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,test,bench]'
+	@touch $@
+
+demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording
+	@rm -rf $(DEMO) && mkdir $(DEMO)
+	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording
+	$(BIN)/body_tracking show $(DEMO)/recording --output $(DEMO)/joint_angles.png
+
+test: lint ## formatting, lint, types and all tests
+	$(BIN)/python -m pytest
+
+lint: $(STAMP) ## formatting, lint and types
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+
+bench: $(STAMP) ## measure the delay from capture to angle
+	$(BIN)/python benchmarks/latency.py
+
+docs: $(STAMP) ## rewrite the generated tables of README.md
+	$(BIN)/python docs/update_readme.py
+
+clean: ## remove everything that make and colcon made
+	rm -rf $(VENV) $(DEMO) build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
