@@ -2,6 +2,6 @@
 
 It works by stamps alone, so that the live node and the offline replay give the same numbers: frames are brought to the
 reference sensor's clock, paired with the lead sensor's, gated, repaired where a sensor sees the body turned around, and
-weighted: by covariance, or as Schlagenhauf (2017) says or computes. It knows ``skeleton`` and ``calibration.result``, and
-neither filters nor ROS. The fusion node and the offline replay import it.
+weighted: by covariance, or as Schlagenhauf (2017) says or computes. It knows ``skeleton`` and ``calibration.result``,
+and neither filters nor ROS. The fusion node and the offline replay import it.
 """
