@@ -1,6 +1,7 @@
 """An ament_python package for colcon, and an ordinary one for pip."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -15,6 +16,8 @@ NODES = [
     "bag_recorder",
 ]
 
+MANIFEST = ElementTree.parse("package.xml")
+
 
 def share(folder: str, pattern: str) -> tuple[str, list[str]]:
     """A ``data_files`` entry: the files of a folder of the project, under the package's share."""
@@ -23,8 +26,8 @@ def share(folder: str, pattern: str) -> tuple[str, list[str]]:
 
 setup(
     name=NAME,
-    version="0.1.0",
-    description="Live multi-sensor human body tracking with an honest uncertainty on every joint angle (ROS 2)",
+    version=MANIFEST.findtext("version"),
+    description=MANIFEST.findtext("description"),
     license="Apache-2.0",
     author="body_tracking maintainers",
     python_requires=">=3.11",
@@ -63,6 +66,7 @@ setup(
             "colcon-common-extensions",
             "colcon-ros",
             "psutil",
+            "setuptools>=77",
         ],
         "bench": ["psutil"],
     },
