@@ -1,0 +1,391 @@
+"""The linear Kalman filters of all 25 joints (Schlagenhauf 2017, chapters 3.7 and 5.4, algorithm 1).
+
+Each joint has a filter of its own with the thesis's state: its position (zero-velocity model, eq. 5.11) or its position
+and velocity (constant-velocity model, eq. 5.12). Unlike there, the process noise is a continuous white noise with the
+time step that really passed, the measurement noise is the fused skeleton's own, and every innovation is gated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
+from scipy.stats import chi2
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.filters.stacked import Stacked
+from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+
+ZERO_VELOCITY = "lkf_zero_velocity"
+CONSTANT_VELOCITY = "lkf_constant_velocity"
+LINEAR_MODELS = (ZERO_VELOCITY, CONSTANT_VELOCITY)
+
+_MAX_RANGE = 100.0
+"""A coordinate beyond this many metres is no measurement of a person but a damaged number."""
+_EYE3 = np.eye(3)
+
+
+class FilterError(BodyTrackingError):
+    """A filter was asked for by an unknown name or with parameters that make no sense."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinearKalmanParameters:
+    """The settings of both linear filters; each field's metadata says what it is, its unit and its range.
+
+    Raises:
+        FilterError: a value out of its range.
+    """
+
+    acceleration_density_trunk: float = field(
+        default=ACCELERATION_DENSITIES[0],
+        metadata={
+            "doc": "constant velocity: spectral density of the acceleration of spine, head, shoulders, hips, per axis",
+            "unit": "m2/s3",
+            "min": 1e-6,
+            "max": 1e4,
+        },
+    )
+    acceleration_density_limb: float = field(
+        default=ACCELERATION_DENSITIES[1],
+        metadata={
+            "doc": "constant velocity: spectral density of the acceleration of elbows and knees, per axis",
+            "unit": "m2/s3",
+            "min": 1e-6,
+            "max": 1e4,
+        },
+    )
+    acceleration_density_extremity: float = field(
+        default=ACCELERATION_DENSITIES[2],
+        metadata={
+            "doc": "constant velocity: spectral density of the acceleration of wrists, hands, ankles, feet, per axis",
+            "unit": "m2/s3",
+            "min": 1e-6,
+            "max": 1e4,
+        },
+    )
+    velocity_density_trunk: float = field(
+        default=0.02,
+        metadata={
+            "doc": "zero velocity: spectral density of the velocity of spine, head, shoulders, hips, per axis",
+            "unit": "m2/s",
+            "min": 1e-8,
+            "max": 1e3,
+        },
+    )
+    velocity_density_limb: float = field(
+        default=0.06,
+        metadata={
+            "doc": "zero velocity: spectral density of the velocity of elbows and knees, per axis",
+            "unit": "m2/s",
+            "min": 1e-8,
+            "max": 1e3,
+        },
+    )
+    velocity_density_extremity: float = field(
+        default=0.2,
+        metadata={
+            "doc": "zero velocity: spectral density of the velocity of wrists, hands, ankles, feet, per axis",
+            "unit": "m2/s",
+            "min": 1e-8,
+            "max": 1e3,
+        },
+    )
+    tracked_stddev: float = field(
+        default=0.015,
+        metadata={
+            "doc": "noise per axis of a tracked joint 2 m away, where the skeleton brings no covariance",
+            "unit": "m",
+            "min": 1e-4,
+            "max": 1.0,
+        },
+    )
+    inferred_stddev: float = field(
+        default=0.06,
+        metadata={
+            "doc": "noise per axis of an inferred joint 2 m away, where the skeleton brings no covariance",
+            "unit": "m",
+            "min": 1e-4,
+            "max": 1.0,
+        },
+    )
+    initial_velocity_stddev: float = field(
+        default=1.0,
+        metadata={
+            "doc": "standard deviation per axis of the velocity of a joint when it is first seen",
+            "unit": "m/s",
+            "min": 1e-3,
+            "max": 100.0,
+        },
+    )
+    gate_probability: float = field(
+        default=0.9999,
+        metadata={
+            "doc": "a measurement is rejected where its innovation lies beyond this chi-square quantile (3 degrees of "
+            "freedom); 1 rejects nothing",
+            "unit": "",
+            "min": 0.5,
+            "max": 1.0,
+        },
+    )
+    reacquire_after: float = field(
+        default=0.2,
+        metadata={
+            "doc": "a joint rejected without a break for longer than this is started anew on its measurement",
+            "unit": "s",
+            "min": 0.0,
+            "max": 60.0,
+        },
+    )
+    predict_for: float = field(
+        default=0.5,
+        metadata={
+            "doc": "a joint without an accepted measurement for longer than this is lost: not tracked, NaN",
+            "unit": "s",
+            "min": 0.0,
+            "max": 60.0,
+        },
+    )
+    reset_gap: float = field(
+        default=1.0,
+        metadata={
+            "doc": "a gap between frames longer than this starts every joint anew",
+            "unit": "s",
+            "min": 0.01,
+            "max": 600.0,
+        },
+    )
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                raise FilterError(f"filter parameter {item.name}: {value!r}, expected a number from {low} to {high}")
+
+
+class LinearKalmanFilter:
+    """25 independent linear Kalman filters, run as one stacked :class:`filterpy.kalman.KalmanFilter`.
+
+    The process noise of a step of ``dt`` seconds is ``q dt`` (zero velocity: a random walk) or ``q`` times
+    [[dt^3/3, dt^2/2], [dt^2/2, dt]] (constant velocity: white acceleration; Bar-Shalom 2001, eq. 6.2.2-12). Both make
+    two half steps equal to one whole.
+
+    A missing joint has an observation matrix of zeros, hence exactly no gain and no innovation (thesis, eq. 5.21-5.22).
+    A rejected one goes back to its prior, which is the same.
+
+    Attributes:
+        counters: what happened since the construction, for diagnostics; joints are counted one by one.
+        innovation_distances: (25,) squared Mahalanobis distance of the last frame's innovations (the normalised
+            innovation squared, chi-square with 3 degrees of freedom); NaN where a joint had no measurement or no prior.
+    """
+
+    def __init__(self, model: str, parameters: LinearKalmanParameters | None = None) -> None:
+        """Set up without any joint known.
+
+        Args:
+            model: one of ``LINEAR_MODELS``.
+            parameters: the defaults where None.
+
+        Raises:
+            FilterError: an unknown model.
+        """
+        if model not in LINEAR_MODELS:
+            raise FilterError(f"unknown linear filter {model!r}, expected one of {', '.join(LINEAR_MODELS)}")
+        self.model = model
+        self.parameters = p = parameters or LinearKalmanParameters()
+        if model == CONSTANT_VELOCITY:
+            self._order = 2
+            densities = (p.acceleration_density_trunk, p.acceleration_density_limb, p.acceleration_density_extremity)
+            unit_step = Q_continuous_white_noise(2, dt=1.0, block_size=3, order_by_dim=False)
+            powers = np.array([[3.0, 2.0], [2.0, 1.0]])
+        else:
+            self._order = 1
+            densities = (p.velocity_density_trunk, p.velocity_density_limb, p.velocity_density_extremity)
+            unit_step, powers = np.eye(3), np.array([[1.0]])
+        # Every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it.
+        self._unit_noise: FloatArray = joint_densities(densities)[:, None, None] * unit_step
+        self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
+        self._gate = float(chi2.ppf(p.gate_probability, 3))
+        self.counters: dict[str, int] = dict.fromkeys(
+            (
+                "frames",
+                "measured",
+                "predicted",
+                "rejected",
+                "reacquired",
+                "lost",
+                "damaged",
+                "repeated_stamps",
+                "backward_jumps",
+                "gaps",
+                "changes",
+            ),
+            0,
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every joint; the counters stay."""
+        size = 3 * self._order
+        self._kalman = KalmanFilter(dim_x=size, dim_z=3)
+        self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))
+        self._kalman.P = Stacked.of(np.broadcast_to(np.eye(size), (N_JOINTS, size, size)).copy())
+        self._source: tuple[str, int] | None = None
+        self._stamp_ns = 0
+        self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
+        self._unmeasured: FloatArray = np.zeros(N_JOINTS)
+        self._rejected: FloatArray = np.zeros(N_JOINTS)
+        self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
+
+    def update(self, skeleton: Skeleton) -> Skeleton | None:
+        """One step of algorithm 1 for every joint.
+
+        Args:
+            skeleton: in a fixed frame, usually ``/fused/skeleton``.
+
+        Returns:
+            The same body at the same stamp: position and covariance (position part of ``P``), velocity (constant
+            velocity) or NaN (the zero-velocity model has none), and the state: the measurement's where it was used,
+            INFERRED where the joint is predicted, NOT_TRACKED with NaN and an infinite covariance where it is lost or
+            was never seen. None where the stamp repeats the last one, or no joint is known.
+        """
+        step = self._step(skeleton)
+        if step is None:
+            return None
+        positions, measured = self._measurement(skeleton)
+        noise = self._measurement_noise(skeleton, positions, measured)
+        rejected = self._filter(positions, noise, measured & self._alive, step)
+        self._book(step, measured, rejected)
+
+        started = measured & (~self._alive | (self._rejected > self.parameters.reacquire_after))
+        if started.any():
+            self._start(started, positions, noise)
+            self.counters["reacquired"] += int((started & rejected).sum())
+        return self._output(skeleton, measured & (~rejected | started))
+
+    def _step(self, skeleton: Skeleton) -> float | None:
+        """Seconds since the last frame; 0 for a first one, None for one to ignore."""
+        source = (skeleton.frame_id, skeleton.body)
+        elapsed_ns = skeleton.stamp_ns - self._stamp_ns
+        if self._source is not None:
+            reason = None
+            if source != self._source:
+                reason = "changes"
+            elif elapsed_ns == 0:
+                self.counters["repeated_stamps"] += 1
+                return None
+            elif elapsed_ns < 0:
+                reason = "backward_jumps"
+            elif elapsed_ns > self.parameters.reset_gap * NANOSECONDS:
+                reason = "gaps"
+            if reason is not None:
+                self.counters[reason] += 1
+                self.reset()
+        step = 0.0 if self._source is None else elapsed_ns / NANOSECONDS
+        self._source, self._stamp_ns = source, skeleton.stamp_ns
+        self.counters["frames"] += 1
+        return step
+
+    def _measurement(self, skeleton: Skeleton) -> tuple[FloatArray, BoolArray]:
+        """(25, 3) positions without a NaN or infinity, (25,) which of them are measurements."""
+        # abs() < limit is False for NaN and infinity too
+        sane: BoolArray = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
+        measured = sane & (skeleton.states > TrackingState.NOT_TRACKED)
+        return np.where(measured[:, None], skeleton.positions, 0.0), measured
+
+    def _measurement_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
+        """(25, 3, 3) covariance of the measurements, positive definite; the identity where there is none."""
+        noise = (
+            np.where(measured[:, None, None], skeleton.covariances, _EYE3) if skeleton.covariances is not None else None
+        )
+        if noise is not None:
+            try:
+                np.linalg.cholesky(noise)  # raises on NaN as well
+                return noise
+            except np.linalg.LinAlgError:
+                noise[~np.isfinite(noise).all(axis=(1, 2))] = 0.0
+                sound = np.linalg.eigvalsh(noise)[:, 0] > 0.0
+                self.counters["damaged"] += int((~sound).sum())
+                return np.where(sound[:, None, None], noise, self._modelled_noise(skeleton, positions, measured))
+        return self._modelled_noise(skeleton, positions, measured)
+
+    def _modelled_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
+        """(25, 3, 3) isotropic, by tracking state, growing with the square of the distance beyond 2 m."""
+        p = self.parameters
+        stddev = np.where(skeleton.states == TrackingState.TRACKED, p.tracked_stddev, p.inferred_stddev)
+        growth = 0.5 + 0.125 * np.einsum("ij,ij->i", positions, positions)  # 1 at 2 m
+        return np.where(measured, (stddev * growth) ** 2, 1.0)[:, None, None] * _EYE3
+
+    def _filter(self, positions: FloatArray, noise: FloatArray, observed: BoolArray, step: float) -> BoolArray:
+        """Predict all joints, update the observed ones, take back those beyond the gate; returns (25,) these."""
+        kalman = self._kalman
+        size = 3 * self._order
+        transition = np.eye(size)  # eq. 5.11, 5.12
+        if self._order == 2:
+            transition[:3, 3:] = step * _EYE3
+        kalman.predict(F=transition, Q=self._unit_noise * step**self._noise_powers)
+
+        observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
+        observation[:, :, :3] = observed[:, None, None] * _EYE3
+        z = np.where(observed[:, None], positions, 0.0)[:, :, None]
+        kalman.update(Stacked.of(z), R=Stacked.of(noise), H=Stacked.of(observation))
+
+        innovation = np.asarray(kalman.y)
+        distances: FloatArray = (innovation * (np.asarray(kalman.SI) @ innovation)).sum(axis=(1, 2))
+        self.innovation_distances = np.where(observed, distances, np.nan)
+        rejected: BoolArray = np.asarray(distances > self._gate)
+        if rejected.any():
+            kalman.x[rejected] = kalman.x_prior[rejected]
+            kalman.P[rejected] = kalman.P_prior[rejected]
+        return rejected
+
+    def _book(self, step: float, measured: BoolArray, rejected: BoolArray) -> None:
+        """Age the joints that got no measurement, and give up those for which it was too long."""
+        accepted = measured & ~rejected
+        self._unmeasured = np.where(accepted, 0.0, self._unmeasured + step)
+        # a missing frame between two rejected ones is no break: only an accepted measurement is
+        self._rejected = np.where(accepted, 0.0, np.where(rejected, self._rejected + step, self._rejected))
+        lost = self._alive & (self._unmeasured > self.parameters.predict_for)
+        self._alive &= ~lost
+        self.counters["lost"] += int(lost.sum())
+        self.counters["rejected"] += int(rejected.sum())
+
+    def _start(self, joints: BoolArray, positions: FloatArray, noise: FloatArray) -> None:
+        """Set joints to their measurement, at rest, with its covariance."""
+        kalman = self._kalman
+        kalman.x[joints] = 0.0
+        kalman.x[joints, :3, 0] = positions[joints]
+        kalman.P[joints] = np.diag([0.0] * 3 + [self.parameters.initial_velocity_stddev**2] * (3 * self._order - 3))
+        kalman.P[joints, :3, :3] = noise[joints]
+        self._alive |= joints
+        self._unmeasured[joints] = 0.0
+        self._rejected[joints] = 0.0
+
+    def _output(self, skeleton: Skeleton, used: BoolArray) -> Skeleton | None:
+        alive = self._alive
+        self.counters["measured"] += int(used.sum())
+        self.counters["predicted"] += int((alive & ~used).sum())
+        if not alive.any():
+            return None
+        state = self._kalman.x[:, :, 0]
+        # copies, and plain arrays: what is handed out must not change with the next frame
+        positions: FloatArray = np.array(state[:, :3])
+        covariances: FloatArray = np.array(self._kalman.P[:, :3, :3])
+        velocities: FloatArray = np.array(state[:, 3:]) if self._order == 2 else np.full((N_JOINTS, 3), np.nan)
+        states = np.where(used, skeleton.states, np.uint8(TrackingState.INFERRED))
+        if not alive.all():
+            positions[~alive] = velocities[~alive] = np.nan
+            covariances[~alive] = np.diag([np.inf] * 3)
+            states[~alive] = TrackingState.NOT_TRACKED
+        return Skeleton(
+            skeleton.stamp_ns,
+            skeleton.frame_id,
+            positions,
+            states,
+            skeleton.body,
+            covariances,
+            velocities,
+        )
