@@ -1,0 +1,166 @@
+"""Quality of service as a bag stores it: the YAML form of rosbag2, without any ROS library.
+
+rosbag2 writes the names of the policies from metadata version 9 (Jazzy) on, and the numbers of ``rmw`` before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from body_tracking.skeleton import NANOSECONDS
+
+INFINITE_NS = 2**63 - 1
+"""``RMW_DURATION_INFINITE``: 9223372036 s and 854775807 ns."""
+
+# The values of the rmw enumerations, for metadata before version 9.
+_NUMBERED = {
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+    "liveliness": ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """What one publisher offered.
+
+    Attributes:
+        reliability: ``reliable`` or ``best_effort``.
+        durability: ``volatile`` or ``transient_local``.
+        depth: messages kept; 0 where discovery did not tell.
+        history: ``keep_last``, ``keep_all``, or ``unknown`` where discovery did not tell.
+        deadline_ns: nanoseconds.
+        lifespan_ns: nanoseconds.
+        liveliness: ``automatic`` or ``manual_by_topic``.
+        liveliness_lease_ns: nanoseconds.
+        avoid_ros_namespace_conventions: as in ``rmw``.
+    """
+
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    depth: int = 10
+    history: str = "keep_last"
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = "automatic"
+    liveliness_lease_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+
+RELIABLE = Qos()
+SENSOR_DATA = Qos(reliability="best_effort", depth=5)
+LATCHED = Qos(durability="transient_local", depth=10)
+
+
+def offer_for(recorded: Sequence[Qos]) -> Qos:
+    """The profile under which to play a topic again, so that every subscription that matched then matches now.
+
+    What one publisher offered is offered as it was; of several, the strongest of each policy. What discovery did not
+    tell (history, depth) becomes the usual ``keep_last`` 10.
+    """
+    if not recorded:
+        return RELIABLE
+    first = recorded[0]
+    return Qos(
+        reliability="reliable" if any(qos.reliability != "best_effort" for qos in recorded) else "best_effort",
+        durability="transient_local" if any(qos.durability == "transient_local" for qos in recorded) else "volatile",
+        depth=max(qos.depth for qos in recorded) or RELIABLE.depth,
+        history="keep_all" if all(qos.history == "keep_all" for qos in recorded) else "keep_last",
+        deadline_ns=min(qos.deadline_ns for qos in recorded),
+        lifespan_ns=max(qos.lifespan_ns for qos in recorded),
+        liveliness=first.liveliness if first.liveliness in ("automatic", "manual_by_topic") else "automatic",
+        liveliness_lease_ns=min(qos.liveliness_lease_ns for qos in recorded),
+        avoid_ros_namespace_conventions=first.avoid_ros_namespace_conventions,
+    )
+
+
+def request_for(offered: Sequence[Qos], depth: int) -> Qos:
+    """The profile of a subscription that matches every one of these publishers and takes the most from them.
+
+    Reliable if every publisher is, transient local likewise.
+
+    Args:
+        offered: what the publishers of the topic offer now.
+        depth: messages that may wait for the subscriber.
+    """
+    reliable = all(qos.reliability == "reliable" for qos in offered)
+    latched = all(qos.durability == "transient_local" for qos in offered)
+    return Qos("reliable" if reliable else "best_effort", "transient_local" if latched else "volatile", depth)
+
+
+def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
+    """The value of ``offered_qos_profiles`` in metadata version 9."""
+
+    def duration(nanoseconds: int) -> dict[str, int]:
+        sec, nsec = divmod(nanoseconds, NANOSECONDS)
+        return {"sec": sec, "nsec": nsec}
+
+    return [
+        {
+            "history": offer.history,
+            "depth": offer.depth,
+            "reliability": offer.reliability,
+            "durability": offer.durability,
+            "deadline": duration(offer.deadline_ns),
+            "lifespan": duration(offer.lifespan_ns),
+            "liveliness": offer.liveliness,
+            "liveliness_lease_duration": duration(offer.liveliness_lease_ns),
+            "avoid_ros_namespace_conventions": offer.avoid_ros_namespace_conventions,
+        }
+        for offer in offers
+    ]
+
+
+def dump(offers: Sequence[Qos]) -> str:
+    """The text that an mcap channel carries under ``offered_qos_profiles``."""
+    return yaml.safe_dump(to_yaml(offers), sort_keys=False).strip() if offers else ""
+
+
+def load(value: object) -> tuple[Qos, ...]:
+    """The profiles in ``offered_qos_profiles`` of any metadata version, text or list.
+
+    Whatever cannot be understood falls back to the default of that policy: a recording whose QoS is odd is still a
+    recording.
+    """
+    if isinstance(value, str):
+        try:
+            value = yaml.safe_load(value)
+        except yaml.YAMLError:
+            return ()
+    return tuple(_profile(item) for item in value if isinstance(item, dict)) if isinstance(value, list) else ()
+
+
+def _profile(item: dict[str, Any]) -> Qos:
+    def policy(name: str, default: str) -> str:
+        value = item.get(name, default)
+        names = _NUMBERED[name]
+        if isinstance(value, int):
+            return names[value] if 0 <= value < len(names) else default
+        return value if value in names else default
+
+    def duration(name: str) -> int:
+        value = item.get(name)
+        try:
+            nanoseconds = int(value["sec"]) * NANOSECONDS + int(value["nsec"])  # type: ignore[index]
+        except (TypeError, KeyError, ValueError):
+            return INFINITE_NS
+        # Before Jazzy an infinite duration was 2147483647 s and 4294967295 ns; 0 is "unspecified".
+        return nanoseconds if 0 < nanoseconds < 2147483647 * NANOSECONDS else INFINITE_NS
+
+    depth = item.get("depth", 0)
+    return Qos(
+        reliability=policy("reliability", "reliable"),
+        durability=policy("durability", "volatile"),
+        depth=depth if isinstance(depth, int) and depth >= 0 else 0,
+        history=policy("history", "unknown"),
+        deadline_ns=duration("deadline"),
+        lifespan_ns=duration("lifespan"),
+        liveliness=policy("liveliness", "automatic"),
+        liveliness_lease_ns=duration("liveliness_lease_duration"),
+        avoid_ros_namespace_conventions=bool(item.get("avoid_ros_namespace_conventions", False)),
+    )

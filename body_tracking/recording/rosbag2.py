@@ -1,0 +1,725 @@
+"""Bags: folders of mcap files with a ``metadata.yaml``, as ``ros2 bag`` (Jazzy) reads and writes them.
+
+Messages stay the CDR bytes that they are on the wire; :func:`serialize` and :func:`deserialize` convert where somebody
+wants to look inside. Layout: https://github.com/ros2/rosbag2 (metadata version 9) and the ``ros2`` profile of
+https://mcap.dev/spec/registry. All times are integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import heapq
+import os
+import re
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import yaml
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from body_tracking.messages import BagMessages
+from body_tracking.recording import qos as quality
+from body_tracking.recording.mcap_file import BagError, Block, McapFile, StoredMessage
+from body_tracking.recording.mcap_repair import finish
+from body_tracking.recording.qos import Qos
+
+__all__ = [
+    "BAG_MESSAGES",
+    "BagError",
+    "BagReader",
+    "BagWriter",
+    "RawMessage",
+    "TopicInfo",
+    "deserialize",
+    "is_known",
+    "recover",
+    "serialize",
+]
+
+METADATA = "metadata.yaml"
+METADATA_VERSION = 9
+ROS_DISTRO = "jazzy"
+LIBRARY = "body_tracking"
+MAX_TIME_NS = 2**63 - 1
+
+_COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+BAG_MESSAGES = BagMessages(_STORE.types)
+"""The message classes of recordings: ``BAG_MESSAGES.make("std_msgs/msg/String", data="")``."""
+
+
+def is_known(type_name: str) -> bool:
+    """Whether the definition of a message type, such as ``sensor_msgs/msg/PointCloud2``, is at hand."""
+    return type_name in _STORE.types
+
+
+def serialize(message: Any) -> bytes:
+    """A message of :data:`BAG_MESSAGES` as CDR bytes, little-endian, with the encapsulation header.
+
+    Raises:
+        BagError: a field holds what its type cannot.
+    """
+    try:
+        return bytes(_STORE.serialize_cdr(message, message.__msgtype__))
+    except Exception as error:
+        raise BagError(f"{type(message).__name__} cannot be serialised: {error}") from error
+
+
+def deserialize(type_name: str, cdr: bytes) -> Any:
+    """The message in CDR bytes; its arrays are views of them.
+
+    Raises:
+        BagError: the type is unknown, or the bytes are no such message.
+    """
+    if not is_known(type_name):
+        raise BagError(f"message type {type_name!r} is unknown")
+    try:
+        return _STORE.deserialize_cdr(cdr, type_name)
+    except Exception as error:
+        raise BagError(f"{len(cdr)} bytes are no {type_name}: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """A topic of a bag.
+
+    Attributes:
+        type_name: such as ``sensor_msgs/msg/PointCloud2``.
+        count: messages.
+        offered: what each of its publishers offered.
+    """
+
+    type_name: str
+    count: int
+    offered: tuple[Qos, ...] = ()
+
+    @property
+    def qos(self) -> Qos:
+        """The profile under which to publish it again."""
+        return quality.offer_for(self.offered)
+
+
+class RawMessage(NamedTuple):
+    """A recorded message.
+
+    Attributes:
+        topic: its name.
+        cdr: the serialised message, as it was received.
+        log_time_ns: when it was received.
+        publish_time_ns: when it was sent, as far as the recorder knew.
+    """
+
+    topic: str
+    cdr: bytes
+    log_time_ns: int
+    publish_time_ns: int
+
+
+# --- reading
+
+
+class BagReader:
+    """Reads a bag: a folder, also without its ``metadata.yaml``, or a single mcap file.
+
+    What is damaged or missing does not stop it: a line in :attr:`warnings` says what and where. A damaged chunk is only
+    noticed when it is read; :meth:`verify` reads them all.
+
+    Args:
+        path: the folder or file.
+
+    Raises:
+        BagError: nothing there can be read as a recording.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.files: list[McapFile] = []
+        self._notes: list[str] = []
+        try:
+            for file in self._paths():
+                self._open(file)
+            if not self.files:
+                raise BagError(self._notes[0] if self._notes else f"{self.path}: no mcap file is in the folder")
+        except BaseException:
+            self.close()
+            raise
+        self.topics: dict[str, TopicInfo] = self._topics()
+        recorded = [file for file in self.files if file.message_count]
+        self.start_ns: int = min((file.start_ns for file in recorded), default=0)
+        self.end_ns: int = max((file.end_ns for file in recorded), default=0)
+        self.message_count: int = sum(file.message_count for file in self.files)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self.files:
+            file.close()
+
+    @property
+    def warnings(self) -> list[str]:
+        """A line for each thing that is missing or damaged, as far as it was noticed yet."""
+        return self._notes + [warning for file in self.files for warning in file.warnings]
+
+    @property
+    def whole(self) -> bool:
+        """Whether every file was closed properly."""
+        return not self._notes and all(file.whole for file in self.files)
+
+    def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None) -> Iterator[RawMessage]:
+        """The messages in the order of their log times, and as they were written where those are equal.
+
+        Args:
+            topics: only these; None for all.
+            start_ns: only those received at this time or later.
+        """
+        wanted = [
+            {
+                number: channel.topic
+                for number, channel in file.channels.items()
+                if channel.message_encoding == "cdr" and (topics is None or channel.topic in topics)
+            }
+            for file in self.files
+        ]
+        blocks: list[tuple[int, int, int, Block]] = sorted(
+            (block.start_ns, index, block.offset, block)
+            for index, file in enumerate(self.files)
+            for block in file.blocks
+            if (start_ns is None or block.end_ns >= start_ns)
+            and (block.counts is None or not wanted[index].keys().isdisjoint(block.counts))
+        )
+        # Blocks overlap in time where messages were written late: a block is opened before anything later than its
+        # beginning leaves the heap.
+        heap: list[tuple[int, int, int, int, RawMessage]] = []
+        position = 0
+        while position < len(blocks) or heap:
+            while position < len(blocks) and (not heap or blocks[position][0] <= heap[0][0]):
+                _, index, offset, block = blocks[position]
+                position += 1
+                names = wanted[index]
+                for number, stored in enumerate(self.files[index].read(block)):
+                    if stored.channel in names and (start_ns is None or stored.log_time_ns >= start_ns):
+                        message = _raw(names[stored.channel], stored)
+                        heapq.heappush(heap, (stored.log_time_ns, index, offset, number, message))
+            if heap:
+                yield heapq.heappop(heap)[-1]
+
+    def verify(self) -> None:
+        """Read everything once, so that :attr:`warnings` is complete."""
+        for file in self.files:
+            for block in file.blocks:
+                file.read(block)
+
+    def _paths(self) -> list[Path]:
+        if not self.path.exists():
+            raise BagError(f"{self.path}: no such recording")
+        if not self.path.is_dir():
+            return [self.path]
+        found = sorted(self.path.glob("*.mcap"), key=_natural)
+        listed = self._listed()
+        if listed is None:
+            if found:
+                self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
+            return found
+        missing = [path for path in listed if not path.exists()]
+        self._notes += [f"{path.name}: listed in {METADATA}, but missing" for path in missing]
+        # A recorder that went on in the same folder and died leaves a file that is not listed yet.
+        further = [path for path in found if path not in listed and (missing or _is_part(self.path, path))]
+        self._notes += [f"{path.name}: not listed in {METADATA}: the recording was not closed" for path in further]
+        return [path for path in listed if path not in missing] + further
+
+    def _listed(self) -> list[Path] | None:
+        """The files that ``metadata.yaml`` lists; None where it is missing or unreadable."""
+        path = self.path / METADATA
+        try:
+            information = yaml.safe_load(path.read_text("utf-8"))["rosbag2_bagfile_information"]
+            storage = str(information["storage_identifier"])
+            compression = str(information.get("compression_mode") or "").lower()
+            names = [Path(str(name)).name for name in information["relative_file_paths"]]
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise BagError(f"{path}: {error.strerror}") from error
+        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+            self._notes.append(f"{METADATA}: damaged; the mcap files were read without it")
+            return None
+        if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
+            raise BagError(f"{self.path}: storage {storage!r} is not supported, only mcap")
+        if compression not in ("", "none"):
+            raise BagError(f"{self.path}: rosbag2 compression mode {compression!r} is not supported, only mcap's own")
+        return [self.path / name for name in names]
+
+    def _open(self, path: Path) -> None:
+        try:
+            self.files.append(McapFile(path))
+        except BagError as error:
+            if not self.path.is_dir():
+                raise
+            self._notes.append(str(error))
+
+    def _topics(self) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        for file in self.files:
+            for number, channel in sorted(file.channels.items()):
+                schema = file.schemas.get(channel.schema_id)
+                if channel.message_encoding != "cdr" or schema is None:
+                    self._notes.append(
+                        f"{file.path.name}: topic {channel.topic} has encoding {channel.message_encoding!r}"
+                        f" and {'no' if schema is None else 'a'} schema; skipped"
+                    )
+                    continue
+                offered = quality.load(channel.metadata.get("offered_qos_profiles", ""))
+                known = topics.get(channel.topic)
+                if known is not None and known.type_name != schema.name:
+                    self._notes.append(f"{channel.topic}: recorded as {known.type_name} and as {schema.name}")
+                topics[channel.topic] = TopicInfo(
+                    schema.name if known is None else known.type_name,
+                    file.counts[number] + (0 if known is None else known.count),
+                    offered if known is None else tuple(dict.fromkeys(known.offered + offered)),
+                )
+        return dict(sorted(topics.items()))
+
+
+def _raw(topic: str, stored: StoredMessage) -> RawMessage:
+    return RawMessage(topic, stored.data, stored.log_time_ns, stored.publish_time_ns)
+
+
+def _natural(path: Path) -> tuple[str, int]:
+    """``name_10`` after ``name_9``."""
+    match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
+    return (match[1], int(match[2])) if match else (path.stem, -1)
+
+
+def _is_part(folder: Path, path: Path) -> bool:
+    return re.fullmatch(re.escape(folder.name) + r"_\d+", path.stem) is not None
+
+
+# --- writing
+
+
+class _Sink:
+    """The file under the mcap writer: unbuffered, so that what failed to be written is known to the byte."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.position = 0
+        self.synchronised = 0
+
+    def write(self, data: bytes) -> int:
+        view = memoryview(data)
+        while view:
+            written = os.write(self.descriptor, view)
+            self.position += written
+            view = view[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self.position
+
+    def flush(self) -> None:
+        """For the mcap writer; nothing waits in here."""
+
+    def synchronise(self) -> None:
+        """Returns when a power failure can no longer take what was written."""
+        if self.synchronised != self.position:
+            os.fdatasync(self.descriptor)
+            self.synchronised = self.position
+
+    def close(self) -> None:
+        os.close(self.descriptor)
+
+
+@dataclass(slots=True)
+class _Topic:
+    channel: int
+    type_name: str
+    offered: tuple[Qos, ...]
+
+
+class BagWriter:
+    """Writes a bag.
+
+    Chunks are closed and written through to the disk at least every ``flush_interval_s`` while messages come, so that a
+    power failure loses about that much. Whoever has nothing to write for a while calls :meth:`flush` in between.
+
+    Args:
+        folder: of the bag; its files are called ``<folder>_<n>.mcap``.
+        overwrite: replace a bag that is there.
+        resume: go on in a bag that is there, in its next file; what its recorder left unclosed is closed as well.
+        compression: of the chunks: ``zstd``, ``lz4`` or ``none``.
+        chunk_bytes: a chunk is closed at this size, uncompressed.
+        flush_interval_s: seconds; infinite for writing offline.
+
+    Raises:
+        BagError: the folder exists and neither ``overwrite`` nor ``resume`` is given, is no bag, is being written by
+            somebody else, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        *,
+        overwrite: bool = False,
+        resume: bool = False,
+        compression: str = "zstd",
+        chunk_bytes: int = 768 * 1024,
+        flush_interval_s: float = 1.0,
+    ) -> None:
+        if compression not in _COMPRESSION:
+            raise BagError(f"compression {compression!r} is unknown: {', '.join(_COMPRESSION)}")
+        self.folder = Path(folder).absolute()
+        self._topics: dict[str, _Topic] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
+        self._start_ns, self._end_ns = MAX_TIME_NS, 0
+        self._interval_s = flush_interval_s
+        self._flushed_s = time.monotonic()
+        self._open = False
+        self.failure: BagError | None = None
+        """Why nothing can be written any more; None while all is well."""
+        try:
+            number = self._prepare(overwrite, resume)
+            self.path = self.folder / f"{self.folder.name}_{number}.mcap"
+            self._sink = _Sink(self.path)
+            fcntl.flock(self._sink.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._mcap = Writer(self._sink, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])  # type: ignore[arg-type]
+            self._mcap.start(profile="ros2", library=LIBRARY)
+        except OSError as error:
+            raise BagError(f"{self.folder}: {error.strerror}") from error
+        self._sound = self._sink.position
+        self._open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def message_count(self) -> int:
+        """Messages written to this bag by this writer."""
+        return self._counts.total()
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics added so far."""
+        return tuple(self._topics)
+
+    def add_topic(self, topic: str, type_name: str, qos: Qos | Sequence[Qos] = quality.RELIABLE) -> None:
+        """Announce a topic; once more with the same type changes nothing.
+
+        Args:
+            topic: its name.
+            type_name: such as ``sensor_msgs/msg/PointCloud2``.
+            qos: what its publisher offers, or each of its publishers.
+
+        Raises:
+            BagError: the type is unknown, or the topic has another one already, or nothing can be written.
+        """
+        self._check()
+        known = self._topics.get(topic)
+        if known is not None:
+            if known.type_name != type_name:
+                raise BagError(f"{topic}: is recorded as {known.type_name}, not as {type_name}")
+            return
+        if not is_known(type_name):
+            raise BagError(f"{topic}: message type {type_name!r} is unknown (no definition of it is at hand)")
+        offered = (qos,) if isinstance(qos, Qos) else tuple(qos)
+        metadata = {
+            "offered_qos_profiles": quality.dump(offered),
+            "topic_type_hash": _STORE.hash_rihs01(type_name),
+        }
+        with self._writing():
+            if type_name not in self._schemas:
+                definition, _ = _STORE.generate_msgdef(type_name, ros_version=2)
+                self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.encode())
+            channel = self._mcap.register_channel(topic, "cdr", self._schemas[type_name], metadata)
+        self._topics[topic] = _Topic(channel, type_name, offered)
+
+    def write(self, topic: str, cdr: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> None:
+        """Write one message.
+
+        Args:
+            topic: as added.
+            cdr: the serialised message.
+            log_time_ns: when it was received.
+            publish_time_ns: when it was sent; as received if unknown.
+
+        Raises:
+            BagError: the topic was not added, a time is negative, or nothing can be written (any more).
+        """
+        self._check()
+        if topic not in self._topics:
+            raise BagError(f"{topic}: was not added to the bag")
+        sent_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        if not (0 <= log_time_ns <= MAX_TIME_NS and 0 <= sent_ns <= MAX_TIME_NS):
+            raise BagError(f"{topic}: a bag cannot hold the time {min(log_time_ns, sent_ns)} ns")
+        with self._writing():
+            self._mcap.add_message(self._topics[topic].channel, log_time_ns, cdr, sent_ns)
+        self._counts[topic] += 1
+        self._start_ns = min(self._start_ns, log_time_ns)
+        self._end_ns = max(self._end_ns, log_time_ns)
+        if time.monotonic() - self._flushed_s >= self._interval_s:
+            self.flush()
+
+    def write_message(self, topic: str, message: Any, log_time_ns: int) -> None:
+        """Serialise and write one message of :data:`BAG_MESSAGES`."""
+        self.write(topic, serialize(message), log_time_ns)
+
+    def flush(self) -> None:
+        """Write what is there through to the disk.
+
+        Raises:
+            BagError: it cannot be written.
+        """
+        self._check()
+        with self._writing():
+            self._mcap.flush()  # type: ignore[no-untyped-call]
+            self._sink.synchronise()
+        self._flushed_s = time.monotonic()
+
+    def close(self) -> None:
+        """Finish the file and write ``metadata.yaml``; once more changes nothing.
+
+        Raises:
+            BagError: it cannot be written.
+        """
+        if not self._open:
+            return
+        self.flush()
+        entry = self._entry()
+        with self._writing():
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": _dump(_information([entry]))})
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._sink.synchronise()
+        self._shut()
+        earlier = [path for path in sorted(self.folder.glob("*.mcap"), key=_natural) if path != self.path]
+        for path in earlier:
+            _finish_quietly(path)
+        try:
+            _write_metadata(self.folder, _information([*_entries(earlier), entry]))
+        except OSError as error:
+            raise BagError(f"{self.folder / METADATA}: {error.strerror}") from error
+
+    def discard(self) -> None:
+        """Stop, and delete the file that this writer made, and the folder if nothing else is in it."""
+        self._shut()
+        with contextlib.suppress(OSError):
+            self.path.unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    # --- inside
+
+    def _prepare(self, overwrite: bool, resume: bool) -> int:
+        """Make the folder ready; the number of the file to write."""
+        if self.folder.exists() and not self.folder.is_dir():
+            raise BagError(f"{self.folder}: exists and is no folder")
+        if not self.folder.exists() or (resume and not any(self.folder.iterdir())):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            return 0
+        if not (overwrite or resume):
+            raise BagError(f"{self.folder}: exists already")
+        parts = sorted(self.folder.glob("*.mcap"), key=_natural)
+        if not parts and not (self.folder / METADATA).exists():
+            raise BagError(f"{self.folder}: exists and is no bag")
+        for path in parts:
+            _refuse_if_in_use(path)
+        # From here on the listing would be wrong; whoever reads meanwhile finds the files by themselves.
+        (self.folder / METADATA).unlink(missing_ok=True)
+        if overwrite:
+            for path in parts:
+                path.unlink()
+            return 0
+        return 1 + max((_natural(path)[1] for path in parts if _is_part(self.folder, path)), default=-1)
+
+    def _check(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+        if not self._open:
+            raise BagError(f"{self.folder}: the bag is closed")
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """After a failure (disk full) the file ends with its last whole chunk, as after a power failure."""
+        try:
+            yield
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._sink.descriptor, self._sound)
+            self.failure = BagError(f"{self.path}: {error.strerror}")
+            self._shut()
+            raise self.failure from error
+        self._sound = self._sink.position
+
+    def _shut(self) -> None:
+        if self._open:
+            self._open = False
+            self._sink.close()
+
+    def _entry(self) -> _Entry:
+        return _Entry(
+            self.path.name,
+            self._start_ns,
+            max(0, self._end_ns - self._start_ns),
+            {
+                name: _Counted(topic.type_name, self._counts[name], topic.offered)
+                for name, topic in self._topics.items()
+            },
+        )
+
+
+# --- metadata
+
+
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    type_name: str
+    count: int
+    offered: tuple[Qos, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """One file of a bag, as ``metadata.yaml`` tells of it; without messages the start is the latest possible time."""
+
+    name: str
+    start_ns: int
+    duration_ns: int
+    topics: dict[str, _Counted]
+
+    @property
+    def count(self) -> int:
+        return sum(topic.count for topic in self.topics.values())
+
+
+def _entries(paths: Sequence[Path]) -> list[_Entry]:
+    """What is in files that are there already; those that cannot be read are left out."""
+    entries = []
+    for path in paths:
+        try:
+            with BagReader(path) as reader:
+                start_ns = reader.start_ns if reader.message_count else MAX_TIME_NS
+                topics = {
+                    name: _Counted(topic.type_name, topic.count, topic.offered) for name, topic in reader.topics.items()
+                }
+                entries.append(_Entry(path.name, start_ns, reader.end_ns - reader.start_ns, topics))
+        except BagError:
+            continue
+    return entries
+
+
+def _information(entries: Sequence[_Entry]) -> dict[str, Any]:
+    """The content of ``metadata.yaml``, in the order in which rosbag2 writes it."""
+    topics: dict[str, _Counted] = {}
+    for entry in entries:
+        for name, topic in entry.topics.items():
+            if name in topics:
+                offered = tuple(dict.fromkeys(topics[name].offered + topic.offered))
+                topics[name] = _Counted(topics[name].type_name, topics[name].count + topic.count, offered)
+            else:
+                topics[name] = topic
+    start_ns = min((entry.start_ns for entry in entries), default=MAX_TIME_NS)
+    end_ns = max((entry.start_ns + entry.duration_ns for entry in entries if entry.count), default=start_ns)
+    return {
+        "version": METADATA_VERSION,
+        "storage_identifier": "mcap",
+        "duration": {"nanoseconds": end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+        "message_count": sum(entry.count for entry in entries),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": name,
+                    "type": topic.type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": quality.to_yaml(topic.offered),
+                    "type_description_hash": _STORE.hash_rihs01(topic.type_name) if is_known(topic.type_name) else "",
+                },
+                "message_count": topic.count,
+            }
+            for name, topic in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [entry.name for entry in entries],
+        "files": [
+            {
+                "path": entry.name,
+                "starting_time": {"nanoseconds_since_epoch": entry.start_ns},
+                "duration": {"nanoseconds": entry.duration_ns},
+                "message_count": entry.count,
+            }
+            for entry in entries
+        ],
+        "custom_data": None,
+        "ros_distro": ROS_DISTRO,
+    }
+
+
+def _dump(content: dict[str, Any]) -> str:
+    return yaml.safe_dump(content, sort_keys=False)
+
+
+def _write_metadata(folder: Path, information: dict[str, Any]) -> None:
+    """Replace ``metadata.yaml`` at once: it is whole at any time."""
+    draft = folder / f"{METADATA}.tmp"
+    with draft.open("w", encoding="utf-8") as file:
+        file.write(_dump({"rosbag2_bagfile_information": information}))
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(folder / METADATA)
+
+
+def _refuse_if_in_use(path: Path) -> None:
+    """A writer holds a lock on its file for as long as its process lives."""
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(f"{path}: is being recorded by another process") from error
+
+
+def _finish_quietly(path: Path) -> None:
+    """Close what a recorder left open; a file that cannot be closed stays as it is, and readable as far as it goes."""
+    with contextlib.suppress(BagError):
+        finish(path)
+
+
+def recover(folder: Path | str) -> BagReader:
+    """Close a bag whose recorder died: give its files their endings and the folder its ``metadata.yaml``.
+
+    Every message that could be read before can be read afterwards, and ``ros2 bag`` opens the folder.
+
+    Returns:
+        A reader of the bag as it is now.
+
+    Raises:
+        BagError: it is no bag, it is still being recorded, or it cannot be written.
+    """
+    folder = Path(folder)
+    paths = sorted(folder.glob("*.mcap"), key=_natural)
+    if not paths:
+        raise BagError(f"{folder}: no mcap file is in the folder")
+    try:
+        for path in paths:
+            _refuse_if_in_use(path)
+            _finish_quietly(path)
+        entries = _entries(paths)
+        if not entries:
+            raise BagError(f"{folder}: none of its mcap files can be read")
+        _write_metadata(folder, _information(entries))
+    except OSError as error:
+        raise BagError(f"{folder}: {error.strerror}") from error
+    return BagReader(folder)
