@@ -3,6 +3,11 @@
 Each joint has a filter of its own with the thesis's state: its position (zero-velocity model, eq. 5.11) or its position
 and velocity (constant-velocity model, eq. 5.12). Unlike there, the process noise is a continuous white noise with the
 time step that really passed, the measurement noise is the fused skeleton's own, and every innovation is gated.
+
+A depth sensor's skeleton is wrong by centimetres but trembles by millimetres: most of its error stays for seconds (a
+joint placed beside the anatomical one, a tilt by the viewing direction). A filter told that all of it were white would
+average it away on paper only. So the measurement covariance ``R`` is split: ``white_noise_share`` of it drives the
+gain, the rest is carried along and added to the covariance that is handed out; gating allows for all of it.
 """
 
 from __future__ import annotations
@@ -112,6 +117,16 @@ class LinearKalmanParameters:
             "max": 1.0,
         },
     )
+    white_noise_share: float = field(
+        default=0.25,
+        metadata={
+            "doc": "share of the measurement variance that is new in every frame, and is filtered; the rest is a slow "
+            "error that no filter can remove, and is added to the covariance of the result",
+            "unit": "",
+            "min": 0.001,
+            "max": 1.0,
+        },
+    )
     initial_velocity_stddev: float = field(
         default=1.0,
         metadata={
@@ -132,9 +147,10 @@ class LinearKalmanParameters:
         },
     )
     reacquire_after: float = field(
-        default=0.2,
+        default=0.1,
         metadata={
-            "doc": "a joint rejected without a break for longer than this is started anew on its measurement",
+            "doc": "a joint rejected without a break for longer than this is started anew on its measurement; much "
+            "later the grown uncertainty would let it in as a sudden movement, and overshoot",
             "unit": "s",
             "min": 0.0,
             "max": 60.0,
@@ -159,6 +175,17 @@ class LinearKalmanParameters:
         },
     )
 
+    reorder_window: float = field(
+        default=0.1,
+        metadata={
+            "doc": "a frame older than the last one by no more than this came late and is ignored; an older one is a "
+            "backward jump of time, which starts every joint anew",
+            "unit": "s",
+            "min": 0.0,
+            "max": 10.0,
+        },
+    )
+
     def __post_init__(self) -> None:
         for item in fields(self):
             value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
@@ -178,8 +205,9 @@ class LinearKalmanFilter:
 
     Attributes:
         counters: what happened since the construction, for diagnostics; joints are counted one by one.
-        innovation_distances: (25,) squared Mahalanobis distance of the last frame's innovations (the normalised
-            innovation squared, chi-square with 3 degrees of freedom); NaN where a joint had no measurement or no prior.
+        innovation_distances: (25,) squared Mahalanobis distance of the last frame's innovations by the white part of
+            the noise (the normalised innovation squared, chi-square with 3 degrees of freedom where the model holds);
+            NaN where a joint had no measurement or no prior.
     """
 
     def __init__(self, model: str, parameters: LinearKalmanParameters | None = None) -> None:
@@ -219,6 +247,7 @@ class LinearKalmanFilter:
                 "lost",
                 "damaged",
                 "repeated_stamps",
+                "late_frames",
                 "backward_jumps",
                 "gaps",
                 "changes",
@@ -236,6 +265,7 @@ class LinearKalmanFilter:
         self._source: tuple[str, int] | None = None
         self._stamp_ns = 0
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
+        self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
         self._unmeasured: FloatArray = np.zeros(N_JOINTS)
         self._rejected: FloatArray = np.zeros(N_JOINTS)
         self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
@@ -247,10 +277,11 @@ class LinearKalmanFilter:
             skeleton: in a fixed frame, usually ``/fused/skeleton``.
 
         Returns:
-            The same body at the same stamp: position and covariance (position part of ``P``), velocity (constant
-            velocity) or NaN (the zero-velocity model has none), and the state: the measurement's where it was used,
-            INFERRED where the joint is predicted, NOT_TRACKED with NaN and an infinite covariance where it is lost or
-            was never seen. None where the stamp repeats the last one, or no joint is known.
+            The same body at the same stamp: position and covariance (position part of ``P`` and the slow part of the
+            noise); velocity (constant velocity) or NaN (the zero-velocity model has none); and the state: the
+            measurement's where it was used, INFERRED where the joint is predicted, NOT_TRACKED with NaN and an
+            infinite covariance where it is lost or was never seen. None where the stamp repeats the last one or is a
+            little older, or no joint is known.
         """
         step = self._step(skeleton)
         if step is None:
@@ -264,10 +295,13 @@ class LinearKalmanFilter:
         if started.any():
             self._start(started, positions, noise)
             self.counters["reacquired"] += int((started & rejected).sum())
-        return self._output(skeleton, measured & (~rejected | started))
+        used = measured & (~rejected | started)
+        self._slow = np.where(used[:, None, None], (1.0 - self.parameters.white_noise_share) * noise, self._slow)
+        return self._output(skeleton, used)
 
     def _step(self, skeleton: Skeleton) -> float | None:
         """Seconds since the last frame; 0 for a first one, None for one to ignore."""
+        p = self.parameters
         source = (skeleton.frame_id, skeleton.body)
         elapsed_ns = skeleton.stamp_ns - self._stamp_ns
         if self._source is not None:
@@ -277,9 +311,12 @@ class LinearKalmanFilter:
             elif elapsed_ns == 0:
                 self.counters["repeated_stamps"] += 1
                 return None
+            elif -p.reorder_window * NANOSECONDS <= elapsed_ns < 0:
+                self.counters["late_frames"] += 1
+                return None
             elif elapsed_ns < 0:
                 reason = "backward_jumps"
-            elif elapsed_ns > self.parameters.reset_gap * NANOSECONDS:
+            elif elapsed_ns > p.reset_gap * NANOSECONDS:
                 reason = "gaps"
             if reason is not None:
                 self.counters[reason] += 1
@@ -292,25 +329,23 @@ class LinearKalmanFilter:
     def _measurement(self, skeleton: Skeleton) -> tuple[FloatArray, BoolArray]:
         """(25, 3) positions without a NaN or infinity, (25,) which of them are measurements."""
         # abs() < limit is False for NaN and infinity too
-        sane: BoolArray = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
-        measured = sane & (skeleton.states > TrackingState.NOT_TRACKED)
+        sane = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
+        measured: BoolArray = sane & (skeleton.states > TrackingState.NOT_TRACKED)
         return np.where(measured[:, None], skeleton.positions, 0.0), measured
 
     def _measurement_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
         """(25, 3, 3) covariance of the measurements, positive definite; the identity where there is none."""
-        noise = (
-            np.where(measured[:, None, None], skeleton.covariances, _EYE3) if skeleton.covariances is not None else None
-        )
-        if noise is not None:
-            try:
-                np.linalg.cholesky(noise)  # raises on NaN as well
-                return noise
-            except np.linalg.LinAlgError:
-                noise[~np.isfinite(noise).all(axis=(1, 2))] = 0.0
-                sound = np.linalg.eigvalsh(noise)[:, 0] > 0.0
-                self.counters["damaged"] += int((~sound).sum())
-                return np.where(sound[:, None, None], noise, self._modelled_noise(skeleton, positions, measured))
-        return self._modelled_noise(skeleton, positions, measured)
+        if skeleton.covariances is None:
+            return self._modelled_noise(skeleton, positions, measured)
+        noise = np.where(measured[:, None, None], skeleton.covariances, _EYE3)
+        try:
+            np.linalg.cholesky(noise)  # raises on NaN as well
+        except np.linalg.LinAlgError:
+            noise[~np.isfinite(noise).all(axis=(1, 2))] = 0.0
+            sound = np.linalg.eigvalsh(noise)[:, 0] > 0.0
+            self.counters["damaged"] += int((~sound).sum())
+            noise = np.where(sound[:, None, None], noise, self._modelled_noise(skeleton, positions, measured))
+        return noise
 
     def _modelled_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
         """(25, 3, 3) isotropic, by tracking state, growing with the square of the distance beyond 2 m."""
@@ -331,13 +366,18 @@ class LinearKalmanFilter:
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
         z = np.where(observed[:, None], positions, 0.0)[:, :, None]
-        kalman.update(Stacked.of(z), R=Stacked.of(noise), H=Stacked.of(observation))
+        share = self.parameters.white_noise_share
+        kalman.update(Stacked.of(z), R=Stacked.of(share * noise), H=Stacked.of(observation))
 
         innovation = np.asarray(kalman.y)
         distances: FloatArray = (innovation * (np.asarray(kalman.SI) @ innovation)).sum(axis=(1, 2))
         self.innovation_distances = np.where(observed, distances, np.nan)
-        rejected: BoolArray = np.asarray(distances > self._gate)
-        if rejected.any():
+        rejected: BoolArray = np.array(distances > self._gate)
+        if rejected.any():  # suspected, that is: not yet with the slow part of the noise
+            suspects = np.flatnonzero(rejected)
+            total = np.asarray(kalman.S)[suspects] + (1.0 - share) * noise[suspects]
+            suspect = innovation[suspects]
+            rejected[suspects] = (suspect * np.linalg.solve(total, suspect)).sum(axis=(1, 2)) > self._gate
             kalman.x[rejected] = kalman.x_prior[rejected]
             kalman.P[rejected] = kalman.P_prior[rejected]
         return rejected
@@ -359,7 +399,7 @@ class LinearKalmanFilter:
         kalman.x[joints] = 0.0
         kalman.x[joints, :3, 0] = positions[joints]
         kalman.P[joints] = np.diag([0.0] * 3 + [self.parameters.initial_velocity_stddev**2] * (3 * self._order - 3))
-        kalman.P[joints, :3, :3] = noise[joints]
+        kalman.P[joints, :3, :3] = self.parameters.white_noise_share * noise[joints]
         self._alive |= joints
         self._unmeasured[joints] = 0.0
         self._rejected[joints] = 0.0
@@ -373,7 +413,7 @@ class LinearKalmanFilter:
         state = self._kalman.x[:, :, 0]
         # copies, and plain arrays: what is handed out must not change with the next frame
         positions: FloatArray = np.array(state[:, :3])
-        covariances: FloatArray = np.array(self._kalman.P[:, :3, :3])
+        covariances: FloatArray = np.asarray(self._kalman.P)[:, :3, :3] + self._slow
         velocities: FloatArray = np.array(state[:, 3:]) if self._order == 2 else np.full((N_JOINTS, 3), np.nan)
         states = np.where(used, skeleton.states, np.uint8(TrackingState.INFERRED))
         if not alive.all():

@@ -1,0 +1,320 @@
+"""The linear Kalman filters obey Kalman's equations, and survive what sensors do."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import chi2
+
+from body_tracking.filters import FILTERS, FilterError, LinearKalmanFilter, LinearKalmanParameters, make_filter
+from body_tracking.filters.linear import CONSTANT_VELOCITY, ZERO_VELOCITY
+from body_tracking.kinematics.motion import joint_densities
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+
+FRAME_NS = NANOSECONDS // 30
+TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+BODY = np.random.default_rng(0).normal(size=(N_JOINTS, 3)) * 0.4 + [2.0, 0.0, 0.0]
+
+
+def skeleton(
+    stamp_ns: int,
+    positions: FloatArray = BODY,
+    states: np.ndarray = TRACKED,
+    covariances: FloatArray | None = None,
+    **other: object,
+) -> Skeleton:
+    return replace(Skeleton(stamp_ns, "world", positions.copy(), states.copy(), 0, covariances), **other)
+
+
+def covariances_of(rng: np.random.Generator, scale: float = 0.01) -> FloatArray:
+    factor = rng.normal(size=(N_JOINTS, 3, 3)) * scale
+    return factor @ factor.swapaxes(1, 2) + scale**2 * np.eye(3)
+
+
+def run(
+    filtered: LinearKalmanFilter, positions: FloatArray, step_ns: int = FRAME_NS, start_ns: int = 1
+) -> list[Skeleton]:
+    """The filter over (n, 25, 3) positions."""
+    results = [filtered.update(skeleton(start_ns + k * step_ns, frame)) for k, frame in enumerate(positions)]
+    assert all(result is not None for result in results)
+    return [result for result in results if result is not None]
+
+
+@pytest.mark.parametrize("model", FILTERS)
+def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
+    """Random covariances, uneven time steps, joints that come and go; every state and covariance to 1e-12."""
+    rng = np.random.default_rng(1)
+    parameters = LinearKalmanParameters(white_noise_share=1.0, gate_probability=1.0, predict_for=60.0)
+    stacked = LinearKalmanFilter(model, parameters)
+    order = 2 if model == CONSTANT_VELOCITY else 1
+    names = ("trunk", "limb", "extremity")
+    kind = "acceleration" if order == 2 else "velocity"
+    densities = joint_densities(tuple(getattr(parameters, f"{kind}_density_{name}") for name in names))
+
+    singles = [KalmanFilter(dim_x=3 * order, dim_z=3) for _ in range(N_JOINTS)]
+    stamp_ns, position = 1, BODY.copy()
+    for frame in range(120):
+        step = 0.0 if frame == 0 else float(rng.uniform(0.01, 0.2))
+        stamp_ns += round(step * NANOSECONDS)
+        step = round(step * NANOSECONDS) / NANOSECONDS
+        position = position + rng.normal(size=position.shape) * 0.02
+        noise = covariances_of(rng)
+        states = np.where(rng.random(N_JOINTS) < 0.8, TrackingState.TRACKED, TrackingState.NOT_TRACKED).astype(np.uint8)
+        if frame == 0:
+            states = TRACKED
+        seen = np.where(states[:, None] > 0, position, np.nan)
+        result = stacked.update(skeleton(stamp_ns, seen, states, noise))
+        assert result is not None and result.covariances is not None and result.velocities is not None
+        for joint, single in enumerate(singles):
+            if frame == 0:
+                single.x = np.zeros((3 * order, 1))
+                single.x[:3, 0] = seen[joint]
+                single.P = np.diag([0.0] * 3 + [parameters.initial_velocity_stddev**2] * (3 * order - 3))
+                single.P[:3, :3] = noise[joint]
+                single.H = np.eye(3, 3 * order)
+            else:
+                single.F = np.eye(3 * order)
+                single.Q = densities[joint] * step * np.eye(3)
+                if order == 2:
+                    single.F[:3, 3:] = step * np.eye(3)
+                    single.Q = Q_continuous_white_noise(2, step, densities[joint], 3, order_by_dim=False)
+                single.predict()
+                single.update(seen[joint] if states[joint] else None, R=noise[joint])
+            assert_allclose(result.positions[joint], single.x[:3, 0], rtol=0, atol=1e-12)
+            assert_allclose(result.covariances[joint], single.P[:3, :3], rtol=0, atol=1e-12)
+            if order == 2:
+                assert_allclose(result.velocities[joint], single.x[3:, 0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", FILTERS)
+@given(split=st.floats(0.05, 0.95), step_ms=st.integers(10, 400))
+@settings(max_examples=25, deadline=None)
+def test_two_part_steps_of_prediction_equal_the_whole(model: str, split: float, step_ms: int) -> None:
+    whole, parts = (LinearKalmanFilter(model, LinearKalmanParameters(predict_for=10.0)) for _ in range(2))
+    missing = np.zeros(N_JOINTS, dtype=np.uint8)
+    velocity = np.linspace(-1.0, 1.0, 75).reshape(N_JOINTS, 3)
+    for tracker in (whole, parts):
+        run(tracker, np.stack([BODY + velocity * k / 30 for k in range(5)]))
+    now = 1 + 4 * FRAME_NS
+    end = now + step_ms * 1_000_000
+    once = whole.update(skeleton(end, states=missing))
+    parts.update(skeleton(now + round(split * (end - now)), states=missing))
+    twice = parts.update(skeleton(end, states=missing))
+    assert once is not None and twice is not None
+    assert_allclose(once.positions, twice.positions, rtol=0, atol=1e-12)
+    assert_allclose(once.covariances, twice.covariances, rtol=1e-9, atol=1e-15)
+
+
+def random_motion(tracker: LinearKalmanFilter, rng: np.random.Generator, frames: int) -> FloatArray:
+    """(frames, 25, 3) positions drawn from the filter's own model of motion."""
+    p, step = tracker.parameters, FRAME_NS / NANOSECONDS
+    if tracker.model == ZERO_VELOCITY:
+        densities = (p.velocity_density_trunk, p.velocity_density_limb, p.velocity_density_extremity)
+        steps = rng.normal(size=(frames, N_JOINTS, 3)) * np.sqrt(joint_densities(densities) * step)[:, None]
+        return np.asarray(BODY + np.cumsum(steps, axis=0))
+    densities = (p.acceleration_density_trunk, p.acceleration_density_limb, p.acceleration_density_extremity)
+    block = np.linalg.cholesky(np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]]))
+    kicks = rng.normal(size=(frames, N_JOINTS, 3, 2)) @ block.T * np.sqrt(joint_densities(densities))[:, None, None]
+    velocity = np.cumsum(kicks[..., 1], axis=0) - kicks[..., 1]
+    return np.asarray(BODY + np.cumsum(velocity * step + kicks[..., 0], axis=0))
+
+
+@pytest.mark.parametrize("model", FILTERS)
+def test_innovations_of_data_that_fits_the_model_are_chi_square(model: str) -> None:
+    """NIS of white noise on a motion of the assumed density: the mean within its 99.9 % band, few beyond the gate."""
+    rng = np.random.default_rng(2)
+    share, noise = 0.25, 0.012**2
+    tracker = LinearKalmanFilter(model, LinearKalmanParameters(white_noise_share=share))
+    covariance = np.broadcast_to(np.eye(3) * noise, (N_JOINTS, 3, 3))
+    distances, errors = [], []
+    for _ in range(6):
+        truth = random_motion(tracker, rng, 75)
+        seen = truth + rng.normal(size=truth.shape) * np.sqrt(share * noise)
+        tracker.reset()
+        for k, frame in enumerate(seen):
+            result = tracker.update(skeleton(1 + k * FRAME_NS, frame, covariances=covariance))
+            assert result is not None and result.covariances is not None
+            if k >= 15:
+                distances.append(tracker.innovation_distances)
+                white = result.covariances - (1.0 - share) * covariance
+                error = (result.positions - truth[k])[:, :, None]
+                errors.append((error * np.linalg.solve(white, error)).sum(axis=(1, 2)))
+    count = len(distances) * N_JOINTS
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * count) / count
+    assert low < np.mean(distances) < high
+    # errors of successive frames are correlated: a wider band
+    assert 2.7 < np.mean(errors) < 3.3
+    assert np.mean(np.array(distances) > chi2.ppf(0.99, 3)) == pytest.approx(0.01, abs=0.005)
+
+
+def test_a_missing_joint_is_pure_prediction() -> None:
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
+    velocity = np.array([0.6, -0.3, 0.1])
+    last = run(tracker, np.stack([BODY + velocity * k / 30 for k in range(30)]))[-1]
+    assert last.velocities is not None and last.covariances is not None
+    states = TRACKED.copy()
+    states[Joint.WRIST_LEFT] = TrackingState.NOT_TRACKED
+    seen = BODY + velocity
+    seen[Joint.WRIST_LEFT] = np.nan
+    step = FRAME_NS / NANOSECONDS
+    result = tracker.update(skeleton(1 + 30 * FRAME_NS, seen, states))
+    assert result is not None and result.covariances is not None and result.velocities is not None
+    wrist = Joint.WRIST_LEFT
+    assert_allclose(result.positions[wrist], last.positions[wrist] + last.velocities[wrist] * step, rtol=0, atol=1e-14)
+    assert_array_equal(result.velocities[wrist], last.velocities[wrist])
+    assert result.states[wrist] == TrackingState.INFERRED
+    assert (np.diag(result.covariances[wrist]) > np.diag(last.covariances[wrist])).all()
+    assert (np.delete(result.states, wrist) == TrackingState.TRACKED).all()
+
+
+def test_a_joint_unseen_for_long_is_lost_and_comes_back_on_its_measurement() -> None:
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
+    run(tracker, np.stack([BODY] * 10))
+    states = TRACKED.copy()
+    states[Joint.HEAD] = TrackingState.NOT_TRACKED
+    seen_states = []
+    for k in range(10, 40):
+        result = tracker.update(skeleton(1 + k * FRAME_NS, states=states))
+        assert result is not None
+        seen_states.append(result.states[Joint.HEAD])
+    predicted_frames = int(tracker.parameters.predict_for * 30)
+    assert seen_states == [TrackingState.INFERRED] * predicted_frames + [TrackingState.NOT_TRACKED] * (
+        30 - predicted_frames
+    )
+    assert result is not None and result.covariances is not None
+    assert np.isnan(result.positions[Joint.HEAD]).all() and np.isinf(np.diag(result.covariances[Joint.HEAD])).all()
+    moved = BODY.copy()
+    moved[Joint.HEAD] += 1.0
+    back = tracker.update(skeleton(1 + 40 * FRAME_NS, moved))
+    assert back is not None
+    assert_allclose(back.positions[Joint.HEAD], moved[Joint.HEAD])
+    assert tracker.counters["lost"] == 1
+
+
+def test_an_outlier_is_rejected_and_a_move_for_good_is_followed() -> None:
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
+    run(tracker, np.stack([BODY] * 10))
+    moved = BODY.copy()
+    moved[Joint.WRIST_RIGHT] += [0.0, 0.5, 0.0]
+    frames = [tracker.update(skeleton(1 + k * FRAME_NS, moved)) for k in range(10, 20)]
+    offsets = np.array(
+        [frame.positions[Joint.WRIST_RIGHT, 1] - BODY[Joint.WRIST_RIGHT, 1] for frame in frames if frame]
+    )
+    waits = int(tracker.parameters.reacquire_after * 30)
+    assert_allclose(offsets[:waits], 0.0, atol=1e-6)
+    assert_allclose(offsets[waits + 1 :], 0.5, atol=1e-6)
+    assert tracker.counters["reacquired"] == 1
+    first = frames[0]
+    assert first is not None and first.states[Joint.WRIST_RIGHT] == TrackingState.INFERRED
+    assert_array_equal(np.delete(first.states, Joint.WRIST_RIGHT), np.delete(TRACKED, Joint.WRIST_RIGHT))
+
+
+def test_the_slow_part_of_the_noise_opens_the_gate_and_stays_in_the_covariance() -> None:
+    """A jump by 1.5 stated standard deviations per axis is no outlier, though it is far beyond the white part of the noise."""
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY, LinearKalmanParameters(white_noise_share=0.01))
+    noise = np.broadcast_to(np.eye(3) * 0.03**2, (N_JOINTS, 3, 3))
+    for k in range(60):
+        result = tracker.update(skeleton(1 + k * FRAME_NS, covariances=noise))
+    assert result is not None and result.covariances is not None
+    stddev = np.sqrt(np.diagonal(result.covariances, axis1=1, axis2=2))
+    assert ((stddev > 0.029) & (stddev <= 0.03)).all()
+    tracker.update(skeleton(1 + 60 * FRAME_NS, BODY + 0.045, covariances=noise))
+    assert np.nanmin(tracker.innovation_distances) > chi2.ppf(tracker.parameters.gate_probability, 3)
+    assert tracker.counters["rejected"] == 0
+
+
+@pytest.mark.parametrize("model", FILTERS)
+def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
+    tracker = LinearKalmanFilter(model)
+    start = 100 * NANOSECONDS
+    run(tracker, np.stack([BODY] * 3), start_ns=start)
+    last = start + 2 * FRAME_NS
+    assert tracker.update(skeleton(last, BODY + 1.0)) is None
+    assert tracker.counters["repeated_stamps"] == 1
+    assert tracker.update(skeleton(last - FRAME_NS, BODY + 1.0)) is None
+    assert tracker.counters["late_frames"] == 1
+    jumped = tracker.update(skeleton(NANOSECONDS, BODY + 1.0))
+    assert jumped is not None and tracker.counters["backward_jumps"] == 1
+    assert_allclose(jumped.positions, BODY + 1.0)
+    leapt = tracker.update(skeleton(50 * NANOSECONDS, BODY - 1.0))
+    assert leapt is not None and tracker.counters["gaps"] == 1
+    assert_allclose(leapt.positions, BODY - 1.0)
+    other = tracker.update(skeleton(50 * NANOSECONDS + FRAME_NS, BODY + 2.0, body=3))
+    assert other is not None and tracker.counters["changes"] == 1
+    assert_allclose(other.positions, BODY + 2.0)
+
+
+@pytest.mark.parametrize("model", FILTERS)
+@given(
+    positions=arrays(np.float64, (N_JOINTS, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
+    states=arrays(np.uint8, (N_JOINTS,), elements=st.integers(0, 2)),
+    covariance=arrays(np.float64, (3, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_number_whatever_gets_into_the_state(
+    model: str, positions: FloatArray, states: np.ndarray, covariance: FloatArray
+) -> None:
+    tracker = LinearKalmanFilter(model)
+    covariances = np.broadcast_to(np.eye(3) * 1e-4, (N_JOINTS, 3, 3)).copy()
+    covariances[::2] = covariance
+    tracker.update(skeleton(1, positions, states, covariances))
+    for k in range(1, 30):
+        result = tracker.update(skeleton(1 + k * FRAME_NS))
+    assert result is not None and result.covariances is not None
+    assert_allclose(result.positions, BODY, atol=1e-3)
+    assert (np.linalg.eigvalsh(result.covariances) > 0).all()
+    assert (result.states == TrackingState.TRACKED).all()
+
+
+def test_nobody_known_is_nothing_to_say() -> None:
+    nobody = skeleton(1, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8))
+    assert LinearKalmanFilter(CONSTANT_VELOCITY).update(nobody) is None
+
+
+def test_what_was_handed_out_does_not_change_later() -> None:
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
+    first = tracker.update(skeleton(1))
+    assert first is not None
+    kept = first.positions.copy()
+    run(tracker, np.stack([BODY + 0.01] * 5), start_ns=1 + FRAME_NS)
+    assert_array_equal(first.positions, kept)
+
+
+def test_the_zero_velocity_model_has_no_velocity() -> None:
+    result = LinearKalmanFilter(ZERO_VELOCITY).update(skeleton(1))
+    assert result is not None and result.velocities is not None and np.isnan(result.velocities).all()
+
+
+def test_a_steady_motion_is_followed_without_lag() -> None:
+    """Constant velocity is the model: position and velocity are exact once the start is forgotten."""
+    velocity = np.array([1.5, -0.5, 0.2])
+    truth = np.stack([BODY + velocity * k / 30 for k in range(60)])
+    last = run(LinearKalmanFilter(CONSTANT_VELOCITY), truth)[-1]
+    assert last.velocities is not None
+    assert_allclose(last.positions, truth[-1], atol=1e-4)
+    assert_allclose(last.velocities, np.broadcast_to(velocity, (N_JOINTS, 3)), atol=1e-3)
+
+
+def test_names_and_parameters_are_checked() -> None:
+    assert {make_filter(name, gate_probability=0.99).counters["frames"] for name in FILTERS} == {0}
+    with pytest.raises(FilterError, match="unknown filter 'ekg'"):
+        make_filter("ekg")
+    with pytest.raises(FilterError, match="unknown parameter"):
+        make_filter(CONSTANT_VELOCITY, gate=1.0)
+    with pytest.raises(FilterError, match=r"gate_probability: 2\.0"):
+        make_filter(CONSTANT_VELOCITY, gate_probability=2.0)
+    with pytest.raises(FilterError, match="predict_for: nan"):
+        make_filter(CONSTANT_VELOCITY, predict_for=float("nan"))
+
+
+def test_every_parameter_says_what_it_is() -> None:
+    for item in fields(LinearKalmanParameters):
+        assert item.metadata["doc"] and item.metadata["min"] <= item.default <= item.metadata["max"]
