@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
+from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 
 ZERO_VELOCITY = "lkf_zero_velocity"
@@ -30,6 +31,8 @@ LINEAR_MODELS = (ZERO_VELOCITY, CONSTANT_VELOCITY)
 
 _MAX_RANGE = 100.0
 """A coordinate beyond this many metres is no measurement of a person but a damaged number."""
+_REFERENCE_DISTANCE = 2.0
+"""Metres within which the measurement noise no longer shrinks."""
 _EYE3 = np.eye(3)
 
 
@@ -99,26 +102,18 @@ class LinearKalmanParameters:
             "max": 1e3,
         },
     )
-    tracked_stddev: float = field(
-        default=0.015,
+    measurement_noise_scale: float = field(
+        default=1.0,
         metadata={
-            "doc": "noise per axis of a tracked joint 2 m away, where the skeleton brings no covariance",
-            "unit": "m",
-            "min": 1e-4,
-            "max": 1.0,
-        },
-    )
-    inferred_stddev: float = field(
-        default=0.06,
-        metadata={
-            "doc": "noise per axis of an inferred joint 2 m away, where the skeleton brings no covariance",
-            "unit": "m",
-            "min": 1e-4,
-            "max": 1.0,
+            "doc": "where the skeleton brings no covariance: factor on the standard deviation per joint, tracking "
+            "state and distance of body_tracking.measurement",
+            "unit": "",
+            "min": 0.01,
+            "max": 100.0,
         },
     )
     white_noise_share: float = field(
-        default=0.25,
+        default=0.06,
         metadata={
             "doc": "share of the measurement variance that is new in every frame, and is filtered; the rest is a slow "
             "error that no filter can remove, and is added to the covariance of the result",
@@ -339,20 +334,23 @@ class LinearKalmanFilter:
             return self._modelled_noise(skeleton, positions, measured)
         noise = np.where(measured[:, None, None], skeleton.covariances, _EYE3)
         try:
-            np.linalg.cholesky(noise)  # raises on NaN as well
+            sound_all = noise.max() < _MAX_RANGE**2  # False for NaN and infinity too
+            np.linalg.cholesky(noise)
         except np.linalg.LinAlgError:
-            noise[~np.isfinite(noise).all(axis=(1, 2))] = 0.0
+            sound_all = False
+        if not sound_all:
+            noise[~(np.abs(noise) < _MAX_RANGE**2).all(axis=(1, 2))] = 0.0
             sound = np.linalg.eigvalsh(noise)[:, 0] > 0.0
             self.counters["damaged"] += int((~sound).sum())
             noise = np.where(sound[:, None, None], noise, self._modelled_noise(skeleton, positions, measured))
         return noise
 
     def _modelled_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
-        """(25, 3, 3) isotropic, by tracking state, growing with the square of the distance beyond 2 m."""
-        p = self.parameters
-        stddev = np.where(skeleton.states == TrackingState.TRACKED, p.tracked_stddev, p.inferred_stddev)
-        growth = 0.5 + 0.125 * np.einsum("ij,ij->i", positions, positions)  # 1 at 2 m
-        return np.where(measured, (stddev * growth) ** 2, 1.0)[:, None, None] * _EYE3
+        """(25, 3, 3) by joint, tracking state and distance from the frame's origin, where a sensor stands."""
+        inferred = np.where(skeleton.states == TrackingState.TRACKED, 1.0, INFERRED_FACTOR)
+        distance = np.maximum(np.sqrt(np.einsum("ij,ij->i", positions, positions)) / _REFERENCE_DISTANCE, 1.0)
+        stddev = self.parameters.measurement_noise_scale * BASE_STDDEV * inferred * distance
+        return np.where(measured, stddev**2, 1.0)[:, None, None] * _EYE3
 
     def _filter(self, positions: FloatArray, noise: FloatArray, observed: BoolArray, step: float) -> BoolArray:
         """Predict all joints, update the observed ones, take back those beyond the gate; returns (25,) these."""

@@ -218,7 +218,7 @@ def test_an_outlier_is_rejected_and_a_move_for_good_is_followed() -> None:
 
 
 def test_the_slow_part_of_the_noise_opens_the_gate_and_stays_in_the_covariance() -> None:
-    """A jump by 1.5 stated standard deviations per axis is no outlier, though it is far beyond the white part of the noise."""
+    """A jump by 1.5 stated standard deviations is no outlier, though far beyond the white part of the noise."""
     tracker = LinearKalmanFilter(CONSTANT_VELOCITY, LinearKalmanParameters(white_noise_share=0.01))
     noise = np.broadcast_to(np.eye(3) * 0.03**2, (N_JOINTS, 3, 3))
     for k in range(60):
@@ -264,7 +264,7 @@ def test_no_number_whatever_gets_into_the_state(
 ) -> None:
     tracker = LinearKalmanFilter(model)
     covariances = np.broadcast_to(np.eye(3) * 1e-4, (N_JOINTS, 3, 3)).copy()
-    covariances[::2] = covariance
+    covariances[::2] = np.triu(covariance) + np.triu(covariance, 1).T
     tracker.update(skeleton(1, positions, states, covariances))
     for k in range(1, 30):
         result = tracker.update(skeleton(1 + k * FRAME_NS))
