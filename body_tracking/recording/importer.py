@@ -1,0 +1,310 @@
+"""``body_tracking import``: recordings of other formats, one or several views, as one bag.
+
+A message's header stamp is the sensor's own clock exactly as recorded; the bag's log time is the time of receipt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.messages import POINT_CLOUD, skeletons_to_cloud
+from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
+from body_tracking.sensors import RecordedFrame, Recording
+from body_tracking.sensors.csv_recording import CsvRecording, sensor_column
+from body_tracking.sensors.ntu import NtuRecording
+from body_tracking.skeleton import NANOSECONDS
+
+CSV_SUFFIXES = (".csv", ".csv.gz")
+NTU_SUFFIX = ".skeleton"
+
+
+class ImportFileError(BodyTrackingError):
+    """Files that cannot be imported, or not together."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedSensor:
+    """What was imported of one sensor.
+
+    Attributes:
+        frames: messages.
+        bodies: the most bodies in one frame.
+        seconds: from the first to the last receipt.
+    """
+
+    frames: int
+    bodies: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """What an import did.
+
+    Attributes:
+        bag: the folder.
+        sensors: by name.
+        seconds: from the first to the last receipt of all.
+        problems: how often each kind of oddity was met; all of it was imported as recorded.
+        warnings: what is missing.
+    """
+
+    bag: Path
+    sensors: dict[str, ImportedSensor]
+    seconds: float
+    problems: dict[str, int]
+    warnings: list[str]
+
+    @property
+    def frames(self) -> int:
+        """Messages of all sensors."""
+        return sum(sensor.frames for sensor in self.sensors.values())
+
+    def as_json(self) -> str:
+        """One JSON object."""
+        return json.dumps(
+            {
+                "bag": str(self.bag),
+                "frames": self.frames,
+                "recording_s": self.seconds,
+                "sensors": {
+                    name: {"frames": sensor.frames, "bodies": sensor.bodies, "seconds": sensor.seconds}
+                    for name, sensor in self.sensors.items()
+                },
+                "problems": self.problems,
+                "warnings": self.warnings,
+            },
+            indent=2,
+        )
+
+
+@dataclass(slots=True)
+class _Tally:
+    frames: int = 0
+    bodies: int = 0
+    times_ns: list[int] = field(default_factory=list)
+
+    def add(self, frame: RecordedFrame) -> None:
+        self.frames += 1
+        self.bodies = max(self.bodies, len(frame.skeletons))
+        times = (*self.times_ns, frame.received_ns)
+        self.times_ns = [min(times), max(times)]
+
+    @property
+    def seconds(self) -> float:
+        return (self.times_ns[1] - self.times_ns[0]) / NANOSECONDS if self.times_ns else 0.0
+
+
+def open_recording(path: Path, sensor: str | None = None, partial: bool = False) -> Recording:
+    """The reader for a file, chosen by its suffix.
+
+    Args:
+        path: ``.csv``, ``.csv.gz`` or ``.skeleton``.
+        sensor: the sensor's name, where the file does not tell it or tells another.
+        partial: read a file that is cut off up to its last whole frame.
+
+    Raises:
+        ImportFileError: another suffix, or no such file.
+    """
+    if not path.is_file():
+        raise ImportFileError(f"{path}: no such file")
+    if path.name.lower().endswith(CSV_SUFFIXES):
+        return CsvRecording(path, sensor, partial)
+    if path.suffix.lower() == NTU_SUFFIX:
+        return NtuRecording(path, sensor, partial)
+    raise ImportFileError(f"{path}: not a {', '.join((*CSV_SUFFIXES, NTU_SUFFIX))} file")
+
+
+def import_files(
+    files: Sequence[Path],
+    bag: Path,
+    *,
+    sensors: Mapping[Path, str] | None = None,
+    overwrite: bool = False,
+    partial: bool = False,
+    progress: bool = False,
+) -> ImportReport:
+    """Import recordings into one bag, merged in time order.
+
+    Args:
+        files: each with sensors of its own.
+        bag: the folder to make.
+        sensors: names for files, where a file does not tell its sensor or tells another. A CSV file without the column
+            ``sensor`` is ``kinect1`` without this, the next one ``kinect2``.
+        overwrite: replace a bag that is there.
+        partial: import files that are cut off as far as they go.
+        progress: show on stderr how far it is.
+
+    Raises:
+        BodyTrackingError: a file is not as its format says, or two files have a sensor in common, or the bag cannot be
+            written. No bag is left then.
+    """
+    if not files:
+        raise ImportFileError("no file to import")
+    twice = [str(path) for path, count in Counter(files).items() if count > 1]
+    if twice:
+        raise ImportFileError(f"{twice[0]}: is to be imported twice")
+    recordings = [
+        open_recording(path, name, partial) for path, name in zip(files, _names(files, sensors or {}), strict=True)
+    ]
+    tallies: dict[str, _Tally] = {}
+    owners: dict[str, Path] = {}
+    # Read once before anything that is there is replaced: a file that turns out to be bad must not cost a bag.
+    if overwrite and bag.exists():
+        for recording in recordings:
+            for _ in recording:
+                pass
+    writer = BagWriter(bag, overwrite=overwrite, flush_interval_s=float("inf"))
+    try:
+        shown = _Progress(recordings) if progress else None
+        streams = [_ordered(recording, number) for number, recording in enumerate(recordings)]
+        for _, number, frame in heapq.merge(*streams, key=lambda item: item[:2]):
+            path = files[number]
+            if owners.setdefault(frame.sensor, path) != path:
+                raise ImportFileError(f"sensor {frame.sensor!r} is in {owners[frame.sensor]} and in {path}")
+            topic = f"/{frame.sensor}/skeleton"
+            if frame.sensor not in tallies:
+                writer.add_topic(topic, POINT_CLOUD, SENSOR_DATA)
+                tallies[frame.sensor] = _Tally()
+            writer.write_message(topic, skeletons_to_cloud(frame.skeletons, BAG_MESSAGES), frame.received_ns)
+            tallies[frame.sensor].add(frame)
+            if shown is not None:
+                shown.update()
+        if shown is not None:
+            shown.end()
+        if not tallies:
+            raise ImportFileError(f"{', '.join(map(str, files))}: no body in any frame")
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+    problems: Counter[str] = Counter()
+    for recording in recordings:
+        problems.update(recording.problems)
+    times = [value for tally in tallies.values() for value in tally.times_ns]
+    return ImportReport(
+        bag=bag,
+        sensors={
+            name: ImportedSensor(tally.frames, tally.bodies, tally.seconds) for name, tally in sorted(tallies.items())
+        },
+        seconds=(max(times) - min(times)) / NANOSECONDS,
+        problems=dict(problems),
+        warnings=[warning for recording in recordings for warning in recording.warnings],
+    )
+
+
+def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]:
+    """The name to give to each file's sensor; None where the file itself tells it."""
+    unknown = [path for path in given if path not in files]
+    if unknown:
+        raise ImportFileError(f"--sensor {given[unknown[0]]}={unknown[0]}: no such file is imported")
+    names: list[str | None] = []
+    for path in files:
+        name = given.get(path)
+        if name is None and path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and not sensor_column(path):
+            name = f"kinect{sum(value is not None for value in names) + 1}"
+        names.append(name)
+    return names
+
+
+def _ordered(recording: Recording, number: int) -> Iterator[tuple[int, int, RecordedFrame]]:
+    """Frames with a key that never falls, so that merging keeps each file's own order."""
+    latest = -(2**63)
+    for frame in recording:
+        latest = max(latest, frame.received_ns)
+        yield latest, number, frame
+
+
+class _Progress:
+    """One line on stderr that is written over; nothing where stderr is no terminal, or for short imports."""
+
+    def __init__(self, recordings: Sequence[Recording]) -> None:
+        self._recordings = recordings
+        self._due_s = time.monotonic() + 1.0
+        self._shown = False
+
+    def update(self) -> None:
+        if time.monotonic() < self._due_s or not sys.stderr.isatty():
+            return
+        self._due_s = time.monotonic() + 0.2
+        self._shown = True
+        done = sum(recording.progress for recording in self._recordings) / len(self._recordings)
+        print(f"\rimporting {done:5.1%}", end="", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        if self._shown:
+            print("\r                 \r", end="", file=sys.stderr, flush=True)
+
+
+# --- command line
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``import`` to the ``body_tracking`` command."""
+    parser = subparsers.add_parser(
+        "import",
+        help="turn CSV recordings or NTU RGB+D .skeleton files into a bag",
+        description="Turn recordings into one bag with a topic /<sensor>/skeleton per sensor. Header stamps are the "
+        "sensors' own clocks as recorded, the bag's log time is the time of receipt. Formats: docs/recordings.md.",
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz or .skeleton")
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="BAG", help="the bag (a folder) to make")
+    parser.add_argument(
+        "--sensor",
+        action="append",
+        default=[],
+        metavar="NAME[=FILE]",
+        help="the sensor's name, where the file does not tell it or tells another; with several files, once per file",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
+    parser.add_argument("--partial", action="store_true", help="import files that are cut off as far as they go")
+    parser.add_argument("--json", action="store_true", help="print what was imported as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """``body_tracking import``."""
+    report = import_files(
+        args.files,
+        args.output,
+        sensors=_parse_sensors(args.sensor, args.files),
+        overwrite=args.overwrite,
+        partial=args.partial,
+        progress=True,
+    )
+    if args.json:
+        print(report.as_json())
+        return 0
+    for name, sensor in report.sensors.items():
+        bodies = f", up to {sensor.bodies} bodies" if sensor.bodies > 1 else ""
+        print(f"/{name}/skeleton: {sensor.frames} frames in {sensor.seconds:.1f} s{bodies}")
+    for problem, count in report.problems.items():
+        print(f"counted: {count} {problem}")
+    for warning in report.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(f"{report.bag}: {report.frames} frames, {report.seconds:.1f} s")
+    return 0
+
+
+def _parse_sensors(options: Sequence[str], files: Sequence[Path]) -> dict[Path, str]:
+    """``NAME=FILE``, or ``NAME`` for the only file."""
+    names: dict[Path, str] = {}
+    for option in options:
+        name, equals, file = option.partition("=")
+        if not equals and len(files) > 1:
+            raise ImportFileError(f"--sensor {name}: of which of the {len(files)} files? --sensor {name}=FILE")
+        path = Path(file) if equals else files[0]
+        if path in names:
+            raise ImportFileError(f"--sensor {option}: {path} has the name {names[path]} already")
+        names[path] = name
+    return names
