@@ -1,0 +1,320 @@
+"""Joint angles from joint positions alone, with their uncertainty.
+
+Every angle is one of two elementary ones, so that the Jacobian is analytic and everything runs as arrays: the angle
+between two vectors, and the angle between two vectors seen along a third (a dihedral angle).
+
+========================== ======================================================================== ============
+angle                      0, and what is positive                                                  range (deg)
+========================== ======================================================================== ============
+trunk_flexion              upright; leaning forward                                                 -180 .. 180
+trunk_lateral_lean         upright; leaning to the person's right                                    -90 .. 90
+trunk_axial_lean           shoulder line above hip line; chest turned to the person's left          -180 .. 180
+shoulder_elevation_*       upper arm along the trunk, downwards; raised                                0 .. 180
+shoulder_plane_*           abduction (arm raised sideways); +90 flexion (forwards), -90 extension   -180 .. 180
+humeral_rotation_*         bent forearm perpendicular to the plane of trunk axis and upper arm, in
+                           front of it (arm raised sideways: pointing forward); internal rotation   -180 .. 180
+elbow_flexion_*            straight; bent                                                              0 .. 180
+clavicle_elevation_*       shoulder on the level of SpineShoulder along the trunk; raised            -90 .. 90
+========================== ======================================================================== ============
+
+The trunk axis of the lean angles runs from SpineBase to SpineShoulder; its flexion and lateral lean are those of the
+Cardan sequence flexion, lateral, axial (ISB: Wu 2005, thorax), relative to the vertical and to the person's heading,
+the horizontal direction of the hip line: turning the whole person changes nothing. Signs are right-handed rotations
+about the person's left, forward and upward axes. Thorax axes for the arms: up from SpineMid to SpineShoulder; left
+along the shoulder line. Elevation, plane and humeral rotation are the three angles of the ISB's Y-X-Y sequence (Wu
+2005, glenohumeral): plane of elevation, elevation (there negative), axial rotation; internal rotation is positive.
+
+Kinect's SpineShoulder lies a little above the shoulders: a relaxed clavicle reads some -10 deg.
+
+The signed angles are cut at +-180 deg, where no joint of a person can be (such as an upper arm that points straight at
+the other shoulder); within a person's range of motion they are continuous, but for the singularities below.
+
+Uncertainty: first order in the joint covariances, joints independent of each other. Where an angle is the length of a
+deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which the first order does
+not see. A plane of elevation with the arm at the side and the rotation of a straight or vertical arm turn about an axis
+that the positions do not show: the standard deviation grows like 1/sin, and is infinity where the deflection that gives
+the direction is not significant, that is within its own 95 % ellipse of zero (beyond 0.41 rad).
+
+Velocities are the Jacobian times the joint velocities. A skeleton brings no covariance of its velocities; the stated
+deviation rests on a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman
+filter in its steady state is (2 q^2 p)^(1/3) with p its position variance, and (3 q^2 p)^(1/3) after a long prediction
+without measurements; so the second is taken, with the densities of human movement in ``kinematics.motion``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.motion import joint_densities
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
+
+ANGLE_NAMES: tuple[str, ...] = (
+    "trunk_flexion",
+    "trunk_lateral_lean",
+    "trunk_axial_lean",
+    "shoulder_elevation_left",
+    "shoulder_elevation_right",
+    "shoulder_plane_left",
+    "shoulder_plane_right",
+    "humeral_rotation_left",
+    "humeral_rotation_right",
+    "elbow_flexion_left",
+    "elbow_flexion_right",
+    "clavicle_elevation_left",
+    "clavicle_elevation_right",
+)
+"""The angles of :func:`positional_angles`, in order; the module's text defines them."""
+
+_J = Joint
+_VECTORS: dict[str, tuple[Joint, Joint]] = {
+    "trunk": (_J.SPINE_BASE, _J.SPINE_SHOULDER),
+    "thorax": (_J.SPINE_MID, _J.SPINE_SHOULDER),
+    "hips": (_J.HIP_RIGHT, _J.HIP_LEFT),
+    "shoulders": (_J.SHOULDER_RIGHT, _J.SHOULDER_LEFT),
+    "upper_arm_left": (_J.SHOULDER_LEFT, _J.ELBOW_LEFT),
+    "upper_arm_right": (_J.SHOULDER_RIGHT, _J.ELBOW_RIGHT),
+    "forearm_left": (_J.ELBOW_LEFT, _J.WRIST_LEFT),
+    "forearm_right": (_J.ELBOW_RIGHT, _J.WRIST_RIGHT),
+    "clavicle_left": (_J.SPINE_SHOULDER, _J.SHOULDER_LEFT),
+    "clavicle_right": (_J.SPINE_SHOULDER, _J.SHOULDER_RIGHT),
+}
+"""(from, to) of the vectors that the angles are made of."""
+
+# Two more vectors follow those of the table: the heading (the hip line's horizontal part) and the vertical.
+_NAMES = (*_VECTORS, "heading", "vertical")
+_N_VECTORS = len(_VECTORS)
+
+# (angle, vector a, vector b, sign of the angle between them, radians to add)
+_BETWEEN = (
+    ("trunk_lateral_lean", "trunk", "heading", 1.0, -np.pi / 2),
+    ("shoulder_elevation_left", "upper_arm_left", "thorax", -1.0, np.pi),
+    ("shoulder_elevation_right", "upper_arm_right", "thorax", -1.0, np.pi),
+    ("elbow_flexion_left", "upper_arm_left", "forearm_left", 1.0, 0.0),
+    ("elbow_flexion_right", "upper_arm_right", "forearm_right", 1.0, 0.0),
+    ("clavicle_elevation_left", "clavicle_left", "thorax", -1.0, np.pi / 2),
+    ("clavicle_elevation_right", "clavicle_right", "thorax", -1.0, np.pi / 2),
+)
+
+# (angle, axis, sign of the axis, from vector, sign, to vector, quarter turns to add): from "from" to "to" about "axis"
+_DIHEDRAL = (
+    ("trunk_flexion", "heading", 1.0, "vertical", 1.0, "trunk", 0),
+    ("trunk_axial_lean", "trunk", 1.0, "hips", 1.0, "shoulders", 0),
+    ("shoulder_plane_left", "thorax", -1.0, "shoulders", 1.0, "upper_arm_left", 0),
+    ("shoulder_plane_right", "thorax", 1.0, "shoulders", -1.0, "upper_arm_right", 0),
+    ("humeral_rotation_left", "upper_arm_left", 1.0, "thorax", 1.0, "forearm_left", -1),
+    ("humeral_rotation_right", "upper_arm_right", -1.0, "thorax", 1.0, "forearm_right", -1),
+)
+
+
+def _indices(names: list[str]) -> IntArray:
+    return np.array([_NAMES.index(name) for name in names], dtype=np.intp)
+
+
+_FROM, _TO = (np.array([pair[end] for pair in _VECTORS.values()], dtype=np.intp) for end in (0, 1))
+_HIPS = _NAMES.index("hips")
+
+_B_A, _B_B = _indices([row[1] for row in _BETWEEN]), _indices([row[2] for row in _BETWEEN])
+_B_SIGN, _B_OFFSET = np.array([row[3] for row in _BETWEEN]), np.array([row[4] for row in _BETWEEN])
+
+_D_AXIS, _D_P, _D_Q = (_indices([str(row[column]) for row in _DIHEDRAL]) for column in (1, 3, 5))
+_D_AXIS_SIGN, _D_P_SIGN = np.array([row[2] for row in _DIHEDRAL]), np.array([row[4] for row in _DIHEDRAL])
+_D_TURNED = np.array([row[6] != 0 for row in _DIHEDRAL])
+
+_ORDER = np.array([[row[0] for row in (*_BETWEEN, *_DIHEDRAL)].index(name) for name in ANGLE_NAMES], dtype=np.intp)
+"""Row of the two tables, one after the other, for each name."""
+_N_BETWEEN, _N_ANGLES = len(_BETWEEN), len(ANGLE_NAMES)
+
+_JOINTS: IntArray = np.unique(np.concatenate([_FROM, _TO]))
+"""The joints that any angle uses."""
+
+
+def _incidence() -> FloatArray:
+    """(joints, vectors + 2): the derivative of each vector by each used joint, as a factor; the vertical has none."""
+    incidence = np.zeros((len(_JOINTS), _N_VECTORS + 2))
+    for column, (start, end) in enumerate(_VECTORS.values()):
+        incidence[np.searchsorted(_JOINTS, start), column] = -1.0
+        incidence[np.searchsorted(_JOINTS, end), column] = 1.0
+    incidence[:, _N_VECTORS] = incidence[:, _HIPS]
+    return incidence
+
+
+def _slots() -> tuple[FloatArray, FloatArray]:
+    """Incidence of the gradients' slots: (7, joints, 2) of the angles between, (6, joints, 3) of the dihedral ones."""
+    incidence = _incidence()
+    return (
+        np.stack([incidence[:, _B_A], incidence[:, _B_B]], axis=-1).transpose(1, 0, 2),
+        np.stack([incidence[:, _D_AXIS], incidence[:, _D_P], incidence[:, _D_Q]], axis=-1).transpose(1, 0, 2),
+    )
+
+
+_B_SLOTS, _D_SLOTS = _slots()
+_USED = np.concatenate([(_B_SLOTS != 0).any(axis=2), (_D_SLOTS != 0).any(axis=2)])[_ORDER].T
+"""(joints, angles) which joint takes part in which angle."""
+_B_HEADING, _D_HEADING = (int(np.flatnonzero(column == _N_VECTORS)[0]) for column in (_B_B, _D_AXIS))
+_NO_FOLD = np.zeros((_N_ANGLES - _N_BETWEEN, len(_JOINTS), 3))
+_DENSITIES_SQUARED = 3.0 * joint_densities()[_JOINTS, None] ** 2
+
+_TINY = 1e-18
+"""Square metres below which a squared length is none."""
+_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
+_SINGULAR = 1e-6
+"""Sine below which a vector lies along the axis that it should turn about."""
+_MAX_STDDEV = np.where(_ORDER < _N_BETWEEN, np.pi / np.sqrt(12.0), 1.0 / np.sqrt(chi2.ppf(0.95, 2)))
+"""(n,) radians from which an angle is unknown: the standard deviation of a uniform one (0 to 180 deg), and that of a
+direction whose vector is not significantly longer than zero."""
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product of (3, n) arrays; numpy's own takes three times as long on so few."""
+    return a.take(_YZX, axis=0) * b.take(_ZXY, axis=0) - a.take(_ZXY, axis=0) * b.take(_YZX, axis=0)
+
+
+def _vectors(positions: FloatArray) -> FloatArray:
+    """(3, 12) the vectors of the table, the heading and the vertical; NaN where a joint is NaN."""
+    vectors = np.empty((3, _N_VECTORS + 2))
+    vectors[:, :_N_VECTORS] = (positions[_TO] - positions[_FROM]).T
+    vectors[:2, _N_VECTORS] = vectors[:2, _HIPS]
+    vectors[2, _N_VECTORS] = 0.0
+    vectors[:, _N_VECTORS + 1] = 0.0, 0.0, 1.0
+    return vectors
+
+
+def _between(
+    a: FloatArray, b: FloatArray, aa: FloatArray, bb: FloatArray, ab: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Angles between the columns of two (3, n) arrays, given with their dot products.
+
+    Returns:
+        (n,) angles from 0 to pi, (n,) their sines, (2, 3, n) gradients by a and b, (2, 3, n) gradients of the
+        deflection across the plane of a and b, by which the angle changes to first order only where it is 0 or pi.
+    """
+    scale = np.sqrt(aa * bb)
+    normal = _cross(a, b)
+    area = np.sqrt((normal * normal).sum(axis=0))
+    angle, sine = np.arctan2(area, ab), area / scale
+    gradient = np.stack([a * (ab / aa) - b, b * (ab / bb) - a])
+    flat = sine < _SINGULAR
+    if flat.any():  # every direction across a is as good
+        least = np.eye(3)[:, np.abs(a[:, flat]).argmin(axis=0)]
+        normal[:, flat] = _cross(a[:, flat], least)
+        area[flat] = np.sqrt((normal[:, flat] ** 2).sum(axis=0))
+        gradient[0][:, flat] = _cross(a[:, flat], normal[:, flat]) / aa[flat]
+        gradient[1][:, flat] = _cross(normal[:, flat], b[:, flat]) / bb[flat]
+    across = np.stack([normal * (-ab / (scale * np.sqrt(aa))), normal / np.sqrt(bb)])
+    return angle, sine, gradient / area, across / area
+
+
+def _dihedral(
+    n: FloatArray, p: FloatArray, q: FloatArray, nn: FloatArray, np_: FloatArray, nq: FloatArray, pq: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Angles from p to q about n, columns of (3, m) arrays, given with dot products (Blondel and Karplus 1996).
+
+    Returns:
+        (m,) sines and (m,) cosines, scaled alike; (3, 3, m) gradients by n, p and q; (m,) and (m,) the squared areas of
+        (n, p) and (n, q), one of which is 0 where the angle is not defined.
+    """
+    length = np.sqrt(nn)
+    a, b = _cross(n, p), _cross(n, q)
+    aa, bb = (a * a).sum(axis=0), (b * b).sum(axis=0)
+    # the floor keeps the gradient finite, and huge, at the singularity
+    by_p, by_q = a / np.maximum(aa, _TINY), b / np.maximum(bb, _TINY)
+    gradient = np.stack([by_p * np_ - by_q * nq, by_p * -nn, by_q * nn]) / length
+    return length * (a * q).sum(axis=0), nn * pq - np_ * nq, gradient, aa, bb
+
+
+def positional_angles(skeleton: Skeleton) -> JointAngles:
+    """The angles of ``ANGLE_NAMES`` of one body; see the module's text for their definitions.
+
+    Args:
+        skeleton: in a frame with z up, usually ``/filtered/skeleton``.
+
+    Returns:
+        Angles in radians. An angle that needs an unknown joint, or two joints at the same place, is NaN with an
+        infinite standard deviation. Without covariances in the skeleton every standard deviation is infinite, without
+        velocities every velocity is NaN.
+    """
+    with np.errstate(all="ignore"):  # NaN and infinity are values here: they say that something is not known
+        positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
+        angles, jacobian, across, fold, singular = _angles_and_jacobians(positions)
+        unknown = np.isnan(angles) | singular
+        stddev = rate_stddev = np.full(_N_ANGLES, np.inf)
+        if skeleton.covariances is not None:
+            covariances = skeleton.covariances[_JOINTS]
+            variances = np.where(_USED, ((jacobian @ covariances) * jacobian).sum(axis=2), 0.0)
+            variance = variances.sum(axis=0)
+            # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far
+            # from it none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
+            variance_across = np.where(_USED, ((across @ covariances) * across).sum(axis=2), 0.0).sum(axis=0)
+            variance = variance + variance_across * np.minimum(1.0, 2.0 * variance_across / fold**2)
+            stddev = np.sqrt(variance)
+            unknown |= ~np.isfinite(stddev) | (stddev > _MAX_STDDEV)
+            stddev[unknown] = np.inf
+        rates = np.full(_N_ANGLES, np.nan)
+        if skeleton.velocities is not None:
+            parts = (jacobian * skeleton.velocities[_JOINTS, None, :]).sum(axis=2)
+            rates = np.where(_USED, parts, 0.0).sum(axis=0)
+            if skeleton.covariances is not None:
+                steepness = (jacobian * jacobian).sum(axis=2)
+                bounds = np.cbrt(_DENSITIES_SQUARED * steepness**2 * variances)
+                rate_stddev = np.sqrt(np.where(_USED, bounds, 0.0).sum(axis=0))
+                rate_stddev[unknown | np.isnan(rates)] = np.inf
+    return JointAngles(skeleton.stamp_ns, ANGLE_NAMES, angles, rates, stddev, rate_stddev)
+
+
+def _angles_and_jacobians(
+    positions: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """All angles and their derivatives.
+
+    Args:
+        positions: (25, 3) metres, NaN where unknown.
+
+    Returns:
+        (n,) angles; (joints, n, 3) their Jacobian by the used joints; (joints, n, 3) that of the deflection across the
+        fold (zero for dihedral angles); (n,) the sine of the distance from the fold (one for dihedral angles); (n,)
+        dihedral angles that turn about an axis along one of their vectors.
+    """
+    vectors = _vectors(positions)
+    dots = vectors.T @ vectors
+    squares = dots.diagonal().copy()
+    squares[squares < _TINY] = np.nan  # two joints at one place have no direction
+
+    between, sine, gradient, across = _between(
+        vectors[:, _B_A], vectors[:, _B_B], squares[_B_A], squares[_B_B], dots[_B_A, _B_B]
+    )
+    gradient *= _B_SIGN
+
+    y, x, turn_gradient, area_p, area_q = _dihedral(
+        vectors[:, _D_AXIS] * _D_AXIS_SIGN,
+        vectors[:, _D_P] * _D_P_SIGN,
+        vectors[:, _D_Q],
+        squares[_D_AXIS],
+        dots[_D_AXIS, _D_P] * (_D_AXIS_SIGN * _D_P_SIGN),
+        dots[_D_AXIS, _D_Q] * _D_AXIS_SIGN,
+        dots[_D_P, _D_Q] * _D_P_SIGN,
+    )
+    smaller = np.minimum(area_p / squares[_D_P], area_q / squares[_D_Q]) / squares[_D_AXIS]
+    dihedral = np.where(_D_TURNED, np.arctan2(-x, y), np.arctan2(y, x))  # a quarter turn back
+    turn_gradient[0] *= _D_AXIS_SIGN
+    turn_gradient[1] *= _D_P_SIGN
+
+    # the heading is the horizontal part of the hip line
+    gradient[1, 2, _B_HEADING] = across[1, 2, _B_HEADING] = 0.0
+    turn_gradient[0, 2, _D_HEADING] = 0.0
+
+    between = between + 0.0 * sine  # NaN where a vector has no length
+    dihedral = dihedral + 0.0 * smaller
+    angles = np.concatenate([_B_SIGN * between + _B_OFFSET, dihedral])
+    jacobian = np.concatenate([_B_SLOTS @ gradient.transpose(2, 0, 1), _D_SLOTS @ turn_gradient.transpose(2, 0, 1)])
+    jacobian_across = np.concatenate([_B_SLOTS @ across.transpose(2, 0, 1), _NO_FOLD])
+    fold = np.concatenate([sine, np.ones(_N_ANGLES - _N_BETWEEN)])
+    singular = np.concatenate([np.zeros(_N_BETWEEN, dtype=bool), ~(smaller > _SINGULAR**2)])
+    return (
+        angles[_ORDER],
+        jacobian[_ORDER].transpose(1, 0, 2),
+        jacobian_across[_ORDER].transpose(1, 0, 2),
+        fold[_ORDER],
+        singular[_ORDER],
+    )

@@ -1,0 +1,308 @@
+"""Angles from positions: known poses, invariances, derivatives, and a standard deviation that is meant."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.common import Q_continuous_white_noise
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.linalg import solve_discrete_are
+from scipy.spatial.transform import Rotation
+
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, JOINT_CLASSES, joint_densities
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.skeleton import MIRROR, N_JOINTS, FloatArray, Joint, Skeleton, TrackingState
+
+TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+UP, FORWARD, LEFT = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+
+def arm(positions: FloatArray, side: str, upper: FloatArray, forearm: FloatArray) -> None:
+    """Lay an arm along two directions (unit vectors)."""
+    shoulder, elbow, wrist = (Joint[f"{name}_{side}"] for name in ("SHOULDER", "ELBOW", "WRIST"))
+    positions[elbow] = positions[shoulder] + 0.3 * upper
+    positions[wrist] = positions[elbow] + 0.25 * forearm
+
+
+def t_pose() -> FloatArray:
+    """(25, 3) metres; facing x, z up, shoulders on the level of SpineShoulder."""
+    positions = np.zeros((N_JOINTS, 3))
+    positions[[Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER], 2] = 1.0, 1.25, 1.5
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        positions[Joint[f"HIP_{side}"]] = [0.0, 0.1 * sign, 0.95]
+        positions[Joint[f"SHOULDER_{side}"]] = [0.0, 0.18 * sign, 1.5]
+        arm(positions, side, sign * LEFT, sign * LEFT)
+    return positions
+
+
+def bent_pose(seed: int) -> FloatArray:
+    """A pose of a moving person, away from every singularity."""
+    rng = np.random.default_rng(seed)
+    positions = t_pose()
+    upper = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3))
+    for joint in range(N_JOINTS):
+        if Joint(joint).name.split("_")[0] not in ("HIP", "KNEE", "ANKLE", "FOOT") and joint != Joint.SPINE_BASE:
+            positions[joint] = upper.apply(positions[joint] - UP) + UP
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        direction = sign * LEFT + rng.uniform(-0.6, 0.6, 3)
+        bend = FORWARD + rng.uniform(-0.6, 0.6, 3)
+        arm(positions, side, direction / np.linalg.norm(direction), bend / np.linalg.norm(bend))
+    return positions + rng.normal(size=3)
+
+
+def skeleton(positions: FloatArray, stddev: float | None = None, velocities: FloatArray | None = None) -> Skeleton:
+    covariances = None if stddev is None else np.broadcast_to(stddev**2 * np.eye(3), (N_JOINTS, 3, 3))
+    return Skeleton(5, "world", positions, TRACKED, 0, covariances, velocities)
+
+
+def angle(angles: JointAngles, name: str) -> float:
+    return float(np.degrees(angles.position[angles.names.index(name)]))
+
+
+def both(angles: JointAngles, name: str) -> tuple[float, float]:
+    return angle(angles, f"{name}_left"), angle(angles, f"{name}_right")
+
+
+def wrapped(difference: FloatArray) -> FloatArray:
+    return (difference + np.pi) % (2 * np.pi) - np.pi
+
+
+def test_the_t_pose() -> None:
+    angles = positional_angles(skeleton(t_pose(), 0.01))
+    for name, value in zip(ANGLE_NAMES, np.degrees(angles.position), strict=True):
+        assert value == pytest.approx(90.0 if name.startswith("shoulder_elevation") else 0.0, abs=1e-9), name
+    assert angles.stamp_ns == 5 and angles.names == ANGLE_NAMES
+
+
+def test_arms_down_forward_up_and_back() -> None:
+    for direction, elevation, plane in (
+        (-UP, 0.0, None),
+        (FORWARD, 90.0, 90.0),
+        (UP, 180.0, None),
+        (-FORWARD, 90.0, -90.0),
+    ):
+        positions = t_pose()
+        for side in ("LEFT", "RIGHT"):
+            arm(positions, side, direction, direction)
+        angles = positional_angles(skeleton(positions, 0.01))
+        assert both(angles, "shoulder_elevation") == pytest.approx((elevation, elevation), abs=1e-6)
+        assert both(angles, "elbow_flexion") == pytest.approx((0.0, 0.0), abs=1e-6)
+        planes = [angles.names.index(f"shoulder_plane_{side}") for side in ("left", "right")]
+        if plane is None:  # an arm along the trunk has no plane of elevation
+            assert np.isinf(angles.position_stddev[planes]).all()
+        else:
+            assert both(angles, "shoulder_plane") == pytest.approx((plane, plane))
+            assert (angles.position_stddev[planes] < 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("upper", "forearm", "rotation"),
+    [
+        ("side", FORWARD, 0.0),
+        ("side", -UP, 90.0),
+        ("side", UP, -90.0),
+        ("forward", "inwards", 0.0),
+        ("forward", UP, -90.0),
+    ],
+)
+def test_rotation_of_the_humerus_with_the_elbow_at_90_degrees(
+    upper: str, forearm: FloatArray | str, rotation: float
+) -> None:
+    positions = t_pose()
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        arm(
+            positions,
+            side,
+            sign * LEFT if upper == "side" else FORWARD,
+            -sign * LEFT if isinstance(forearm, str) else forearm,
+        )
+    angles = positional_angles(skeleton(positions, 0.01))
+    assert both(angles, "elbow_flexion") == pytest.approx((90.0, 90.0))
+    assert both(angles, "humeral_rotation") == pytest.approx((rotation, rotation), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("flexion", "lateral", "axial"), [(30, 0, 0), (0, 20, 0), (0, 0, -40), (50, -25, 30), (-15, 10, 80)]
+)
+def test_the_trunk_is_a_cardan_sequence(flexion: float, lateral: float, axial: float) -> None:
+    """Flexion about the left, lateral lean about the forward, axial about the upward axis, in this order."""
+    turn = Rotation.from_euler("YXZ", [flexion, lateral, axial], degrees=True)
+    positions = t_pose()
+    above = np.flatnonzero(positions[:, 2] > 1.1)
+    positions[above] = turn.apply(positions[above] - UP) + UP
+    angles = positional_angles(skeleton(positions))
+    assert angle(angles, "trunk_flexion") == pytest.approx(flexion)
+    assert angle(angles, "trunk_lateral_lean") == pytest.approx(lateral)
+    assert angle(angles, "trunk_axial_lean") == pytest.approx(axial)
+    assert both(angles, "shoulder_elevation") == pytest.approx((90.0, 90.0))
+    assert both(angles, "shoulder_plane") == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), turn=st.floats(-np.pi, np.pi), shift=st.tuples(*[st.floats(-5, 5)] * 3))
+@settings(max_examples=40, deadline=None)
+def test_turning_and_moving_the_person_changes_nothing(seed: int, turn: float, shift: tuple[float, ...]) -> None:
+    positions = bent_pose(seed)
+    velocities = np.random.default_rng(seed).normal(size=positions.shape)
+    rotation = Rotation.from_euler("z", turn)
+    moved = rotation.apply(positions) + shift
+    here = positional_angles(skeleton(positions, 0.01, velocities))
+    there = positional_angles(skeleton(moved, 0.01, rotation.apply(velocities)))
+    assert_allclose(wrapped(here.position - there.position), 0.0, atol=1e-9)
+    assert_allclose(here.velocity, there.velocity, atol=1e-8)
+    assert_allclose(here.position_stddev, there.position_stddev, rtol=1e-7)
+    assert_allclose(here.velocity_stddev, there.velocity_stddev, rtol=1e-7)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_the_mirror_exchanges_left_and_right(seed: int) -> None:
+    positions = bent_pose(seed)
+    here = positional_angles(skeleton(positions, 0.01))
+    there = positional_angles(replace(skeleton(positions * [1, -1, 1], 0.01)).mirrored())
+    for name, value, stddev in zip(here.names, there.position, there.position_stddev, strict=True):
+        other = name.replace("left", "LEFT").replace("right", "left").replace("LEFT", "right")
+        sign = -1.0 if name in ("trunk_lateral_lean", "trunk_axial_lean") else 1.0
+        index = here.names.index(other)
+        assert wrapped(sign * value - here.position[index]) == pytest.approx(0.0, abs=1e-9), name
+        assert stddev == pytest.approx(here.position_stddev[index])
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_velocities_are_the_derivative_of_the_angles(seed: int) -> None:
+    """The Jacobian, against central differences along a random motion of all joints."""
+    positions = bent_pose(seed)
+    velocities = np.random.default_rng(seed + 1).normal(size=positions.shape)
+    step = 1e-6
+    later, earlier = (positional_angles(skeleton(positions + s * velocities)).position for s in (step, -step))
+    rates = positional_angles(skeleton(positions, None, velocities)).velocity
+    assert_allclose(rates, wrapped(later - earlier) / (2 * step), rtol=1e-5, atol=1e-6)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_the_jacobian_of_each_joint_and_axis(seed: int) -> None:
+    """A covariance of one joint in one direction gives the square of one derivative."""
+    rng = np.random.default_rng(seed)
+    positions, joint = bent_pose(seed), int(rng.integers(N_JOINTS))
+    direction = rng.normal(size=3)
+    step, tiny = 1e-6, 1e-6
+    covariances = np.zeros((N_JOINTS, 3, 3))
+    covariances[joint] = tiny**2 * np.outer(direction, direction)
+    moved = np.zeros((N_JOINTS, 3))
+    moved[joint] = step * direction
+    later, earlier = (positional_angles(skeleton(positions + s * moved)).position for s in (1, -1))
+    derivative = wrapped(later - earlier) / (2 * step)
+    stddev = positional_angles(replace(skeleton(positions), covariances=covariances)).position_stddev
+    assert_allclose(stddev, np.abs(derivative) * tiny, rtol=1e-4, atol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_standard_deviations_are_those_of_noisy_positions(seed: int) -> None:
+    positions, stddev = bent_pose(seed), 0.006
+    rng = np.random.default_rng(seed)
+    truth = positional_angles(skeleton(positions, stddev))
+    draws = np.array(
+        [
+            positional_angles(skeleton(positions + rng.normal(size=positions.shape) * stddev)).position
+            for _ in range(4000)
+        ]
+    )
+    spread = np.sqrt((wrapped(draws - truth.position) ** 2).mean(axis=0))
+    assert np.isfinite(truth.position_stddev).all()
+    assert_allclose(truth.position_stddev, spread, rtol=0.06)
+
+
+def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
+    """At the fold: 0 deg is within two stated deviations in 95 % of draws, and the rotation is mostly unknown."""
+    rng = np.random.default_rng(3)
+    stddev, count = 0.01, 3000
+    pose = t_pose()
+    elbow, rotation = (ANGLE_NAMES.index(name) for name in ("elbow_flexion_left", "humeral_rotation_left"))
+    inside = unknown = 0
+    for _ in range(count):
+        angles = positional_angles(skeleton(pose + rng.normal(size=pose.shape) * stddev, stddev))
+        inside += angles.position[elbow] < 2 * angles.position_stddev[elbow]
+        unknown += bool(np.isinf(angles.position_stddev[rotation]))
+    assert 0.92 < inside / count < 0.97
+    assert 0.93 < unknown / count < 1.0
+
+
+def test_the_rotation_grows_uncertain_as_one_over_sine_of_the_flexion() -> None:
+    deviations = []
+    for flexion in np.radians([90.0, 60.0, 30.0]):
+        positions = t_pose()
+        arm(positions, "LEFT", LEFT, np.cos(flexion) * LEFT + np.sin(flexion) * FORWARD)
+        angles = positional_angles(skeleton(positions, 1e-4))
+        deviations.append(angles.position_stddev[ANGLE_NAMES.index("humeral_rotation_left")])
+    # the elbow's own part falls with the flexion, the wrist's is 1 / sin
+    assert deviations[0] < deviations[1] < deviations[2]
+    positions = t_pose()
+    wrist_only = np.zeros((N_JOINTS, 3, 3))
+    wrist_only[Joint.WRIST_LEFT] = 1e-8 * np.eye(3)
+    for flexion in np.radians([90.0, 30.0, 5.0]):
+        arm(positions, "LEFT", LEFT, np.cos(flexion) * LEFT + np.sin(flexion) * FORWARD)
+        angles = positional_angles(replace(skeleton(positions), covariances=wrist_only))
+        stddev = angles.position_stddev[ANGLE_NAMES.index("humeral_rotation_left")]
+        assert stddev == pytest.approx(1e-4 / (0.25 * np.sin(flexion)))
+
+
+def test_an_unknown_joint_hides_its_own_angles_and_no_other() -> None:
+    positions = bent_pose(0)
+    positions[Joint.WRIST_LEFT] = np.nan
+    states = TRACKED.copy()
+    states[Joint.ELBOW_RIGHT] = TrackingState.NOT_TRACKED
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        angles = positional_angles(replace(skeleton(positions, 0.01, positions), states=states))
+    hidden = {"elbow_flexion_left", "humeral_rotation_left"} | {
+        f"{name}_right" for name in ("shoulder_elevation", "shoulder_plane", "humeral_rotation", "elbow_flexion")
+    }
+    for index, name in enumerate(angles.names):
+        assert np.isnan(angles.position[index]) == (name in hidden), name
+        assert np.isnan(angles.velocity[index]) == (name in hidden), name
+        assert np.isinf(angles.position_stddev[index]) == (name in hidden), name
+        assert np.isinf(angles.velocity_stddev[index]) == (name in hidden), name
+
+
+@pytest.mark.parametrize("fill", [0.0, np.nan, np.inf, 1e300, -1e-300])
+def test_impossible_bodies_are_unknown_and_do_not_warn(fill: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        angles = positional_angles(skeleton(np.full((N_JOINTS, 3), fill), 0.01, np.full((N_JOINTS, 3), fill)))
+    assert np.isnan(angles.position).all() and np.isinf(angles.position_stddev).all()
+    assert np.isinf(angles.velocity_stddev).all()
+
+
+def test_nothing_is_claimed_without_covariances_or_velocities() -> None:
+    angles = positional_angles(skeleton(bent_pose(0)))
+    assert np.isfinite(angles.position).all() and np.isnan(angles.velocity).all()
+    assert np.isinf(angles.position_stddev).all() and np.isinf(angles.velocity_stddev).all()
+
+
+@pytest.mark.parametrize("density", ACCELERATION_DENSITIES)
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.06])
+@pytest.mark.parametrize("step", [1 / 60, 1 / 30, 1 / 15])
+def test_the_velocity_bound_covers_a_kalman_filter(density: float, noise: float, step: float) -> None:
+    """(3 q^2 p)^(1/3) against the steady state (Riccati), and against predictions that start there."""
+    transition, observe = np.array([[1.0, step], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    q = Q_continuous_white_noise(2, step, density)
+    prior = solve_discrete_are(transition.T, observe.T, q, np.array([[noise**2]]))
+    gain = prior @ observe.T / (prior[0, 0] + noise**2)
+    covariance = (np.eye(2) - gain @ observe) @ prior
+    for _ in range(15):
+        # 8 %: where one step's own motion exceeds the noise, sampling leaves the velocity a little less known
+        assert covariance[1, 1] < 1.08 * (3.0 * density**2 * covariance[0, 0]) ** (1 / 3)
+        covariance = transition @ covariance @ transition.T + q
+
+
+def test_joint_classes_cover_every_joint() -> None:
+    densities = joint_densities()
+    assert densities[Joint.SPINE_SHOULDER] < densities[Joint.ELBOW_LEFT] < densities[Joint.HAND_TIP_RIGHT]
+    assert (JOINT_CLASSES[MIRROR] == JOINT_CLASSES).all()
