@@ -33,6 +33,8 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import NANOSECONDS
 
 MAGIC: bytes = MCAP0_MAGIC
+LIBRARY = "body_tracking"
+"""Who wrote a file, in its header."""
 
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time

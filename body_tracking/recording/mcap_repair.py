@@ -16,6 +16,7 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
+    Header,
     McapRecord,
     MessageIndex,
     Statistics,
@@ -24,6 +25,7 @@ from mcap.records import (
 
 from body_tracking.recording.mcap_file import (
     HEAD,
+    LIBRARY,
     MAGIC,
     MESSAGE,
     BagError,
@@ -55,7 +57,13 @@ def finish(path: Path) -> bool:
         kept = [block for block in file.blocks if not block.cut]
         rescued = [message for block in file.blocks if block.cut for message in file.read(block)]
         with path.open("r+b") as output:
-            output.seek(file.sound_end)
+            if file.sound_end <= len(MAGIC):
+                # Cut off in its first bytes.
+                builder = RecordBuilder()
+                Header("ros2", LIBRARY).write(builder)
+                output.write(MAGIC + _taken(builder))
+            else:
+                output.seek(file.sound_end)
             _Ending(file, kept, rescued).write(output)
             output.truncate()
             output.flush()

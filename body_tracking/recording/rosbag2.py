@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.messages import BagMessages
 from body_tracking.recording import qos as quality
-from body_tracking.recording.mcap_file import BagError, Block, McapFile, StoredMessage
+from body_tracking.recording.mcap_file import LIBRARY, BagError, Block, McapFile, StoredMessage
 from body_tracking.recording.mcap_repair import finish
 from body_tracking.recording.qos import Qos
 
@@ -46,7 +46,6 @@ __all__ = [
 METADATA = "metadata.yaml"
 METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
-LIBRARY = "body_tracking"
 MAX_TIME_NS = 2**63 - 1
 
 _COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
@@ -144,10 +143,11 @@ class BagReader:
         self.files: list[McapFile] = []
         self._notes: list[str] = []
         try:
-            for file in self._paths():
+            found = self._paths()
+            for file in found:
                 self._open(file)
             if not self.files:
-                raise BagError(self._notes[0] if self._notes else f"{self.path}: no mcap file is in the folder")
+                raise BagError(self._notes[-1] if found else f"{self.path}: no mcap file is in the folder")
         except BaseException:
             self.close()
             raise
@@ -230,8 +230,6 @@ class BagReader:
         found = sorted(self.path.glob("*.mcap"), key=_natural)
         listed = self._listed()
         if listed is None:
-            if found:
-                self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
             return found
         missing = [path for path in listed if not path.exists()]
         self._notes += [f"{path.name}: listed in {METADATA}, but missing" for path in missing]
@@ -249,6 +247,7 @@ class BagReader:
             compression = str(information.get("compression_mode") or "").lower()
             names = [Path(str(name)).name for name in information["relative_file_paths"]]
         except FileNotFoundError:
+            self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
             return None
         except OSError as error:
             raise BagError(f"{path}: {error.strerror}") from error

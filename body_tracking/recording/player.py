@@ -1,0 +1,227 @@
+"""The timing of playback: which messages of a bag are due, and what the clock says; no publishing, no waiting.
+
+Whoever plays calls :meth:`Playback.step` with a steady clock, sends what it returns, and comes back when it says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+from body_tracking.recording.rosbag2 import BagError, BagReader, RawMessage
+from body_tracking.skeleton import NANOSECONDS
+
+_BATCH = 200  # messages at once at most, so that a pause takes effect while the player is catching up
+_LOOP_GAP_NS = 10_000_000  # between the end and the beginning: a bag of one instant must not spin
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Messages of one log time, to be sent after the clock.
+
+    Attributes:
+        clock_ns: the bag's time to publish on ``/clock``.
+        messages: to be sent then; none if it is only the clock's turn.
+    """
+
+    clock_ns: int
+    messages: tuple[RawMessage, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What to do now, and when to come back.
+
+    Attributes:
+        batches: in order.
+        wake_ns: steady time of the next step; None when there is nothing more to play.
+    """
+
+    batches: tuple[Batch, ...]
+    wake_ns: int | None
+
+
+class Playback:
+    """Plays a bag against a steady clock.
+
+    The bag's time runs ``rate`` times as fast as the steady clock, from the first step on. Messages that are late,
+    because nobody called in time, are returned at once and never left out. The clock never runs ahead of a message that
+    is still to be sent, and runs backwards only where the bag begins anew.
+
+    Args:
+        reader: of the bag; stays open while this is used.
+        rate: bag seconds per second, above 0.
+        loop: begin again at the end.
+        start_offset_s: seconds of the bag to leave out at its beginning.
+        topics: only these; empty for all.
+        clock_hz: ticks of the clock per second of the steady clock; 0 for none but those with messages.
+        paused: do not run until :meth:`resume`.
+
+    Raises:
+        BagError: a value is out of its range, or nothing of the bag is left to play.
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        *,
+        rate: float = 1.0,
+        loop: bool = False,
+        start_offset_s: float = 0.0,
+        topics: Collection[str] = (),
+        clock_hz: float = 100.0,
+        paused: bool = False,
+    ) -> None:
+        unknown = [topic for topic in topics if topic not in reader.topics]
+        if unknown:
+            raise BagError(f"{reader.path}: no topic {', '.join(unknown)}; it has {', '.join(reader.topics) or 'none'}")
+        if not (math.isfinite(start_offset_s) and start_offset_s >= 0.0):
+            raise BagError(f"start offset {start_offset_s} s: expected 0 or more")
+        if not (math.isfinite(clock_hz) and clock_hz >= 0.0):
+            raise BagError(f"clock rate {clock_hz} Hz: expected 0 or more")
+        self.loop = loop
+        self.loops = 0
+        """How often the bag began anew."""
+        self.sent = 0
+        """Messages returned so far."""
+        self.late_ns = 0
+        """By how much the latest messages were late, in steady time."""
+        self._reader = reader
+        self._topics = frozenset(topics) or None
+        self._rate = _checked_rate(rate)
+        self._start_ns = reader.start_ns + round(start_offset_s * NANOSECONDS)
+        self._tick_ns = round(NANOSECONDS / clock_hz) if clock_hz else 0
+        self._paused = paused
+        self._next: RawMessage | None
+        self._stream: Iterator[RawMessage]
+        if not self._rewind():
+            what = f" after {start_offset_s:g} s" if start_offset_s else ""
+            raise BagError(f"{reader.path}: no message to play{what}")
+        # The bag's time at a steady time; the first step sets the latter.
+        self._bag_ns: int = self._start_ns
+        self._steady_ns: int | None = None
+        self._next_tick_ns: int = 0
+
+    @property
+    def paused(self) -> bool:
+        """Whether the bag's time stands still."""
+        return self._paused
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything was returned and the bag does not begin anew."""
+        return self._next is None and not self.loop
+
+    @property
+    def rate(self) -> float:
+        """Bag seconds per second."""
+        return self._rate
+
+    def bag_time_ns(self, steady_ns: int) -> int:
+        """The bag's time at a steady time that is not before the latest step."""
+        if self._paused or self._steady_ns is None:
+            return self._bag_ns
+        return self._bag_ns + int((steady_ns - self._steady_ns) * self._rate)
+
+    def pause(self, steady_ns: int) -> None:
+        """Let the bag's time stand still."""
+        self._anchor(steady_ns)
+        self._paused = True
+
+    def resume(self, steady_ns: int) -> None:
+        """Let it run again."""
+        self._anchor(steady_ns)
+        self._paused = False
+
+    def set_rate(self, rate: float, steady_ns: int) -> None:
+        """Run faster or slower from now on.
+
+        Raises:
+            BagError: the rate is not above 0.
+        """
+        checked = _checked_rate(rate)
+        self._anchor(steady_ns)
+        self._rate = checked
+
+    def step(self, steady_ns: int) -> Step:
+        """What is due at a steady time, which never runs backwards.
+
+        Args:
+            steady_ns: nanoseconds of any steady clock.
+        """
+        if self._steady_ns is None:
+            self._steady_ns = self._next_tick_ns = steady_ns
+        if self._next is None:
+            if not self.loop:
+                return Step((), None)
+            # Begin anew; the bag's time jumps back, and waits for the gap to be over.
+            self.loops += 1
+            self._rewind()
+            self._bag_ns, self._steady_ns = self._start_ns, steady_ns + (0 if self._paused else _LOOP_GAP_NS)
+            self._next_tick_ns = self._steady_ns
+            return Step((), self._steady_ns)
+        now_ns = self.bag_time_ns(steady_ns)
+        batches = self._due(now_ns, steady_ns)
+        pending: RawMessage | None = self._next
+        if pending is not None and pending.log_time_ns <= now_ns and not self._paused:
+            return Step(tuple(batches), steady_ns)
+        if self._tick_ns and steady_ns >= self._next_tick_ns:
+            if not batches or batches[-1].clock_ns < now_ns:
+                batches.append(Batch(now_ns, ()))
+            # Ticks that were missed are not made up for.
+            missed = (steady_ns - self._next_tick_ns) // self._tick_ns
+            self._next_tick_ns += (missed + 1) * self._tick_ns
+        return Step(tuple(batches), self._wake(pending, steady_ns))
+
+    # --- inside
+
+    def _anchor(self, steady_ns: int) -> None:
+        if self._steady_ns is not None:
+            # While the gap between two rounds lasts, the bag's time has not begun to run yet.
+            self._bag_ns = max(self._bag_ns, self.bag_time_ns(steady_ns))
+            self._steady_ns = max(self._steady_ns, steady_ns) if not self._paused else steady_ns
+
+    def _rewind(self) -> bool:
+        """Begin (anew); False if there is nothing to play."""
+        self._stream = self._reader.messages(self._topics, self._start_ns)
+        self._next = next(self._stream, None)
+        return self._next is not None
+
+    def _due(self, now_ns: int, steady_ns: int) -> list[Batch]:
+        batches: list[Batch] = []
+        group: list[RawMessage] = []
+        taken = 0
+        while not self._paused and self._next is not None and self._next.log_time_ns <= now_ns and taken < _BATCH:
+            if group and group[0].log_time_ns != self._next.log_time_ns:
+                batches.append(Batch(group[0].log_time_ns, tuple(group)))
+                group = []
+            group.append(self._next)
+            taken += 1
+            self._next = next(self._stream, None)
+        if group:
+            batches.append(Batch(group[0].log_time_ns, tuple(group)))
+            self.late_ns = int((now_ns - group[-1].log_time_ns) / self._rate)
+        self.sent += taken
+        return batches
+
+    def _wake(self, pending: RawMessage | None, steady_ns: int) -> int | None:
+        if pending is None and not self.loop:
+            return None
+        times = []
+        if self._tick_ns:
+            times.append(self._next_tick_ns)
+        if not self._paused and self._steady_ns is not None:
+            if pending is None:
+                times.append(steady_ns)
+            else:
+                ahead_ns = (pending.log_time_ns - self._bag_ns) / self._rate
+                times.append(self._steady_ns + math.ceil(ahead_ns))
+        # Paused and without ticks only a call to resume changes anything.
+        return max(steady_ns, min(times, default=steady_ns + NANOSECONDS))
+
+
+def _checked_rate(rate: float) -> float:
+    if not (math.isfinite(rate) and rate > 0.0):
+        raise BagError(f"rate {rate}: expected a number above 0")
+    return rate

@@ -1,0 +1,154 @@
+"""A recording in place of a live sensor: its frames come when they came then."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from body_tracking.messages import MessageError, cloud_to_skeletons
+from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
+from body_tracking.recording.rosbag2 import BagError, BagReader, deserialize
+from body_tracking.sensors import RecordedFrame, check_sensor_name, optical_frame
+from body_tracking.sensors.csv_recording import sensor_column
+from body_tracking.sensors.live import SourceError, SourceSettings, register
+from body_tracking.skeleton import NANOSECONDS
+
+LATE_NS = 500_000_000
+"""A frame this late is left out: a node that was started again goes on where the recording is by now."""
+
+LOOP_GAP_NS = 33_333_333
+"""Between the last frame and the first one of the next round."""
+
+
+class RecordingSource:
+    """Plays one sensor of a recording (CSV, NTU RGB+D, bag) in real time.
+
+    The recording's zero is the receipt of its first frame of any sensor, so that the sensors of one recording, each
+    played by a process of its own with the same ``start_time``, stay in step.
+
+    Args:
+        settings: ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time`` count.
+
+    Raises:
+        BodyTrackingError: the file cannot be read, or has no such sensor.
+    """
+
+    def __init__(self, settings: SourceSettings) -> None:
+        if not settings.file:
+            raise SourceError("the backend 'recording' needs the parameter 'file'")
+        if not settings.rate > 0.0:
+            raise SourceError(f"rate {settings.rate}: expected a number above 0")
+        check_sensor_name(settings.sensor)
+        self._settings = settings
+        self._wanted = settings.recorded_sensor or settings.sensor
+        self._counters: Counter[str] = Counter()
+        self._closed = threading.Event()
+        self._frames = _frames(Path(settings.file), self._wanted)
+        self._zero_ns: int | None = None
+        self._last_ns = 0
+        self._rounds_ns = 0
+        self._next: RecordedFrame | None = self._advance()
+        if self._next is None:
+            raise SourceError(f"{settings.file}: no frame of sensor {self._wanted!r}")
+        self._start_ns = round(settings.start_time * NANOSECONDS) or time.time_ns()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last frame was read, and the recording does not begin again."""
+        return self._next is None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Frames left out because they were late."""
+        return self._counters
+
+    def close(self) -> None:
+        """Let a ``read`` in another thread return."""
+        self._closed.set()
+
+    def read(self, timeout: float) -> RecordedFrame | None:
+        """See :class:`body_tracking.sensors.live.SkeletonSource`."""
+        deadline_ns = time.time_ns() + round(timeout * NANOSECONDS)
+        while self._next is not None and not self._closed.is_set():
+            due_ns = self._due_ns(self._next)
+            now_ns = time.time_ns()
+            if now_ns - due_ns > LATE_NS:
+                self._counters["left out, late"] += 1
+                self._skip_rounds(now_ns - due_ns)
+                self._next = self._advance()
+                continue
+            self._closed.wait(max(0, min(due_ns, deadline_ns) - now_ns) / NANOSECONDS)
+            if due_ns > deadline_ns:
+                return None
+            frame, self._next = self._next, self._advance()
+            return frame
+        self._closed.wait(timeout)
+        return None
+
+    def _due_ns(self, frame: RecordedFrame) -> int:
+        """Wall time at which a frame of the present round plays."""
+        assert self._zero_ns is not None
+        elapsed = self._rounds_ns + frame.received_ns - self._zero_ns
+        return self._start_ns + round(elapsed / self._settings.rate)
+
+    def _skip_rounds(self, late_ns: int) -> None:
+        """Leave out whole rounds at once, once it is known how long one takes."""
+        if self._rounds_ns and self._zero_ns is not None:
+            length = self._last_ns - self._zero_ns + LOOP_GAP_NS
+            self._rounds_ns += int(late_ns * self._settings.rate) // length * length
+
+    def _advance(self) -> RecordedFrame | None:
+        """The next frame of the wanted sensor."""
+        for _ in range(2):
+            for received_ns, frame in self._frames:
+                if self._zero_ns is None:
+                    self._zero_ns = received_ns
+                self._last_ns = max(self._last_ns, received_ns)
+                if frame is not None:
+                    return self._named(frame)
+            if not self._settings.loop or self._zero_ns is None:
+                return None
+            self._rounds_ns += self._last_ns - self._zero_ns + LOOP_GAP_NS
+            self._frames = _frames(Path(self._settings.file), self._wanted)
+        return None
+
+    def _named(self, frame: RecordedFrame) -> RecordedFrame:
+        name = self._settings.sensor
+        if frame.sensor == name:
+            return frame
+        skeletons = tuple(replace(skeleton, frame_id=optical_frame(name)) for skeleton in frame.skeletons)
+        return RecordedFrame(name, frame.received_ns, skeletons)
+
+
+def _frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None]]:
+    """Receipt of every frame of a recording, and the frame itself if it is of the wanted sensor."""
+    if path.is_dir() or path.suffix == ".mcap":
+        yield from _bag_frames(path, sensor)
+        return
+    # What does not name its sensors itself is of the wanted one.
+    names_itself = path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and sensor_column(path)
+    for frame in open_recording(path, None if names_itself else sensor):
+        yield frame.received_ns, frame if frame.sensor == sensor else None
+
+
+def _bag_frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None]]:
+    topic = f"/{sensor}/skeleton"
+    with BagReader(path) as reader:
+        if topic not in reader.topics:
+            raise BagError(f"{path}: no topic {topic}; it has {', '.join(reader.topics) or 'none'}")
+        type_name = reader.topics[topic].type_name
+        yield reader.start_ns, None
+        for message in reader.messages([topic]):
+            try:
+                skeletons = cloud_to_skeletons(deserialize(type_name, message.cdr))
+            except (BagError, MessageError):
+                continue  # as a sensor that missed a frame
+            yield message.log_time_ns, RecordedFrame(sensor, message.log_time_ns, skeletons)
+        yield reader.end_ns, None
+
+
+register("recording", RecordingSource)

@@ -1,0 +1,602 @@
+"""Bags: what is written is read, by us and by others, and nothing that breaks a file breaks the reader."""
+
+from __future__ import annotations
+
+import random
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.interfaces import Qos as RosbagsQos
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from small_bags import TOPICS, Stored, message, messages, read, write
+
+from body_tracking.recording import qos as quality
+from body_tracking.recording.qos import INFINITE_NS, SENSOR_DATA, Qos
+from body_tracking.recording.rosbag2 import (
+    BAG_MESSAGES,
+    BagError,
+    BagReader,
+    BagWriter,
+    deserialize,
+    recover,
+    serialize,
+)
+
+HERE = Path(__file__).parent
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+
+texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=30)
+contents = st.lists(
+    st.tuples(st.sampled_from(list(TOPICS)), texts, st.floats(), st.integers(0, 2**63 - 1)), max_size=40
+)
+
+
+def rosbags_read(path: Path) -> list[Stored]:
+    with Reader(path) as reader:
+        return [(connection.topic, bytes(data), at) for connection, at, data in reader.messages(reader.connections)]
+
+
+# --- round trips
+
+
+@settings(max_examples=40, deadline=None)
+@given(contents, st.sampled_from(["zstd", "lz4", "none"]), st.sampled_from([100, 10_000]))
+def test_what_is_written_is_read_in_the_order_of_log_times(drawn, compression, chunk_bytes):
+    stored = [(topic, serialize(message(topic, text, number)), at) for topic, text, number, at in drawn]
+    expected = sorted(stored, key=lambda item: item[2])
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "bag", stored, compression=compression, chunk_bytes=chunk_bytes)
+        with BagReader(Path(folder) / "bag") as reader:
+            assert [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()] == expected
+            assert reader.warnings == [] and reader.whole
+            assert reader.message_count == len(stored)
+            assert {name: topic.type_name for name, topic in reader.topics.items()} == {
+                name: kind for name, (kind, _) in TOPICS.items()
+            }
+            assert {name: topic.qos for name, topic in reader.topics.items()} == {
+                name: qos for name, (_, qos) in TOPICS.items()
+            }
+            for name, topic in reader.topics.items():
+                assert topic.count == sum(item[0] == name for item in stored)
+            if stored:
+                assert (reader.start_ns, reader.end_ns) == (expected[0][2], expected[-1][2])
+        # The order among equal times is a matter of taste; everything else is not.
+        assert sorted(rosbags_read(Path(folder) / "bag")) == sorted(stored)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(list(TOPICS)), texts, st.floats(allow_nan=False))
+def test_messages_survive_serialisation(topic, text, number):
+    original = message(topic, text, number)
+    assert deserialize(TOPICS[topic][0], serialize(original)) == original
+
+
+def test_selection_of_topics_and_start(tmp_path):
+    stored = messages(60)
+    path = write(tmp_path / "bag", stored, chunk_bytes=300)
+    with BagReader(path) as reader:
+        start_ns = stored[30][2]
+        found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages({"/text"}, start_ns)]
+    assert found == [item for item in stored if item[0] == "/text" and item[2] >= start_ns]
+
+
+def test_publish_time_is_kept(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/text", "std_msgs/msg/String")
+        writer.write("/text", serialize(message("/text", "a", 0.0)), 20, 10)
+    with BagReader(tmp_path / "bag") as reader:
+        assert [(found.log_time_ns, found.publish_time_ns) for found in reader.messages()] == [(20, 10)]
+
+
+# --- with others
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_rosbags_reads_what_we_write(tmp_path, compression):
+    stored = messages(100)
+    write(tmp_path / "bag", stored, compression=compression, chunk_bytes=1000)
+    assert rosbags_read(tmp_path / "bag") == stored
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.message_count == len(stored)
+        assert reader.start_time == stored[0][2]
+        assert reader.duration == stored[-1][2] - stored[0][2] + 1
+        for connection in reader.connections:
+            definition, _ = TYPES.generate_msgdef(connection.msgtype, ros_version=2)
+            assert connection.msgdef.data == definition
+            assert connection.digest == TYPES.hash_rihs01(connection.msgtype)
+            assert connection.ext.serialization_format == "cdr"
+
+
+@pytest.mark.parametrize("version", [8, 9])
+@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.STORAGE])
+def test_we_read_what_rosbags_writes(tmp_path, version, mode):
+    stored = messages(100)
+    infinite = QosTime(9223372036, 854775807)
+    profile = RosbagsQos(
+        QosHistory.KEEP_LAST,
+        7,
+        QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL,
+        infinite,
+        infinite,
+        QosLiveliness.AUTOMATIC,
+        infinite,
+        False,
+    )
+    writer = Writer(tmp_path / "bag", version=version, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            name: writer.add_connection(name, kind, typestore=TYPES, offered_qos_profiles=[profile])
+            for name, (kind, _) in TOPICS.items()
+        }
+        for topic, cdr, at in stored:
+            writer.write(connections[topic], at, cdr)
+    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
+        assert read(path) == stored
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.warnings == []
+        assert reader.topics["/pose"].offered == (Qos("best_effort", "transient_local", 7),)
+
+
+def test_metadata_has_the_form_that_jazzy_writes(tmp_path):
+    stored = messages(30)
+    write(tmp_path / "bag", stored)
+    information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    start = {"nanoseconds_since_epoch": stored[0][2]}
+    duration = {"nanoseconds": stored[-1][2] - stored[0][2]}
+    topics = information.pop("topics_with_message_count")
+    assert information == {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "duration": duration,
+        "starting_time": start,
+        "message_count": 30,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": ["bag_0.mcap"],
+        "files": [{"path": "bag_0.mcap", "starting_time": start, "duration": duration, "message_count": 30}],
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
+    endless = {"sec": 9223372036, "nsec": 854775807}
+    assert topics[1] == {
+        "topic_metadata": {
+            "name": "/number",
+            "type": "std_msgs/msg/Float64",
+            "serialization_format": "cdr",
+            "offered_qos_profiles": [
+                {
+                    "history": "keep_last",
+                    "depth": 5,
+                    "reliability": "best_effort",
+                    "durability": "volatile",
+                    "deadline": endless,
+                    "lifespan": endless,
+                    "liveliness": "automatic",
+                    "liveliness_lease_duration": endless,
+                    "avoid_ros_namespace_conventions": False,
+                }
+            ],
+            "type_description_hash": TYPES.hash_rihs01("std_msgs/msg/Float64"),
+        },
+        "message_count": 10,
+    }
+
+
+def test_qos_of_older_bags_is_read():
+    humble = """- history: 1
+  depth: 5
+  reliability: 2
+  durability: 1
+  deadline: {sec: 2147483647, nsec: 4294967295}
+  lifespan: {sec: 0, nsec: 0}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 1, nsec: 5}
+  avoid_ros_namespace_conventions: false"""
+    assert quality.load(humble) == (
+        Qos("best_effort", "transient_local", 5, "keep_last", INFINITE_NS, INFINITE_NS, "automatic", 1_000_000_005),
+    )
+
+
+durations = st.one_of(st.just(INFINITE_NS), st.integers(1, 10**15))
+profiles = st.builds(
+    Qos,
+    st.sampled_from(["reliable", "best_effort"]),
+    st.sampled_from(["volatile", "transient_local"]),
+    st.integers(0, 1000),
+    st.sampled_from(["keep_last", "keep_all", "unknown"]),
+    durations,
+    durations,
+    st.sampled_from(["automatic", "manual_by_topic"]),
+    durations,
+    st.booleans(),
+)
+
+
+@given(st.lists(profiles, max_size=3))
+def test_qos_survives_its_text_form(offers):
+    assert quality.load(quality.dump(offers)) == tuple(offers)
+
+
+@given(st.one_of(st.text(max_size=40), st.lists(st.dictionaries(st.text(max_size=9), st.integers() | st.text()))))
+def test_qos_that_makes_no_sense_is_no_error(value):
+    assert all(isinstance(profile, Qos) for profile in quality.load(value))
+
+
+@given(st.lists(profiles, min_size=1, max_size=4))
+def test_a_request_matches_every_offer_and_the_offer_every_request(offers):
+    request, offer = quality.request_for(offers, 10), quality.offer_for(offers)
+    if request.reliability == "reliable":
+        assert all(profile.reliability == "reliable" for profile in offers) and offer.reliability == "reliable"
+    if request.durability == "transient_local":
+        assert all(profile.durability == "transient_local" for profile in offers)
+        assert offer.durability == "transient_local"
+
+
+# --- several files
+
+
+def test_a_bag_is_continued_in_its_next_file(tmp_path):
+    stored = messages(90)
+    for part in range(3):
+        write(tmp_path / "bag", stored[30 * part : 30 * part + 30], resume=True)
+    assert [path.name for path in sorted((tmp_path / "bag").iterdir())] == [
+        "bag_0.mcap",
+        "bag_1.mcap",
+        "bag_2.mcap",
+        "metadata.yaml",
+    ]
+    assert read(tmp_path / "bag") == stored
+    assert rosbags_read(tmp_path / "bag") == stored
+    information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert information["message_count"] == 90
+    assert [file["message_count"] for file in information["files"]] == [30, 30, 30]
+
+
+def test_continuing_closes_what_was_cut_off(tmp_path):
+    stored = messages(90)
+    first = write(tmp_path / "bag", stored[:60], chunk_bytes=500)
+    first.write_bytes(first.read_bytes()[:-700])
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    before = read(tmp_path / "bag")
+    assert 0 < len(before) <= 60
+    write(tmp_path / "bag", stored[60:], resume=True)
+    assert read(tmp_path / "bag") == before + stored[60:]
+    assert rosbags_read(tmp_path / "bag") == before + stored[60:]
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.warnings == [] and reader.whole
+
+
+def test_a_file_that_is_not_listed_yet_is_read(tmp_path):
+    stored = messages(60)
+    write(tmp_path / "bag", stored[:30])
+    listing = (tmp_path / "bag" / "metadata.yaml").read_bytes()
+    write(tmp_path / "bag", stored[30:], resume=True)
+    (tmp_path / "bag" / "metadata.yaml").write_bytes(listing)
+    with BagReader(tmp_path / "bag") as reader:
+        assert [found.cdr for found in reader.messages()] == [item[1] for item in stored]
+        assert any("bag_1.mcap" in warning for warning in reader.warnings)
+
+
+def test_a_listed_file_that_is_missing_is_named(tmp_path):
+    stored = messages(60)
+    for part in range(2):
+        write(tmp_path / "bag", stored[30 * part : 30 * part + 30], resume=True)
+    (tmp_path / "bag" / "bag_0.mcap").unlink()
+    with BagReader(tmp_path / "bag") as reader:
+        assert [found.cdr for found in reader.messages()] == [item[1] for item in stored[30:]]
+        assert any("bag_0.mcap" in warning and "missing" in warning for warning in reader.warnings)
+
+
+@pytest.mark.parametrize("text", [None, "", "{", "rosbag2_bagfile_information: 3", "\xff"])
+def test_a_folder_without_readable_metadata_is_read(tmp_path, text):
+    stored = messages(10)
+    write(tmp_path / "bag", stored)
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    metadata.unlink() if text is None else metadata.write_bytes(text.encode("latin-1"))
+    with BagReader(tmp_path / "bag") as reader:
+        assert [found.cdr for found in reader.messages()] == [item[1] for item in stored]
+        assert len(reader.warnings) == 1 and "metadata.yaml" in reader.warnings[0]
+
+
+# --- damage
+
+
+def offsets(size: int) -> list[int]:
+    """Every offset near the ends, where everything happens in a few bytes, and many in between."""
+    return sorted({*range(1, 120, 2), *range(120, size, 23), *range(max(0, size - 300), size, 3), size - 1})
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_a_file_cut_anywhere_opens_with_a_prefix_of_its_messages(tmp_path, compression):
+    stored = messages(40)
+    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
+    path = tmp_path / "cut.mcap"
+    longest = 0
+    for size in offsets(len(data)):
+        path.write_bytes(data[:size])
+        with BagReader(path) as reader:
+            found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()]
+            assert found == stored[: len(found)], f"cut at {size}"
+            assert len(found) >= longest, f"cut at {size}: fewer messages than in a shorter file"
+            assert reader.message_count == len(found)
+            assert reader.warnings and not reader.whole and "cut off" in reader.warnings[0], f"cut at {size}"
+        longest = len(found)
+    assert longest == len(stored)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_a_cut_file_is_closed_without_losing_a_message(tmp_path, compression):
+    stored = messages(40)
+    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
+    folder = tmp_path / "cut"
+    folder.mkdir()
+    for size in offsets(len(data))[::12]:
+        (folder / "cut_0.mcap").write_bytes(data[:size])
+        (folder / "metadata.yaml").unlink(missing_ok=True)
+        before = read(folder)
+        with recover(folder) as reader:
+            assert reader.warnings == [] and reader.whole, f"cut at {size}"
+            assert [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()] == before
+        assert rosbags_read(folder) == before, f"cut at {size}"
+
+
+def test_what_is_missing_of_a_cut_chunk_is_said(tmp_path):
+    stored = messages(40)
+    path = write(tmp_path / "bag", stored, chunk_bytes=10_000, compression="none")
+    data = path.read_bytes()
+    cut = data.index(stored[20][1])
+    path.write_bytes(data[: cut + 3])
+    with BagReader(path) as reader:
+        assert reader.message_count == 20
+        # The chunk's own header tells that it went on for 200 ms.
+        assert "0.200 s of recording" in reader.warnings[0] and "20 message(s)" in reader.warnings[0]
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_flipped_bits_never_bring_up_a_message_that_was_not_written(tmp_path, compression, closed):
+    stored = messages(40)
+    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
+    if not closed:
+        # Up to the last chunk, as after kill -9.
+        data = data[: data.index(b"serialized_metadata") - 40]
+    path = tmp_path / "flipped.mcap"
+    generator = random.Random(20)
+    whole = 0
+    for _ in range(250):
+        broken = bytearray(data)
+        for _ in range(generator.choice([1, 1, 2, 5])):
+            broken[generator.randrange(len(broken))] ^= 1 << generator.randrange(8)
+        path.write_bytes(broken)
+        try:
+            with BagReader(path) as reader:
+                found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()]
+                lost = [item for item in stored if item not in found]
+                assert found == [item for item in stored if item in found]
+                assert not lost or reader.warnings
+        except BagError as error:
+            assert "not an mcap file" in str(error)
+        else:
+            whole += not lost
+    assert 0 < whole < 250
+
+
+def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path):
+    stored = messages(40)
+    path = write(tmp_path / "bag", stored, chunk_bytes=900, compression="none")
+    data = bytearray(path.read_bytes())
+    data[data.index(stored[12][1]) + 6] ^= 4
+    path.write_bytes(data)
+    with BagReader(tmp_path / "bag") as reader:
+        found = [item.cdr for item in reader.messages()]
+        assert len(reader.warnings) == 1 and "damaged chunk at byte" in reader.warnings[0]
+        list(reader.messages())
+        assert len(reader.warnings) == 1, "said once, however often it is read"
+        reader_message_count = reader.message_count
+    lost = [item[1] for item in stored if item[1] not in found]
+    assert stored[12][1] in lost and 0 < len(lost) < 20
+    assert reader_message_count == len(stored), "the index still tells how many there were"
+
+
+def test_verify_finds_the_damage_without_reading_messages(tmp_path):
+    stored = messages(40)
+    path = write(tmp_path / "bag", stored, chunk_bytes=900, compression="none")
+    data = bytearray(path.read_bytes())
+    data[data.index(stored[20][1])] ^= 255
+    path.write_bytes(data)
+    with BagReader(path) as reader:
+        reader.verify()
+        assert reader.warnings
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=300))
+def test_any_bytes_after_the_magic_are_no_crash(data):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "random.mcap"
+        path.write_bytes(b"\x89MCAP0\r\n" + data)
+        with BagReader(path) as reader:
+            list(reader.messages())
+            assert reader.warnings
+
+
+def test_a_record_that_claims_to_be_huge_is_no_crash(tmp_path):
+    path = tmp_path / "huge.mcap"
+    for opcode in range(256):
+        path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", opcode, 2**63 + 5) + bytes(100))
+        with BagReader(path) as reader:
+            assert list(reader.messages()) == [] and reader.warnings
+
+
+def test_what_is_no_recording_is_one_line(tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "text.mcap").write_text("no recording at all")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information: {storage_identifier: sqlite3, relative_file_paths: [a.db3]}"
+    )
+    for name, text in (
+        ("empty.mcap", "empty"),
+        ("text.mcap", "not an mcap file"),
+        ("absent", "no such"),
+        ("folder", "no mcap file"),
+        ("other", "sqlite3"),
+    ):
+        with pytest.raises(BagError, match=text) as caught:
+            BagReader(tmp_path / name)
+        assert "\n" not in str(caught.value) and name in str(caught.value)
+
+
+# --- writing
+
+
+def test_a_folder_that_is_there_is_refused(tmp_path):
+    stored = messages(10)
+    write(tmp_path / "bag", stored)
+    with pytest.raises(BagError, match="exists already"):
+        BagWriter(tmp_path / "bag")
+    write(tmp_path / "bag", stored[:3], overwrite=True)
+    assert read(tmp_path / "bag") == stored[:3]
+
+
+@pytest.mark.parametrize("option", ["overwrite", "resume"])
+def test_a_folder_that_is_no_bag_is_never_touched(tmp_path, option):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("precious")
+    with pytest.raises(BagError, match="no bag"):
+        BagWriter(tmp_path / "thesis", **{option: True})
+    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "precious"
+
+
+def test_two_writers_do_not_share_a_bag(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/text", "std_msgs/msg/String")
+        with pytest.raises(BagError, match="another process"):
+            BagWriter(tmp_path / "bag", resume=True)
+        with pytest.raises(BagError, match="another process"):
+            recover(tmp_path / "bag")
+
+
+def test_what_cannot_be_written_is_an_error(tmp_path):
+    cdr = serialize(message("/text", "a", 0.0))
+    with BagWriter(tmp_path / "bag") as writer:
+        with pytest.raises(BagError, match="my_msgs/msg/Own"):
+            writer.add_topic("/own", "my_msgs/msg/Own")
+        with pytest.raises(BagError, match="not added"):
+            writer.write("/text", cdr, 0)
+        writer.add_topic("/text", "std_msgs/msg/String")
+        writer.add_topic("/text", "std_msgs/msg/String")
+        with pytest.raises(BagError, match="recorded as"):
+            writer.add_topic("/text", "std_msgs/msg/Float64")
+        with pytest.raises(BagError, match="-1 ns"):
+            writer.write("/text", cdr, -1)
+        writer.write("/text", cdr, 5)
+    with pytest.raises(BagError, match="closed"):
+        writer.write("/text", cdr, 6)
+    assert read(tmp_path / "bag") == [("/text", cdr, 5)]
+    with pytest.raises(BagError, match="serialised"):
+        serialize(BAG_MESSAGES.make("std_msgs/msg/UInt8", data=-1))
+    with pytest.raises(BagError, match="no std_msgs/msg/Float64"):
+        deserialize("std_msgs/msg/Float64", cdr[:6])
+
+
+def test_an_unfinished_bag_holds_what_was_flushed(tmp_path):
+    stored = messages(20)
+    with BagWriter(tmp_path / "bag", flush_interval_s=3600.0) as writer:
+        for topic, (kind, qos) in TOPICS.items():
+            writer.add_topic(topic, kind, qos)
+        for item in stored[:10]:
+            writer.write(*item)
+        assert read(tmp_path / "bag") == []
+        writer.flush()
+        for item in stored[10:]:
+            writer.write(*item)
+        assert read(tmp_path / "bag") == stored[:10]
+    with BagWriter(tmp_path / "eager", flush_interval_s=0.0) as writer:
+        for topic, (kind, qos) in TOPICS.items():
+            writer.add_topic(topic, kind, qos)
+        for count, item in enumerate(stored, start=1):
+            writer.write(*item)
+            assert read(tmp_path / "eager") == stored[:count]
+
+
+WRITE_FOREVER = """
+import sys, time
+from small_bags import TOPICS, messages
+from body_tracking.recording.rosbag2 import BagWriter
+writer = BagWriter(sys.argv[1], flush_interval_s=0.05)
+for topic, (kind, qos) in TOPICS.items():
+    writer.add_topic(topic, kind, qos)
+for item in messages(100_000):
+    writer.write(*item)
+    time.sleep(0.0005)
+"""
+
+
+def test_kill_9_leaves_a_bag_that_opens(tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", WRITE_FOREVER, str(tmp_path / "bag")], cwd=HERE)
+    try:
+        until = time.monotonic() + 30
+        while time.monotonic() < until:
+            if (tmp_path / "bag" / "bag_0.mcap").exists() and len(read(tmp_path / "bag")) > 100:
+                break
+            time.sleep(0.1)
+        process.send_signal(signal.SIGKILL)
+    finally:
+        process.kill()
+        process.wait(10)
+    found = read(tmp_path / "bag")
+    assert len(found) > 100 and found == messages(len(found))
+    with recover(tmp_path / "bag") as reader:
+        assert reader.message_count == len(found) and reader.warnings == []
+    assert rosbags_read(tmp_path / "bag") == found
+
+
+FILL_THE_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+from small_bags import TOPICS, messages
+from body_tracking.recording.rosbag2 import BagError, BagWriter
+writer = BagWriter(sys.argv[1], flush_interval_s=0.0, compression="none")
+for topic, (kind, qos) in TOPICS.items():
+    writer.add_topic(topic, kind, qos)
+try:
+    for count, item in enumerate(messages(100_000)):
+        writer.write(*item)
+except BagError as error:
+    print(count, error)
+    writer.close()
+"""
+
+
+def test_a_full_disk_is_an_error_and_costs_nothing_written_before(tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-c", FILL_THE_DISK, str(tmp_path / "bag")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=HERE,
+    )
+    assert run.returncode == 0, run.stderr
+    count, text = run.stdout.split(maxsplit=1)
+    assert "bag_0.mcap" in text
+    found = read(tmp_path / "bag")
+    assert len(found) == int(count) > 10 and found == messages(int(count))
+
+
+def test_sensor_data_is_the_usual_profile():
+    assert (SENSOR_DATA.reliability, SENSOR_DATA.durability, SENSOR_DATA.depth) == ("best_effort", "volatile", 5)
