@@ -33,7 +33,7 @@ Uncertainty: first order in the joint covariances, joints independent of each ot
 deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which the first order does
 not see. A plane of elevation with the arm at the side and the rotation of a straight or vertical arm turn about an axis
 that the positions do not show: the standard deviation grows like 1/sin, and is infinity where the deflection that gives
-the direction is not significant, that is within its own 95 % ellipse of zero (beyond 0.41 rad).
+the direction is not significant, that is within its own 99.9 % ellipse of zero (beyond 0.27 rad).
 
 Velocities are the Jacobian times the joint velocities. A skeleton brings no covariance of its velocities; the stated
 deviation rests on a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman
@@ -161,9 +161,19 @@ _TINY = 1e-18
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
-_MAX_STDDEV = np.where(_ORDER < _N_BETWEEN, np.pi / np.sqrt(12.0), 1.0 / np.sqrt(chi2.ppf(0.95, 2)))
-"""(n,) radians from which an angle is unknown: the standard deviation of a uniform one (0 to 180 deg), and that of a
-direction whose vector is not significantly longer than zero."""
+_MAX_STDDEV: FloatArray = np.select(
+    [
+        _ORDER < _N_BETWEEN,
+        np.array([name.startswith("trunk") for name in ANGLE_NAMES]),
+    ],
+    [np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0)],
+    1.0 / np.sqrt(chi2.ppf(0.999, 2)),
+)
+"""(n,) radians from which an angle is unknown.
+
+That of an angle of which nothing is known (uniform over its range); but for the turns of the arm, where a straight
+elbow or a hanging arm shows no direction at all, that of a direction whose vector is not significantly longer than zero.
+"""
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ class Errors:
     """
 
     white: float = 0.002
-    bias: float = 0.010
+    bias: float = 0.016
     bias_s: float = 3.0
     inferred: float = 0.060
     inferred_s: float = 0.4

@@ -220,7 +220,7 @@ def test_standard_deviations_are_those_of_noisy_positions(seed: int) -> None:
 
 
 def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
-    """At the fold: 0 deg is within two stated deviations in 95 % of draws, and the rotation is mostly unknown."""
+    """At the fold: 0 deg is within two stated deviations in 95 % of draws, and the rotation is unknown."""
     rng = np.random.default_rng(3)
     stddev, count = 0.01, 3000
     pose = t_pose()
@@ -231,7 +231,7 @@ def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
         inside += angles.position[elbow] < 2 * angles.position_stddev[elbow]
         unknown += bool(np.isinf(angles.position_stddev[rotation]))
     assert 0.92 < inside / count < 0.97
-    assert 0.93 < unknown / count < 1.0
+    assert unknown / count > 0.99
 
 
 def test_the_rotation_grows_uncertain_as_one_over_sine_of_the_flexion() -> None:

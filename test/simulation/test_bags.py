@@ -100,8 +100,8 @@ def test_poses_and_clocks_explain_what_the_sensors_say(name: str) -> None:
             tracked = skeleton.states == TrackingState.TRACKED
             errors.append(np.linalg.norm(pose.apply(skeleton.positions) - expected, axis=1)[tracked])
         error = np.concatenate(errors)
-        assert 0.012 < np.median(error) < 0.030
-        assert np.abs(error).max() < 0.6
+        assert 0.02 < np.median(error) < 0.05  # Kinect v2 against markers: 20 to 40 mm
+        assert error.max() < 0.8
 
 
 def test_the_second_clock_is_seconds_off_and_drifts() -> None:
