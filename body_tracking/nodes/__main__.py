@@ -1,0 +1,17 @@
+"""``python -m body_tracking.nodes <executable> [--ros-args ...]``: a node without an installed script, for ``up``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from body_tracking.graph import EXECUTABLES
+from body_tracking.nodes.supervised import die_with_parent
+
+if __name__ == "__main__":
+    die_with_parent()
+    if len(sys.argv) < 2 or sys.argv[1] not in EXECUTABLES:
+        print(f"usage: python -m body_tracking.nodes {{{','.join(EXECUTABLES)}}} [--ros-args ...]", file=sys.stderr)
+        sys.exit(2)
+    name = sys.argv.pop(1)
+    sys.exit(importlib.import_module(f"body_tracking.nodes.{name}").main())

@@ -1,0 +1,372 @@
+"""What every node does the same way: parameters, diagnostics, surviving bad messages, starting and ending."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence, Set
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
+from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.parameters import (
+    Parameter,
+    Value,
+    check_all,
+    is_ros_own,
+    is_wildcard,
+    matches,
+    read_file,
+    to_ros,
+)
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.skeleton import NANOSECONDS, Skeleton
+
+RCLError: type[Exception] = _rclpy.RCLError
+ROS = RosMessages()
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+JUMP_BACK_NS = 1 * NANOSECONDS
+"""A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
+
+GAP_NS = 50_000_000
+"""Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
+
+_LOG_PERIOD_S = 5.0
+_STATE_LEVELS = ("OK", "warning", "error", "stale")
+
+RELIABLE = Parameter(
+    "reliable",
+    False,
+    "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
+)
+WORLD_FRAME = Parameter("world_frame", "world", "name of the world frame; map for REP-155")
+BODY = Parameter("body", "body1", "the id of the person in topics and names of angles (REP-155)")
+SENSORS = Parameter("sensors", ("kinect1", "kinect2"), "the sensors; the node listens to /<sensor>/skeleton of each")
+REFERENCE = Parameter("reference", "", "the sensor that defines world and its time; empty for the first one")
+
+
+class Monitor:
+    """Counts what goes through a node, for its diagnostics."""
+
+    def __init__(self) -> None:
+        self.totals: Counter[str] = Counter()
+        self.last_reason = ""
+        self._window: Counter[str] = Counter()
+        self._delays_ns: list[int] = []
+        self._latencies_ns: list[int] = []
+        self._last_stamp: dict[str, int] = {}
+        self._since = time.monotonic()
+
+    def message_in(self, topic: str, stamp_ns: int) -> bool:
+        """Count a message of an input; True when time jumped back."""
+        self._window[f"in {topic}"] += 1
+        self.totals["received"] += 1
+        last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
+        if last is None:
+            return False
+        step = stamp_ns - last
+        if step == 0:
+            self.totals["repeated stamps"] += 1
+        elif step < 0:
+            self.totals["stamps backwards"] += 1
+        elif step > GAP_NS:
+            self.totals["gaps"] += 1
+        return step < -JUMP_BACK_NS
+
+    def message_out(self, topic: str, delay_ns: int | None = None, latency_ns: int | None = None) -> None:
+        """Count a message of an output.
+
+        Args:
+            topic: its name.
+            delay_ns: since the input that it answers was sent: transport and processing.
+            latency_ns: since capture, by ROS time.
+        """
+        self._window[f"out {topic}"] += 1
+        self.totals["published"] += 1
+        if delay_ns is not None:
+            self._delays_ns.append(delay_ns)
+        # A sensor that counts from its own start tells nothing about how long ago that was.
+        if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
+            self._latencies_ns.append(latency_ns)
+
+    def values(self) -> dict[str, object]:
+        """Rates since the last call, and totals."""
+        now = time.monotonic()
+        elapsed, self._since = max(now - self._since, 1e-3), now
+        values: dict[str, object] = {
+            f"rate {name}": f"{count / elapsed:.1f}" for name, count in sorted(self._window.items())
+        }
+        self._window = Counter(dict.fromkeys(self._window, 0))
+        for name, samples in (("delay", self._delays_ns), ("latency", self._latencies_ns)):
+            if samples:
+                values[f"{name} median ms"] = f"{np.median(samples) / 1e6:.2f}"
+                values[f"{name} max ms"] = f"{max(samples) / 1e6:.2f}"
+                samples.clear()
+        values.update(self.totals)
+        if self.last_reason:
+            values["last malformed"] = self.last_reason
+        return values
+
+
+class GraphNode(Node):
+    """Base of the nodes.
+
+    A node names itself, lists its parameters, sets itself up in ``configure`` and ``start``, and hands its callbacks
+    through :meth:`listen`, so that no message can end it.
+    """
+
+    NAME: ClassVar[str]
+    PARAMETERS: ClassVar[tuple[Parameter, ...]]
+
+    def __init__(self) -> None:
+        super().__init__(self.NAME)
+        self.monitor = Monitor()
+        self._logged: dict[str, float] = {}
+        self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
+        self.configure(self.values)
+        self.add_on_set_parameters_callback(self._on_set)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", to_profile(RELIABLE_QOS))
+        self.start()
+        self.create_timer(1.0, self._report, clock=STEADY)
+
+    # --- to be written by a node
+
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Take the parameters, at the start and whenever some of them change.
+
+        Raises:
+            BodyTrackingError: they do not go together; at the start the node ends, later the change is refused.
+        """
+
+    def start(self) -> None:
+        """Make publishers, subscriptions, services and timers."""
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """Level, line and values that the node adds to its diagnostics."""
+        return 0, "", {}
+
+    def close(self) -> None:
+        """Finish what the node has in hand, at its end."""
+
+    # --- parameters
+
+    def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
+        table = {parameter.name: parameter for parameter in self.PARAMETERS}
+        values = dict(self.values)
+        try:
+            for change in changes:
+                if change.name in table:
+                    values[change.name] = table[change.name].check(change.value)
+            if values != self.values:
+                self.configure(MappingProxyType(values))
+        except BodyTrackingError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.values = MappingProxyType(values)
+        return SetParametersResult(successful=True)
+
+    # --- messages
+
+    def skeleton_qos(self) -> QoSProfile:
+        """Of skeleton topics, by the parameter ``reliable``."""
+        return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else graph.SKELETON)
+
+    def listen(self, topic: str, kind: type[Any], qos: QoSProfile, handle: Callable[[Any, int], None]) -> Subscription:
+        """Subscribe, so that a message which is not as it should be is counted and logged, and never ends the node.
+
+        Args:
+            topic: its name.
+            kind: the message class.
+            qos: the profile.
+            handle: takes the message, and the wall time in nanoseconds at which it was sent.
+        """
+
+        def callback(message: Any, info: dict[str, int]) -> None:
+            try:
+                handle(message, info["source_timestamp"])
+            except MessageError as error:
+                self.malformed(topic, str(error))
+            except BodyTrackingError as error:
+                self.malformed(topic, str(error), "refused")
+
+        checked: Any = callback  # rclpy passes the message info to callbacks of two arguments
+        return self.create_subscription(kind, topic, checked, qos)
+
+    def listen_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
+        """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
+        from sensor_msgs.msg import PointCloud2
+
+        def convert(message: Any, sent_ns: int) -> None:
+            skeletons = cloud_to_skeletons(message)
+            if self.monitor.message_in(topic, skeletons[0].stamp_ns):
+                self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+                self.time_jumped_back(topic)
+            handle(skeletons, sent_ns)
+
+        return self.listen(topic, PointCloud2, self.skeleton_qos(), convert)
+
+    def time_jumped_back(self, topic: str) -> None:
+        """Forget the state, because the stamps of an input jumped back."""
+
+    def send(self, publisher: Publisher, message: Any, stamp_ns: int | None = None, sent_ns: int | None = None) -> None:
+        """Publish and count.
+
+        Args:
+            publisher: where to.
+            message: what.
+            stamp_ns: its capture time, for the latency.
+            sent_ns: wall time at which the input that it answers was sent, for the delay.
+        """
+        publisher.publish(message)
+        self.monitor.message_out(
+            publisher.topic_name,
+            None if sent_ns is None else time.time_ns() - sent_ns,
+            None if stamp_ns is None else self.now_ns() - stamp_ns,
+        )
+
+    def malformed(self, topic: str, reason: str, what: str = "malformed") -> None:
+        """Count a message that is not used, and why."""
+        self.monitor.totals[what] += 1
+        self.monitor.last_reason = f"{topic}: {reason}"
+        self.log_seldom(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
+
+    def log_seldom(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
+        """Warn, but not again about the same within some seconds."""
+        now = time.monotonic()
+        if now - self._logged.get(key, -period_s) >= period_s:
+            self._logged[key] = now
+            self.get_logger().warning(text)
+
+    def now_ns(self) -> int:
+        """ROS time: the wall clock, or ``/clock`` with ``use_sim_time``."""
+        return int(self.get_clock().now().nanoseconds)
+
+    # --- diagnostics
+
+    @cached_property
+    def _status_name(self) -> str:
+        return f"{self.get_name()}: stream"
+
+    def _report(self) -> None:
+        level, text, values = self.state()
+        values = {**self.monitor.values(), **values}
+        if self.monitor.totals["malformed"] and level == 0:
+            text = text or f"{self.monitor.totals['malformed']} malformed messages"
+        message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)
+        self._diagnostics.publish(message)
+
+
+def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
+    """Declare parameters; the values that they have, with what was given by file or ``-p``.
+
+    Raises:
+        ParameterError: something unknown was given, which rclpy would ignore in silence, or a value is not allowed.
+    """
+    overrides: dict[str, RosParameter] = node._parameter_overrides
+    known = {parameter.name: parameter for parameter in table}
+    given = {name: item.value for name, item in overrides.items() if not is_ros_own(name)}
+    for name in _meant_for_others(node, given.keys() - known.keys()):
+        del given[name]
+    values = check_all(table, given)
+    for name, value in values.items():
+        # rclpy would refuse a whole number where a number is expected; check_all has made it one.
+        if name in overrides:
+            overrides[name] = RosParameter(name, value=to_ros(value))
+        node.declare_parameter(name, to_ros(value), _descriptor(known[name]))
+    return MappingProxyType(values)
+
+
+def _meant_for_others(node: Node, unknown: Set[str]) -> Set[str]:
+    """Unknown names that a wildcard section of a parameters file gives to all nodes, and that some node knows."""
+    shared: set[str] = set()
+    for file in _parameter_files() if unknown else ():
+        for pattern, values in read_file(file).items():
+            if is_wildcard(pattern) and matches(pattern, node.get_fully_qualified_name()):
+                shared |= unknown & values.keys()
+    if not shared:
+        return shared
+    return shared & {parameter.name for name in graph.EXECUTABLES for parameter in graph.parameters_of(name)}
+
+
+def _parameter_files() -> list[Path]:
+    """The parameters files on the command line."""
+    return [Path(sys.argv[i + 1]) for i, word in enumerate(sys.argv[:-1]) if word == "--params-file"]
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    description = f"{parameter.doc} [{parameter.unit}]" if parameter.unit else parameter.doc
+    descriptor = ParameterDescriptor(
+        description=description, additional_constraints=parameter.constraint, read_only=not parameter.live
+    )
+    if parameter.min is not None and parameter.max is not None:
+        if isinstance(parameter.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(parameter.min), to_value=float(parameter.max))
+            ]
+        else:
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(parameter.min), to_value=int(parameter.max), step=1)
+            ]
+    return descriptor
+
+
+# --- main
+
+
+def run(node_class: type[GraphNode]) -> None:
+    """``main`` of every node: exit code 0 at its end or on Ctrl-C, 2 with one line when it cannot start."""
+    code, node = 0, None
+    try:
+        for file in _parameter_files():
+            read_file(file)  # rcl's own complaint takes several lines
+        rclpy.init()
+        node = node_class()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except BodyTrackingError as error:
+        print(f"{node_class.NAME}: {error}", file=sys.stderr)
+        code = 2
+    except RCLError as error:
+        if node is not None:
+            raise
+        print(f"{node_class.NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+        code = 2
+    finally:
+        # A second Ctrl-C must not interrupt the ending: a recording is being closed.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.close()
+            with contextlib.suppress(InvalidHandle):
+                node.destroy_node()
+        rclpy.try_shutdown()
+    if code:
+        sys.exit(code)

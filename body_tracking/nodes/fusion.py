@@ -1,0 +1,110 @@
+"""All ``/<sensor>/skeleton`` and the calibration to ``/fused/skeleton``."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import PointCloud2, TimeReference
+
+from body_tracking import graph
+from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.messages import skeletons_to_cloud, time_reference_to_clock, transform_to_pose
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
+from body_tracking.parameters import Value, fields_of, parameters_from
+from body_tracking.recording.qos import LATCHED, Qos
+from body_tracking.sensors import check_sensor_name
+from body_tracking.skeleton import Skeleton
+
+PARAMETERS = (SENSORS, REFERENCE, WORLD_FRAME, *parameters_from(FusionParameters), RELIABLE)
+
+
+class FusionNode(GraphNode):
+    """Feeds the fusion and publishes what it makes."""
+
+    NAME = "fusion"
+    PARAMETERS = PARAMETERS
+
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Make the fusion."""
+        given: dict[str, Any] = dict(values)
+        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
+        parameters = FusionParameters(**fields_of(FusionParameters, values))
+        self.fusion = Fusion(self.sensors, parameters, given["reference"] or None, given["world_frame"])
+
+    def start(self) -> None:
+        """Connect."""
+        self.subjects = {sensor: SubjectSelector() for sensor in self.sensors}
+        self.last_sent_ns = 0
+        self.output = self.create_publisher(PointCloud2, graph.FUSED, self.skeleton_qos())
+        latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(self.sensors))))
+        self.listen(graph.CALIBRATION_CLOCK, TimeReference, latched, self.on_clock)
+        self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose)
+        for sensor in self.sensors:
+            self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
+        self.deadline_ns: int | None = None
+        self.timer = self.create_timer(1.0, self.on_deadline, clock=STEADY)
+        self.timer.cancel()
+
+    def on_pose(self, message: Any, sent_ns: int) -> None:
+        """A sensor's pose."""
+        self.fusion.set_pose(transform_to_pose(message))
+
+    def on_clock(self, message: Any, sent_ns: int) -> None:
+        """A sensor's clock."""
+        self.fusion.set_clock(*time_reference_to_clock(message))
+
+    def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        """Feed one frame and publish what follows from it."""
+        subject = self.subjects[sensor].pick(skeletons)
+        if subject is not None:
+            self.last_sent_ns = sent_ns
+            self.publish(self.fusion.push(sensor, subject, time.monotonic_ns()))
+
+    def on_deadline(self) -> None:
+        """Nothing more to wait for."""
+        self.timer.cancel()
+        self.deadline_ns = None
+        self.publish(self.fusion.poll(time.monotonic_ns()))
+
+    def publish(self, fused: list[Skeleton]) -> None:
+        """Send the skeletons and set the timer for the next that cannot wait longer."""
+        for skeleton in fused:
+            cloud = skeletons_to_cloud([skeleton], ROS)
+            self.send(self.output, cloud, skeleton.stamp_ns, self.last_sent_ns)
+        deadline_ns = self.fusion.deadline_ns
+        if deadline_ns == self.deadline_ns:
+            return
+        self.deadline_ns = deadline_ns
+        if deadline_ns is None:
+            self.timer.cancel()
+        else:
+            self.timer.timer_period_ns = max(1, deadline_ns - time.monotonic_ns())
+            self.timer.reset()
+
+    def time_jumped_back(self, topic: str) -> None:
+        """Start anew; poses and clocks stay."""
+        self.fusion.reset()
+        for subject in self.subjects.values():
+            subject.reset()
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """The fusion's counters."""
+        return 0, "", dict(self.fusion.counters)
+
+
+def main() -> None:
+    """The executable ``fusion``."""
+    run(FusionNode)
+
+
+if __name__ == "__main__":
+    main()

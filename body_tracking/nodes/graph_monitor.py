@@ -1,0 +1,143 @@
+"""What ``body_tracking up`` hears of its graph: diagnostics, angles and the clock, as one line."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from body_tracking import graph
+from body_tracking.graph import GraphOptions
+from body_tracking.messages import to_nanoseconds
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.recording.qos import RELIABLE
+
+_CHAIN = ("fusion", "skeleton_filter", "joint_angles")
+_FRESH = 3.0
+"""Seconds for which a node's diagnostics count."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Status:
+    level: int
+    text: str
+    values: dict[str, str]
+    received: float
+
+
+class GraphMonitor:
+    """Listens in a thread of its own.
+
+    Args:
+        body: the id of the person.
+    """
+
+    def __init__(self, body: str) -> None:
+        self.clock_ns = 0
+        """The latest time on ``/clock``; 0 before there is one."""
+        self.last_angles = 0.0
+        """Steady time at which the latest angles came, seconds."""
+        self.angles = 0
+        """How many angle messages have come."""
+        self._statuses: dict[str, _Status] = {}
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("body_tracking_up", context=self._context)
+        self._node.create_subscription(
+            DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
+        )
+        self._node.create_subscription(
+            JointState, graph.joint_states_topic(body), self._on_angles, to_profile(RELIABLE)
+        )
+        clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        rclpy.try_shutdown(context=self._context)
+        self._thread.join(timeout=2.0)
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            node = status.name.partition(":")[0]
+            values = {item.key: item.value for item in status.values}
+            self._statuses[node] = _Status(status.level[0], status.message, values, time.monotonic())
+
+    def _on_angles(self, message: Any) -> None:
+        self.angles += 1
+        self.last_angles = time.monotonic()
+
+    def _on_clock(self, message: Any) -> None:
+        self.clock_ns = to_nanoseconds(message.clock)
+
+    # --- for people
+
+    def line(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:
+        """The status line: rates, delay, calibration, restarts."""
+        now = time.monotonic()
+        fresh = {name: status for name, status in self._statuses.items() if now - status.received < _FRESH}
+        parts = [f"{elapsed:6.1f} s"]
+        player = fresh.get("bag_player")
+        if player is not None:
+            parts[0] += f" (bag {float(player.values['position s']):.1f}/{float(player.values['duration s']):.1f} s)"
+        parts.append(self._rates(options, fresh))
+        delay = self._delay(fresh)
+        if delay:
+            parts.append(delay)
+        calibration = fresh.get("calibration")
+        parts.append(f"calibration: {calibration.text if calibration is not None else 'none'}")
+        malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
+        if malformed:
+            parts.append(f"malformed {malformed}")
+        if restarts:
+            parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
+        return " | ".join(parts)
+
+    def _rates(self, options: GraphOptions, fresh: Mapping[str, _Status]) -> str:
+        def rate(node: str, key: str) -> str:
+            value = fresh[node].values.get(f"rate {key}") if node in fresh else None
+            return f"{float(value):.0f}" if value is not None else "-"
+
+        sensors = " ".join(f"{name} {rate('fusion', f'in {graph.skeleton_topic(name)}')}" for name in options.sensors)
+        fused = rate("fusion", f"out {graph.FUSED}")
+        angles = rate("joint_angles", f"in {graph.FILTERED}")
+        return f"{sensors}, fused {fused}, angles {angles} Hz"
+
+    @staticmethod
+    def _delay(fresh: Mapping[str, _Status]) -> str:
+        """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
+        values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in _CHAIN]
+        known = [float(value) for value in values if value is not None]
+        return f"delay {sum(known):.1f} ms" if len(known) == len(_CHAIN) else ""
+
+    def summary(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:
+        """What was done."""
+        what = f"played {options.bag}" if options.bag else "ran"
+        text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
+        if options.record:
+            text += f", recorded in {options.record}"
+        if restarts:
+            text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
+        return text

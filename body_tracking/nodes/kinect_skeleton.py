@@ -1,0 +1,96 @@
+"""One sensor's skeletons, from a live backend or a recording, to ``/<sensor>/skeleton``."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from sensor_msgs.msg import PointCloud2
+
+import body_tracking.recording.source  # noqa: F401  (registers the backend "recording")
+from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
+from body_tracking.messages import skeletons_to_cloud
+from body_tracking.nodes.common import RELIABLE, ROS, GraphNode, run
+from body_tracking.parameters import Parameter
+from body_tracking.sensors import check_sensor_name
+from body_tracking.sensors.live import SourceSettings, backends, open_source
+
+PARAMETERS = (
+    Parameter("sensor", "kinect1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
+    Parameter("backend", "recording", "where skeletons come from", choices=backends()),
+    Parameter("device", "", "live backends: which of several devices; empty for the only one"),
+    Parameter("file", "", "recording: a .csv, .csv.gz or .skeleton file, or a bag"),
+    Parameter("recorded_sensor", "", "recording: the sensor's name in the file; empty for the same name"),
+    Parameter("rate", 1.0, "recording: seconds of it per second", min=0.01, max=100.0),
+    Parameter("loop", False, "recording: begin again at the end; stamps jump back then"),
+    Parameter(
+        "start_time",
+        0.0,
+        "recording: wall time at which its first frame (of any sensor in it) plays; 0 for now. With the same time for "
+        "each, several sensors stay in step, and one that is started again goes on where it should be",
+        unit="s",
+        min=0.0,
+        max=1e11,
+    ),
+    RELIABLE,
+)
+
+
+class KinectSkeleton(GraphNode):
+    """Publishes the frames of a source as they come."""
+
+    NAME = "kinect_skeleton"
+    PARAMETERS = PARAMETERS
+
+    def start(self) -> None:
+        """Open the source; a thread of its own waits for its frames."""
+        given: dict[str, Any] = dict(self.values)
+        self.failure = ""
+        sensor = check_sensor_name(given["sensor"])
+        settings = SourceSettings(
+            sensor,
+            given["device"],
+            given["file"],
+            given["recorded_sensor"],
+            given["rate"],
+            given["loop"],
+            given["start_time"],
+        )
+        self.source = open_source(given["backend"], settings)
+        self.output = self.create_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.thread = threading.Thread(target=self.publish_frames, daemon=True)
+        self.thread.start()
+
+    def publish_frames(self) -> None:
+        """Until the source or the node ends."""
+        try:
+            while self.context.ok() and not self.source.ended:
+                frame = self.source.read(timeout=0.2)
+                if frame is not None:
+                    self.send(self.output, skeletons_to_cloud(frame.skeletons, ROS), frame.skeletons[0].stamp_ns)
+        except BodyTrackingError as error:
+            self.failure = str(error)
+            self.get_logger().error(self.failure)
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """Whether it plays, ended or failed."""
+        text = self.failure or ("ended" if self.source.ended else "streaming")
+        return (2 if self.failure else 0), text, dict(self.source.counters)
+
+    def close(self) -> None:
+        """Let the thread end."""
+        self.source.close()
+        self.thread.join(timeout=1.0)
+
+
+def main() -> None:
+    """The executable ``kinect_skeleton``."""
+    run(KinectSkeleton)
+
+
+if __name__ == "__main__":
+    main()

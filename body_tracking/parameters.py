@@ -1,0 +1,210 @@
+"""Parameters as data: what a node can be told, with its unit, range and default, in one place.
+
+The nodes declare what is listed here, ``body_tracking up`` checks a parameters file against it before anything starts,
+and the documentation prints it. Knows no ROS library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import yaml
+
+from body_tracking.errors import BodyTrackingError
+
+Value: TypeAlias = bool | int | float | str | tuple[str, ...]
+
+SECTION = "ros__parameters"
+
+
+class ParameterError(BodyTrackingError):
+    """A parameter with an unknown name, of the wrong type or out of its range; or a file of them that is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of a node.
+
+    Attributes:
+        name: as in a parameters file.
+        default: its type is the parameter's type; a tuple is a list of strings, none of them empty.
+        doc: one line.
+        unit: or empty.
+        min: the least value, of a number.
+        max: the greatest value, of a number.
+        choices: the allowed values, of a string; empty for any.
+        live: whether it may change while the node runs.
+    """
+
+    name: str
+    default: Value
+    doc: str
+    unit: str = ""
+    min: float | None = None
+    max: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+
+    @property
+    def type_name(self) -> str:
+        """For people."""
+        names = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
+        return names.get(type(self.default), "a list of strings")
+
+    @property
+    def constraint(self) -> str:
+        """What values are allowed, for people; empty for any."""
+        if self.choices:
+            return ", ".join(self.choices)
+        if self.min is None and self.max is None:
+            return ""
+        if self.max is None:
+            return f"at least {self.min:g}"
+        return f"at most {self.max:g}" if self.min is None else f"{self.min:g} to {self.max:g}"
+
+    def check(self, value: object) -> Value:
+        """The value in the parameter's own type; a whole number serves as a number.
+
+        Raises:
+            ParameterError: another type, or out of range.
+        """
+        checked = self._typed(value)
+        if checked is None:
+            raise ParameterError(f"parameter {self.name!r}: {value!r}, expected {self.type_name}")
+        if isinstance(checked, int | float) and not isinstance(checked, bool):
+            low = -math.inf if self.min is None else self.min
+            high = math.inf if self.max is None else self.max
+            if not low <= checked <= high or not math.isfinite(checked):
+                raise ParameterError(f"parameter {self.name!r}: {value!r}, expected {self.constraint or 'finite'}")
+        if self.choices and checked not in self.choices:
+            raise ParameterError(f"parameter {self.name!r}: {value!r}, expected one of {self.constraint}")
+        return checked
+
+    def _typed(self, value: object) -> Value | None:
+        if isinstance(self.default, tuple):
+            if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
+                return tuple(item for item in value if item)  # ROS has no empty lists: [""] is one
+            return None
+        if isinstance(value, bool) or isinstance(self.default, bool):
+            return value if isinstance(value, bool) and isinstance(self.default, bool) else None
+        if isinstance(self.default, float) and isinstance(value, int):
+            return float(value)
+        return value if type(value) is type(self.default) else None
+
+
+def parameters_from(parameter_class: type[Any], *, live: bool = False) -> tuple[Parameter, ...]:
+    """A parameter per field of a library's parameter dataclass.
+
+    Args:
+        parameter_class: a dataclass with a default for every field; ``field(metadata=...)`` may hold ``doc``, ``unit``,
+            ``min``, ``max`` and ``choices``.
+        live: whether they may change while the node runs.
+    """
+    table = []
+    for item in fields(parameter_class):
+        default: Any = item.default
+        known = {key: item.metadata[key] for key in ("unit", "min", "max") if key in item.metadata}
+        choices = tuple(item.metadata.get("choices", ()))
+        table.append(Parameter(item.name, default, item.metadata.get("doc", ""), choices=choices, live=live, **known))
+    return tuple(table)
+
+
+def fields_of(parameter_class: type[Any], values: Mapping[str, Value]) -> dict[str, Any]:
+    """Those of a node's values that are fields of a library's parameter dataclass."""
+    return {item.name: values[item.name] for item in fields(parameter_class)}
+
+
+def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[str, Value]:
+    """The value of every parameter: as given, else its default.
+
+    Raises:
+        ParameterError: an unknown name, a wrong type, a value out of range.
+    """
+    known = {parameter.name: parameter for parameter in table}
+    for name in sorted(given.keys() - known.keys()):
+        similar = get_close_matches(name, known, n=1)
+        hint = f"did you mean {similar[0]!r}?" if similar else f"known: {', '.join(sorted(known))}"
+        raise ParameterError(f"unknown parameter {name!r}; {hint}")
+    return {
+        name: parameter.check(given[name]) if name in given else parameter.default for name, parameter in known.items()
+    }
+
+
+# --- files
+
+
+def read_file(path: Path) -> dict[str, dict[str, object]]:
+    """A ROS parameters file: for each node name or pattern, its parameters by full name.
+
+    Raises:
+        ParameterError: no such file, not YAML, or not of the form ``node: {ros__parameters: {name: value}}``.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    except yaml.YAMLError as error:
+        raise ParameterError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
+    sections: dict[str, dict[str, object]] = {}
+    _collect(path, content if content is not None else {}, "", sections)
+    return sections
+
+
+def _collect(path: Path, content: object, name: str, sections: dict[str, dict[str, object]]) -> None:
+    """Namespaces may be nested: ``ns: {node: {ros__parameters: ...}}``."""
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: {name or 'the file'} holds no {SECTION}")
+    for key, value in content.items():
+        if key == SECTION:
+            if not isinstance(value, dict):
+                raise ParameterError(f"{path}: {name}: {SECTION} holds no names and values")
+            _flatten(value, "", sections.setdefault(name, {}))
+        else:
+            _collect(path, value, f"{name}/{str(key).strip('/')}" if name else f"/{str(key).strip('/')}", sections)
+
+
+def _flatten(values: Mapping[object, object], prefix: str, flat: dict[str, object]) -> None:
+    """ROS writes the name ``a.b`` as ``a: {b: ...}`` too."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            _flatten(value, f"{prefix}{key}.", flat)
+        else:
+            flat[f"{prefix}{key}"] = value
+
+
+def matches(pattern: str, node: str) -> bool:
+    """Whether a section of a parameters file is about the node of this full name, such as ``/fusion``.
+
+    ``*`` stands for one part of the name, ``**`` for any number of them.
+    """
+    parts, names = pattern.strip("/").split("/"), node.strip("/").split("/")
+
+    def match(i: int, j: int) -> bool:
+        if i == len(parts):
+            return j == len(names)
+        if parts[i] == "**":
+            return any(match(i + 1, k) for k in range(j, len(names) + 1))
+        return j < len(names) and fnmatchcase(names[j], parts[i]) and match(i + 1, j + 1)
+
+    return match(0, 0)
+
+
+def to_ros(value: Value) -> bool | int | float | str | list[str]:
+    """A value as ROS takes it; an empty list would have no type there and becomes ``[""]``."""
+    return list(value) or [""] if isinstance(value, tuple) else value
+
+
+def is_wildcard(pattern: str) -> bool:
+    """Whether a section may be about several nodes."""
+    return "*" in pattern
+
+
+def is_ros_own(name: str) -> bool:
+    """Whether every ROS node has this parameter."""
+    return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")

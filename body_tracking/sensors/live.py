@@ -1,0 +1,90 @@
+"""The place for live sensors: what a backend offers to the ``kinect_skeleton`` node, and how it is found by name.
+
+A new backend is a class with the methods of :class:`SkeletonSource` whose module calls :func:`register`; the node, its
+topics and everything after them stay as they are. ``recording`` is the one there is (``recording/source.py``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.sensors import RecordedFrame
+
+
+class SourceError(BodyTrackingError):
+    """A sensor, or what takes its place, cannot be opened or read."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSettings:
+    """What a backend is told; each uses what concerns it.
+
+    Attributes:
+        sensor: the name under which its skeletons are published.
+        device: which of several devices, such as a serial number; empty for the only one.
+        file: what is played by ``recording``.
+        recorded_sensor: the sensor's name in that file; empty for the same name.
+        rate: seconds of the recording per second.
+        loop: begin again at the end.
+        start_time: wall time, seconds, at which the recording's first frame of any sensor plays; 0 for now.
+    """
+
+    sensor: str
+    device: str = ""
+    file: str = ""
+    recorded_sensor: str = ""
+    rate: float = 1.0
+    loop: bool = False
+    start_time: float = 0.0
+
+
+class SkeletonSource(Protocol):
+    """A stream of frames of one sensor, in the package's conventions (see ``sensors``)."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether no frame will ever come again."""
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What was met so far, such as frames that were dropped."""
+
+    def read(self, timeout: float) -> RecordedFrame | None:
+        """The next frame as soon as it is there; None when none is within the timeout (seconds).
+
+        Raises:
+            BodyTrackingError: the device or file failed; there will be no more frames.
+        """
+
+    def close(self) -> None:
+        """Let go of the device or file; a ``read`` in another thread returns."""
+
+
+Opener = Callable[[SourceSettings], SkeletonSource]
+
+_BACKENDS: dict[str, Opener] = {}
+
+
+def register(name: str, opener: Opener) -> None:
+    """Make a backend known under a name."""
+    _BACKENDS[name] = opener
+
+
+def backends() -> tuple[str, ...]:
+    """The names of the backends."""
+    return tuple(sorted(_BACKENDS))
+
+
+def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
+    """Open a sensor.
+
+    Raises:
+        SourceError: no such backend.
+        BodyTrackingError: the backend cannot open it.
+    """
+    if backend not in _BACKENDS:
+        raise SourceError(f"unknown backend {backend!r}, expected one of {', '.join(backends())}")
+    return _BACKENDS[backend](settings)

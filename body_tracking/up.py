@@ -1,0 +1,466 @@
+"""``body_tracking up``: the graph as separate processes, kept alive, with one line that says how it is doing."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
+from body_tracking.filters import FILTERS
+from body_tracking.graph import GraphOptions, NodeSpec
+from body_tracking.parameters import (
+    SECTION,
+    Parameter,
+    ParameterError,
+    Value,
+    check_all,
+    is_ros_own,
+    is_wildcard,
+    matches,
+    read_file,
+    to_ros,
+)
+from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.skeleton import NANOSECONDS
+
+if TYPE_CHECKING:
+    from body_tracking.nodes.graph_monitor import GraphMonitor
+
+FIRST_BACKOFF = 0.2
+"""Seconds before a node that died is started again; doubles with each death soon after a start, up to the last."""
+
+LAST_BACKOFF = 5.0
+SETTLED = 10.0
+"""A node that has run for this long, seconds, starts again with the first back-off."""
+
+STOP_TIMEOUT = 8.0
+"""Seconds for a node to end after it was asked to."""
+
+DRAIN_QUIET, DRAIN_TIMEOUT = 0.7, 5.0
+"""After the end of a bag: wait until no angles have come for so long, but no longer than that, seconds."""
+
+LINE_PERIOD = 5.0
+"""Seconds between status lines where stdout is no terminal."""
+
+_ROS_LOG = re.compile(r"^(?:\x1b\[[0-9;]*m)?\[(DEBUG|INFO|WARN|ERROR|FATAL)\]")
+_FAST_DDS = re.compile(r"RTPS_|\[[A-Z_]+ (?:Error|Warning)\]")
+
+
+class UpError(BodyTrackingError):
+    """The graph cannot be started as asked for."""
+
+
+# --- what to start
+
+
+def options_for(args: argparse.Namespace) -> GraphOptions:
+    """The graph that the command line asks for.
+
+    Raises:
+        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already.
+    """
+    sensors = tuple(name for name in args.sensors.split(",") if name) if args.sensors else ()
+    if args.sensors is not None and not sensors:
+        raise UpError("--sensors: no name")
+    if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
+        raise UpError(f"{args.record}: exists already; a recording needs a new folder")
+    if args.bag is None:
+        if args.rate != 1.0:
+            raise UpError("--rate is the rate of a bag; give --bag too")
+    else:
+        if not 0.01 <= args.rate <= 100.0:
+            raise UpError(f"--rate {args.rate:g}: expected 0.01 to 100")
+        with BagReader(args.bag) as reader:
+            there = graph.sensors_among(reader.topics)
+        if not there:
+            raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
+        missing = [sensor for sensor in sensors if sensor not in there]
+        if missing:
+            raise UpError(
+                f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
+            )
+        sensors = sensors or there
+    return GraphOptions(
+        sensors=sensors or graph.DEFAULT_SENSORS,
+        bag=str(args.bag) if args.bag else "",
+        record=str(args.record) if args.record else "",
+        rate=args.rate,
+        filter_name=args.filter or "",
+        calibration_file=str(args.calibration) if args.calibration else "",
+        reliable=args.reliable,
+    )
+
+
+def parameters_for(
+    specs: Sequence[NodeSpec], file: Path | None, defaults: Mapping[str, Mapping[str, Value]] | None = None
+) -> dict[str, dict[str, Value]]:
+    """Every parameter that is set, for each node: the graph's defaults, then the file, then what the graph needs.
+
+    Args:
+        specs: the nodes.
+        file: a ROS parameters file, or None.
+        defaults: more defaults by node name.
+
+    Raises:
+        ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
+            allowed.
+    """
+    tables = {spec.name: {item.name: item for item in graph.parameters_of(spec.executable)} for spec in specs}
+    sections = read_file(file) if file is not None else {}
+    for pattern, values in sections.items():
+        about = [spec for spec in specs if matches(pattern, spec.full_name)]
+        if not about:
+            there = ", ".join(spec.full_name for spec in specs)
+            raise ParameterError(f"{file}: {pattern}: no such node; the graph has {there}")
+        known = set().union(*(tables[spec.name] for spec in about))
+        for name in values:
+            if name not in known and not is_ros_own(name):
+                check = [item for spec in about for item in tables[spec.name].values()]
+                _check(check, {name: values[name]}, f"{file}: {pattern}")
+    result: dict[str, dict[str, Value]] = {}
+    for spec in specs:
+        given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
+        for pattern, values in sorted(sections.items(), key=lambda item: not is_wildcard(item[0])):
+            if matches(pattern, spec.full_name):
+                wildcard = is_wildcard(pattern)
+                given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
+        given |= spec.parameters
+        own: dict[str, Any] = {name: given.pop(name) for name in list(given) if is_ros_own(name)}
+        checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}" if file else spec.full_name)
+        result[spec.name] = {**own, **{name: checked[name] for name in given}}
+    return result
+
+
+def _check(table: Iterable[Parameter], given: Mapping[str, object], where: str) -> dict[str, Value]:
+    try:
+        return check_all(tuple(table), given)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None
+
+
+# --- one process
+
+
+@dataclass(slots=True)
+class Child:
+    """A node's process.
+
+    Attributes:
+        spec: what it runs.
+        parameters: what it is told.
+        process: None while it is not running.
+        started: steady time of its last start, seconds.
+        restarts: how often it was started again.
+        due: steady time of the next start; None while it runs, or when it is not to run any more.
+        done: it has ended on purpose.
+    """
+
+    spec: NodeSpec
+    parameters: dict[str, Value]
+    process: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    restarts: int = 0
+    backoff: float = FIRST_BACKOFF
+    due: float | None = 0.0
+    done: bool = False
+    reader: threading.Thread | None = None
+    last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=3))
+
+
+class Console:
+    """One status line at the bottom of a terminal, and lines above it; plain lines where there is no terminal."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stdout.isatty()
+        self._lock = threading.Lock()
+        self._status = ""
+        self._last = time.monotonic()
+
+    def line(self, text: str, *, error: bool = False) -> None:
+        """A line that stays."""
+        with self._lock:
+            if self._terminal and self._status:
+                print("\r\x1b[K", end="", flush=True)
+            print(text, file=sys.stderr if error else sys.stdout, flush=True)
+            self._draw()
+
+    def status(self, text: str) -> None:
+        """Replace the status line; without a terminal, print it every :data:`LINE_PERIOD`."""
+        with self._lock:
+            if self._terminal:
+                self._status = text
+                self._draw()
+            elif time.monotonic() - self._last >= LINE_PERIOD:
+                self._last = time.monotonic()
+                print(text, flush=True)
+
+    def end(self) -> None:
+        """Leave the status line as the last one."""
+        with self._lock:
+            if self._terminal and self._status:
+                print(flush=True)
+            self._status = ""
+
+    def _draw(self) -> None:
+        if self._terminal and self._status:
+            width = shutil.get_terminal_size().columns - 1
+            print(f"\r\x1b[K{self._status[:width]}", end="", flush=True)
+
+
+class Supervisor:
+    """Starts the nodes, starts those again that die, and leaves none behind.
+
+    Args:
+        options: the graph.
+        specs: its nodes.
+        parameters: of each node.
+        folder: for logs and parameters.
+    """
+
+    def __init__(
+        self,
+        options: GraphOptions,
+        specs: Sequence[NodeSpec],
+        parameters: Mapping[str, dict[str, Value]],
+        folder: Path,
+    ) -> None:
+        self.options = options
+        self.folder = folder
+        self.console = Console()
+        self.children = [Child(spec, dict(parameters[spec.name])) for spec in specs]
+        self.stopping = threading.Event()
+        self.failure = ""
+        self._bag_start_ns = 0
+        if options.bag:
+            with BagReader(options.bag) as reader:
+                self._bag_start_ns = reader.start_ns
+
+    def run(self, monitor: GraphMonitor) -> int:
+        """Until the bag ends, a signal comes or a node cannot start; the exit code."""
+        handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
+        begin = time.monotonic()
+        try:
+            while not self.stopping.wait(0.05):
+                self._look_after(monitor)
+                self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
+                if any(child.done for child in self.children):
+                    self._drain(monitor)
+                    break
+        finally:
+            self._stop_all()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        self.console.end()
+        if self.failure:
+            self.console.line(f"body_tracking: {self.failure}", error=True)
+            return 2
+        self.console.line(monitor.summary(self.options, time.monotonic() - begin, self._restarts()))
+        self.console.line(f"logs: {self.folder}")
+        return 0
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.stopping.set()
+
+    def _restarts(self) -> dict[str, int]:
+        return {child.spec.name: child.restarts for child in self.children if child.restarts}
+
+    # --- starting
+
+    def _look_after(self, monitor: GraphMonitor) -> None:
+        now = time.monotonic()
+        for child in self.children:
+            if child.process is not None and child.process.poll() is not None:
+                self._ended(child, now, monitor)
+            if child.due is not None and now >= child.due:
+                self._start(child)
+
+    def _start(self, child: Child) -> None:
+        spec = child.spec
+        file = self.folder / f"{spec.name}.parameters.yaml"
+        values = {name: to_ros(value) for name, value in child.parameters.items()}
+        file.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
+        command = [sys.executable, "-m", "body_tracking.nodes", spec.executable, "--ros-args"]
+        command += ["-r", f"__node:={spec.name}", "-r", f"__ns:={spec.namespace}", "--params-file", str(file)]
+        for source, target in spec.remappings:
+            command += ["-r", f"{source}:={target}"]
+        environment = {
+            **os.environ,
+            graph.PARENT_VARIABLE: str(os.getpid()),
+            "ROS_LOG_DIR": str(self.folder / "ros"),
+            "RCUTILS_COLORIZED_OUTPUT": "0",
+            "PYTHONUNBUFFERED": "1",
+        }
+        # A group of its own: Ctrl-C in the terminal goes to us alone, and we end the nodes in order.
+        child.process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,
+        )
+        child.started, child.due = time.monotonic(), None
+        child.reader = threading.Thread(target=self._read, args=(child, child.process), daemon=True)
+        child.reader.start()
+
+    def _ended(self, child: Child, now: float, monitor: GraphMonitor) -> None:
+        assert child.process is not None
+        code, child.process = child.process.returncode, None
+        if child.reader is not None:
+            child.reader.join(timeout=1.0)
+        playing = child.spec.executable == "bag_player"
+        if playing and (code == 0 or (child.restarts and code == 2)):
+            child.done = True
+            return
+        if code == 2 and child.restarts == 0:
+            self.failure = child.last_lines[-1] if child.last_lines else f"{child.spec.name} could not start"
+            self.stopping.set()
+            return
+        child.backoff = FIRST_BACKOFF if now - child.started > SETTLED else min(2.0 * child.backoff, LAST_BACKOFF)
+        child.due = now + child.backoff
+        child.restarts += 1
+        if playing and monitor.clock_ns:
+            child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
+        how = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+        self.console.line(f"{child.spec.name} died ({how}); starting it again", error=True)
+
+    def _read(self, child: Child, process: subprocess.Popen[bytes]) -> None:
+        """Write a node's output to its log, and show what somebody should know."""
+        assert process.stdout is not None
+        with (self.folder / f"{child.spec.name}.log").open("a", encoding="utf-8") as log, process.stdout:
+            for raw in process.stdout:
+                text = raw.decode("utf-8", "replace").rstrip()
+                print(text, file=log, flush=True)
+                level = _ROS_LOG.match(text)
+                if not text or (level is not None and level[1] in ("DEBUG", "INFO")) or _FAST_DDS.search(text):
+                    continue
+                child.last_lines.append(text)
+                if not self.stopping.is_set() and not text.startswith(f"{child.spec.executable}: "):
+                    self.console.line(f"{child.spec.name}: {text}", error=True)
+
+    # --- ending
+
+    def _drain(self, monitor: GraphMonitor) -> None:
+        """The bag has ended: let the last messages through."""
+        end = time.monotonic() + DRAIN_TIMEOUT
+        begin = time.monotonic()
+        while time.monotonic() < end and not self.stopping.is_set():
+            if time.monotonic() - max(begin, monitor.last_angles) > DRAIN_QUIET:
+                return
+            time.sleep(0.05)
+
+    def _stop_all(self) -> None:
+        self.stopping.set()
+        recorders = [child for child in self.children if child.spec.executable == "bag_recorder"]
+        others = [child for child in self.children if child not in recorders]
+        for group in (others, recorders):  # the recorder last, so that it has everything
+            running = [child.process for child in group if child.process is not None]
+            for process in running:
+                with contextlib.suppress(ProcessLookupError):
+                    process.send_signal(signal.SIGINT)
+            end = time.monotonic() + STOP_TIMEOUT
+            for process in running:
+                try:
+                    process.wait(max(0.0, end - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+        for child in self.children:
+            if child.reader is not None:
+                child.reader.join(timeout=1.0)
+
+
+# --- command line
+
+
+def _log_folder(given: Path | None) -> Path:
+    """Where ROS keeps its logs (``ROS_LOG_DIR``, ``ROS_HOME/log``, ``~/.ros/log``), else a temporary folder."""
+    name = f"body_tracking_up_{datetime.now():%Y%m%d_%H%M%S}_{os.getpid()}"
+    home = os.environ.get("ROS_HOME")
+    base = given or Path(os.environ.get("ROS_LOG_DIR") or (Path(home) if home else Path.home() / ".ros") / "log")
+    try:
+        folder = base.expanduser() / name
+        folder.mkdir(parents=True)
+    except OSError as error:
+        if given is not None:
+            raise UpError(f"{given}: cannot write logs there ({error.strerror})") from error
+        return Path(tempfile.mkdtemp(prefix=f"{name}_"))
+    return folder
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``up`` to the ``body_tracking`` command."""
+    parser = subparsers.add_parser(
+        "up",
+        help="run the live graph: sensors or a bag in, joint angles out",
+        description="Start the graph as separate processes: the sensors (or a bag in their place), calibration, "
+        "fusion, filter, joint angles and, with --record, a recorder. A node that dies is started again. Ends with "
+        "Ctrl-C, or when the bag ends.",
+        epilog="Without --bag the parameters file says what each sensor node reads, under its name <sensor>_skeleton.",
+    )
+    parser.add_argument("--params-file", type=Path, metavar="FILE", help="ROS parameters file; see config/")
+    parser.add_argument("--bag", type=Path, metavar="BAG", help="play this bag in place of the sensors")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="play the bag X times as fast (default 1)")
+    parser.add_argument("--record", type=Path, metavar="BAG", help="record everything into this new folder")
+    parser.add_argument("--filter", choices=FILTERS, help="which filter; overrides the parameters file")
+    parser.add_argument(
+        "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
+    )
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"
+    )
+    parser.add_argument(
+        "--reliable", action="store_true", help="transport skeletons reliably: nothing is lost, whatever it takes"
+    )
+    parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """``body_tracking up``."""
+    # Set before rclpy is imported, by whoever imports it first.
+    if not any(name in os.environ for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY")):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    options = options_for(args)
+    specs = graph.nodes_for(options)
+    try:
+        from body_tracking.nodes.graph_monitor import GraphMonitor
+    except ImportError as error:
+        raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
+    parameters_for(specs, args.params_file)  # what is wrong is said before a folder is made
+    folder = _log_folder(args.log_dir)
+    defaults: dict[str, dict[str, Value]] = {
+        # A calibration node that is started again goes on from here.
+        "calibration": {"calibration_file": str(folder / "calibration.yaml")}
+    }
+    start = time.time() + 3.0  # when every node is there; in step, whoever is started again
+    defaults |= {spec.name: {"start_time": start} for spec in specs if spec.executable == "kinect_skeleton"}
+    parameters = parameters_for(specs, args.params_file, defaults)
+    monitor = GraphMonitor(str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)))
+    try:
+        return Supervisor(options, specs, parameters, folder).run(monitor)
+    finally:
+        monitor.close()
