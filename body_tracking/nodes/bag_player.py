@@ -1,0 +1,258 @@
+"""Plays a bag: its messages as they were recorded, on their topics, with their QoS, and ``/clock``."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from body_tracking import graph
+from body_tracking.messages import to_time
+from body_tracking.nodes.bag_topics import UnknownTypeError, message_class, to_profile
+from body_tracking.nodes.common import ROS, STEADY, GraphNode, run
+from body_tracking.parameters import Parameter, Value
+from body_tracking.recording.player import Playback
+from body_tracking.recording.qos import RELIABLE, Qos
+from body_tracking.recording.rosbag2 import BagError, BagReader
+from body_tracking.skeleton import NANOSECONDS
+
+PARAMETERS = (
+    Parameter("bag", "", "the bag: a folder, or a single mcap file"),
+    Parameter("rate", 1.0, "bag seconds per second", min=1e-3, max=1e4, live=True),
+    Parameter("loop", False, "begin again at the end; /clock and stamps jump back then", live=True),
+    Parameter("start_offset", 0.0, "how much of the bag to leave out at its beginning", unit="s", min=0.0),
+    Parameter("topics", (), "play only these topics; empty for all"),
+    Parameter(
+        "clock_rate",
+        100.0,
+        "/clock this often, besides one before each message; 0 for no /clock at all",
+        unit="Hz",
+        min=0.0,
+        max=1000.0,
+    ),
+    Parameter("reliable", False, "offer every topic reliably, so that nothing is lost, whatever was recorded"),
+    Parameter(
+        "wait_for_subscribers",
+        (),
+        "topics that must have a subscriber before the bag starts, as /topic or /topic:NUMBER_OF_SUBSCRIBERS",
+    ),
+    Parameter("wait_timeout", 30.0, "start even so after this; 0 to wait for as long as it takes", unit="s", min=0.0),
+    Parameter("start_paused", False, "wait for ~/resume before the first message"),
+    Parameter("on_end", "exit", "what to do after the last message", choices=("exit", "idle")),
+)
+
+_LOOK_NS = 20_000_000  # between two looks for subscribers
+_SETTLE_NS = 250_000_000  # after they are seen, for them to see us too
+_ACKNOWLEDGE_S = 2.0  # at the end, for reliable topics
+
+
+class BagPlayer(GraphNode):
+    """Sends what a :class:`Playback` says is due; one timer, set anew each time, does it all."""
+
+    NAME = "bag_player"
+    PARAMETERS = PARAMETERS
+
+    playback: Playback | None = None
+
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Rate and loop may change while it plays."""
+        given: dict[str, Any] = dict(values)
+        if self.playback is not None:
+            self.playback.set_rate(given["rate"], time.monotonic_ns())
+            self.playback.loop = given["loop"]
+            self.wake(0)
+
+    def start(self) -> None:
+        """Open the bag and offer its topics."""
+        given: dict[str, Any] = dict(self.values)
+        if not given["bag"]:
+            raise BagError("parameter 'bag': no bag to play")
+        self.reader = BagReader(given["bag"])
+        self.offers = self.offer(given["topics"] or tuple(self.reader.topics))
+        self.absent = self.wanted_subscribers(given["wait_for_subscribers"])
+        self.playback = Playback(
+            self.reader,
+            rate=given["rate"],
+            loop=given["loop"],
+            start_offset_s=given["start_offset"],
+            topics=tuple(self.offers),
+            clock_hz=given["clock_rate"],
+            paused=given["start_paused"],
+        )
+        self.clock_topic = None
+        if given["clock_rate"]:
+            self.clock_topic = self.create_publisher(Clock, graph.CLOCK_TOPIC, to_profile(RELIABLE))
+        self.clock_ns = self.reader.start_ns
+        self.warned = 0
+        self.warn_of_damage()
+        self.create_service(Trigger, "~/pause", self.on_pause)
+        self.create_service(Trigger, "~/resume", self.on_resume)
+        self.create_service(Trigger, "~/toggle_paused", self.on_toggle_paused)
+        self.phase = "waiting for subscribers"
+        self.give_up_ns = time.monotonic_ns() + round((given["wait_timeout"] or 1e9) * NANOSECONDS)
+        self.alarm = self.create_timer(1.0, self.wait, clock=STEADY)
+        self.wake(0)
+
+    def wake(self, after_ns: int) -> None:
+        """Set the timer anew."""
+        self.alarm.timer_period_ns = max(1, after_ns)
+        self.alarm.reset()
+
+    # --- topics
+
+    def offer(self, topics: tuple[str, ...]) -> dict[str, Any]:
+        """A publisher for each topic that can be played here."""
+        missing = [topic for topic in topics if topic not in self.reader.topics]
+        if missing:
+            has = ", ".join(self.reader.topics) or "none"
+            raise BagError(f"{self.reader.path}: no topic {', '.join(missing)}; it has {has}")
+        publishers = {}
+        for topic in topics:
+            if topic == graph.CLOCK_TOPIC and self.values["clock_rate"]:
+                self.get_logger().info("the recorded /clock is not played: /clock is this playback's own")
+                continue
+            info = self.reader.topics[topic]
+            qos = info.qos
+            if self.values["reliable"]:
+                qos = Qos("reliable", qos.durability, max(qos.depth, graph.RELIABLE_SKELETON.depth))
+            try:
+                publishers[topic] = self.create_publisher(message_class(info.type_name), topic, to_profile(qos))
+            except UnknownTypeError as error:
+                self.monitor.totals["topics not played"] += 1
+                self.get_logger().error(f"{topic} is not played: {error}")
+        if not publishers:
+            raise BagError(f"{self.reader.path}: none of its topics can be played")
+        return publishers
+
+    def wanted_subscribers(self, texts: tuple[str, ...]) -> dict[str, int]:
+        """How many subscribers each of these topics must have: ``/topic`` or ``/topic:2``."""
+        wanted = {}
+        for text in texts:
+            topic, colon, number = text.partition(":")
+            if topic not in self.offers:
+                raise BagError(f"parameter 'wait_for_subscribers': {topic!r} is not played")
+            if colon and not number.isdecimal():
+                raise BagError(f"parameter 'wait_for_subscribers': {text!r}, expected /topic or /topic:NUMBER")
+            wanted[topic] = int(number or 1)
+        return wanted
+
+    # --- the timer, phase by phase
+
+    def wait(self) -> None:
+        """Look whether everybody who was asked for listens."""
+        self.absent = {
+            topic: number
+            for topic, number in self.absent.items()
+            if self.offers[topic].get_subscription_count() < number
+        }
+        late = time.monotonic_ns() > self.give_up_ns
+        if self.absent and not late:
+            self.wake(_LOOK_NS)
+            return
+        if self.absent:
+            self.get_logger().warning(f"starting without enough subscribers of {', '.join(self.absent)}")
+        self.phase = "playing"
+        self.alarm.callback = self.play
+        self.wake(_SETTLE_NS if self.values["wait_for_subscribers"] and not late else 0)
+
+    def play(self) -> None:
+        """Send what is due."""
+        assert self.playback is not None
+        step = self.playback.step(time.monotonic_ns())
+        for batch in step.batches:
+            self.clock_ns = batch.clock_ns
+            if self.clock_topic is not None:
+                self.clock_topic.publish(Clock(clock=to_time(batch.clock_ns, ROS)))
+            for message in batch.messages:
+                self.send(self.offers[message.topic], message.cdr)
+        if step.wake_ns is None:
+            self.end()
+        else:
+            self.wake(step.wake_ns - time.monotonic_ns())
+
+    def end(self) -> None:
+        """After the last message: see that it arrives, then leave or stay."""
+        self.phase = "at the end"
+        self.alarm.cancel()
+        self._report()
+        for publisher in self.offers.values():
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+        if self.values["on_end"] == "exit":
+            self.context.try_shutdown()
+
+    # --- services
+
+    def on_pause(self, _: Any, response: Any) -> Any:
+        """``~/pause``."""
+        return self.set_paused(True, response)
+
+    def on_resume(self, _: Any, response: Any) -> Any:
+        """``~/resume``."""
+        return self.set_paused(False, response)
+
+    def on_toggle_paused(self, _: Any, response: Any) -> Any:
+        """``~/toggle_paused``."""
+        return self.set_paused(self.playback is not None and not self.playback.paused, response)
+
+    def set_paused(self, paused: bool, response: Any) -> Any:
+        """Let the bag's time stand still or run."""
+        assert self.playback is not None
+        now_ns = time.monotonic_ns()
+        if paused:
+            self.playback.pause(now_ns)
+        else:
+            self.playback.resume(now_ns)
+        if self.phase == "playing":
+            self.wake(0)
+        at_s = (self.playback.bag_time_ns(now_ns) - self.reader.start_ns) / NANOSECONDS
+        response.success = self.phase != "at the end"
+        response.message = f"{'paused' if paused else self.phase} at {at_s:.3f} s of the bag"
+        return response
+
+    # --- diagnostics
+
+    def warn_of_damage(self) -> None:
+        """Damage in the bag shows while it is read."""
+        for warning in self.reader.warnings[self.warned :]:
+            self.get_logger().warning(warning)
+        self.warned = len(self.reader.warnings)
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """Where it is, and how late."""
+        assert self.playback is not None
+        self.warn_of_damage()
+        text = "paused" if self.playback.paused else self.phase
+        return (
+            1 if self.warned else 0,
+            text,
+            {
+                "bag": self.reader.path,
+                "position s": f"{(self.clock_ns - self.reader.start_ns) / NANOSECONDS:.3f}",
+                "duration s": f"{(self.reader.end_ns - self.reader.start_ns) / NANOSECONDS:.3f}",
+                "rate": self.playback.rate,
+                "sent": self.playback.sent,
+                "late ms": f"{self.playback.late_ns / 1e6:.3f}",
+                "loops": self.playback.loops,
+                "damages": self.warned,
+            },
+        )
+
+    def close(self) -> None:
+        """Close the bag."""
+        self.reader.close()
+
+
+def main() -> None:
+    """The executable ``bag_player``."""
+    run(BagPlayer)
+
+
+if __name__ == "__main__":
+    main()

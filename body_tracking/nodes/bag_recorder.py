@@ -1,0 +1,242 @@
+"""Records topics into a bag: the messages as they arrive, as bytes."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from std_srvs.srv import Trigger
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.nodes.bag_topics import from_profile, message_class, to_profile
+from body_tracking.nodes.common import STEADY, GraphNode, run
+from body_tracking.parameters import Parameter
+from body_tracking.recording.qos import Qos, request_for
+from body_tracking.recording.rosbag2 import BagError, BagWriter
+
+PARAMETERS = (
+    Parameter(
+        "folder",
+        "",
+        "the bag; one that is there is continued. Empty for body_tracking_<date> in the working directory",
+    ),
+    Parameter("topics", (), "record only these topics; empty for all that appear"),
+    Parameter("exclude", ("/clock", "/rosout", "/parameter_events"), "topics not to record, where topics is empty"),
+    Parameter("start_recording", True, "begin at once, not only with recorder/start"),
+    Parameter(
+        "chunk_seconds",
+        1.0,
+        "at least this often everything is written through to the disk: what a power failure may cost",
+        unit="s",
+        min=0.01,
+        max=3600.0,
+    ),
+)
+
+_DEPTH = 1000  # messages of a topic that may wait while the disk is slow
+
+
+class BagRecorder(GraphNode):
+    """One bag; recording can be stopped and continued."""
+
+    NAME = "bag_recorder"
+    PARAMETERS = PARAMETERS
+
+    def start(self) -> None:
+        """Open the bag and look for topics."""
+        given: dict[str, Any] = dict(self.values)
+        self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
+        self.chosen = frozenset(given["topics"])
+        self.exclude = frozenset(given["exclude"])
+        self.simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self.writer: BagWriter | None = None
+        self.inputs: dict[str, tuple[Qos, Any]] = {}
+        self.refused: dict[str, str] = {}
+        self.early: list[tuple[str, bytes]] = []
+        self.error = ""
+        self.written = self.lost = self.n_bytes = 0
+        self.create_service(Trigger, "recorder/start", partial(self.answer, self.begin))
+        self.create_service(Trigger, "recorder/stop", partial(self.answer, self.stop))
+        # Steady timers: a recording goes on while a simulated clock stands still.
+        self.create_timer(1.0, self.discover, clock=STEADY)
+        self.create_timer(given["chunk_seconds"], self.flush, clock=STEADY)
+        if given["start_recording"]:
+            self.begin()
+
+    # --- beginning and stopping
+
+    def begin(self) -> str:
+        """Record, into the next file of the bag; what was done.
+
+        Raises:
+            BagError: the bag cannot be written.
+        """
+        if self.writer is None:
+            interval: Any = self.values["chunk_seconds"]
+            self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
+            self.error = ""
+            # After a failure the subscriptions are still there; the new file does not know their topics.
+            for topic in tuple(self.inputs):
+                self.forget(topic)
+            self.get_logger().info(f"recording into {self.writer.path}")
+            self.discover()
+        return f"recording into {self.folder}"
+
+    def stop(self) -> str:
+        """Close the bag; what was done.
+
+        Raises:
+            BagError: its end cannot be written.
+        """
+        for topic in tuple(self.inputs):
+            self.forget(topic)
+        self.write_early()
+        writer, self.writer = self.writer, None
+        if writer is not None:
+            self.written += writer.message_count
+            writer.close()
+        return f"{self.written} messages in {self.folder}"
+
+    def answer(self, action: Callable[[], str], _: Any, response: Any) -> Any:
+        """``recorder/start`` and ``recorder/stop``."""
+        try:
+            response.message = action()
+            response.success = True
+        except BagError as error:
+            self.fail(error)
+            response.message = str(error)
+        return response
+
+    def fail(self, error: BagError) -> None:
+        """The disk is full, or gone: say so, count what is lost, stay alive for ``recorder/start``."""
+        self.error = str(error)
+        self.get_logger().error(f"recording has stopped: {error}")
+        if self.writer is not None:
+            self.written += self.writer.message_count
+            self.writer = None
+
+    def close(self) -> None:
+        """Close the bag."""
+        try:
+            self.stop()
+        except BagError as error:
+            self.get_logger().error(str(error))
+
+    # --- topics
+
+    def discover(self) -> None:
+        """Subscribe to what has appeared."""
+        if self.writer is None:
+            return
+        for topic, types in self.get_topic_names_and_types():
+            if topic in self.chosen if self.chosen else topic not in self.exclude:
+                self.adapt(topic, types[0])
+
+    def adapt(self, topic: str, type_name: str) -> None:
+        """Subscribe as the topic's publishers allow, anew when they have changed."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        if not publishers or self.writer is None or self.refused.get(topic) == type_name:
+            return
+        offered = tuple(from_profile(publisher.qos_profile) for publisher in publishers)
+        request = request_for(offered, _DEPTH)
+        if topic in self.inputs and self.inputs[topic][0] == request:
+            return
+        self.forget(topic)
+        try:
+            kind = message_class(type_name)
+            self.writer.add_topic(topic, type_name, offered)
+        except BodyTrackingError as error:
+            if self.writer.failure is not None:
+                self.fail(self.writer.failure)
+                return
+            self.refused[topic] = type_name
+            self.get_logger().warning(f"{topic} is not recorded: {error}")
+            return
+
+        def receive(cdr: bytes, info: dict[str, int]) -> None:
+            self.receive(topic, cdr, info)
+
+        callback: Any = receive  # rclpy passes the message info to callbacks of two arguments
+        subscription = self.create_subscription(kind, topic, callback, to_profile(request), raw=True)
+        self.inputs[topic] = (request, subscription)
+
+    def forget(self, topic: str) -> None:
+        """End a subscription."""
+        if topic in self.inputs:
+            _, subscription = self.inputs.pop(topic)
+            self.destroy_subscription(subscription)
+
+    # --- messages
+
+    def receive(self, topic: str, cdr: bytes, info: dict[str, int]) -> None:
+        """Write a message, with the time of its receipt."""
+        if not self.simulated_time:
+            received_ns = info["received_timestamp"] or time.time_ns()
+            self.write(topic, cdr, received_ns, info["source_timestamp"] or received_ns)
+        elif self.now_ns() == 0:
+            # No /clock yet: 0 would put the beginning of the bag years before its rest.
+            self.early.append((topic, cdr))
+        else:
+            self.write_early()
+            self.write(topic, cdr, self.now_ns())
+
+    def write_early(self) -> None:
+        """Write what came before the clock did."""
+        early, self.early = self.early, []
+        for topic, cdr in early:
+            self.write(topic, cdr, self.now_ns())
+
+    def write(self, topic: str, cdr: bytes, received_ns: int, sent_ns: int | None = None) -> None:
+        """Write at once; if that is not possible, count."""
+        if self.writer is None:
+            self.lost += bool(self.error)
+            return
+        try:
+            self.writer.write(topic, cdr, received_ns, sent_ns)
+        except BagError as error:
+            self.lost += 1
+            self.fail(error)
+        else:
+            self.n_bytes += len(cdr)
+
+    def flush(self) -> None:
+        """Write through to the disk what came last, though nothing more comes."""
+        if self.writer is not None:
+            try:
+                self.writer.flush()
+            except BagError as error:
+                self.fail(error)
+
+    # --- diagnostics
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """What was recorded, and what was not."""
+        values: dict[str, object] = {
+            "bag": self.folder,
+            "messages": self.written + (0 if self.writer is None else self.writer.message_count),
+            "bytes": self.n_bytes,
+            "topics": len(self.inputs),
+            "topics refused": len(self.refused),
+            "lost": self.lost,
+        }
+        if self.refused:
+            values["refused"] = ", ".join(f"{topic} ({type_name})" for topic, type_name in self.refused.items())
+        if self.error:
+            return 2, self.error, values
+        return (1 if self.refused else 0), ("stopped" if self.writer is None else "recording"), values
+
+
+def main() -> None:
+    """The executable ``bag_recorder``."""
+    run(BagRecorder)
+
+
+if __name__ == "__main__":
+    main()
