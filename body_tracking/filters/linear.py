@@ -142,7 +142,7 @@ class LinearKalmanParameters:
         },
     )
     reacquire_after: float = field(
-        default=0.1,
+        default=0.12,
         metadata={
             "doc": "a joint rejected without a break for longer than this is started anew on its measurement; much "
             "later the grown uncertainty would let it in as a sudden movement, and overshoot",
@@ -363,22 +363,30 @@ class LinearKalmanFilter:
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
-        z = np.where(observed[:, None], positions, 0.0)[:, :, None]
-        share = self.parameters.white_noise_share
-        kalman.update(Stacked.of(z), R=Stacked.of(share * noise), H=Stacked.of(observation))
-
-        innovation = np.asarray(kalman.y)
-        distances: FloatArray = (innovation * (np.asarray(kalman.SI) @ innovation)).sum(axis=(1, 2))
+        measurement = Stacked.of(np.where(observed[:, None], positions, 0.0)[:, :, None])
+        white = self.parameters.white_noise_share * noise
+        kalman.update(measurement, R=Stacked.of(white), H=Stacked.of(observation))
+        distances = self._distances()
         self.innovation_distances = np.where(observed, distances, np.nan)
-        rejected: BoolArray = np.array(distances > self._gate)
-        if rejected.any():  # suspected, that is: not yet with the slow part of the noise
-            suspects = np.flatnonzero(rejected)
-            total = np.asarray(kalman.S)[suspects] + (1.0 - share) * noise[suspects]
-            suspect = innovation[suspects]
-            rejected[suspects] = (suspect * np.linalg.solve(total, suspect)).sum(axis=(1, 2)) > self._gate
-            kalman.x[rejected] = kalman.x_prior[rejected]
-            kalman.P[rejected] = kalman.P_prior[rejected]
+        suspects: BoolArray = np.array(distances > self._gate)
+        if not suspects.any():
+            return suspects
+
+        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is an outlier.
+        # Once more for these, with all of the noise: a change is then followed without a kick to the velocity.
+        kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
+        noise = np.where(suspects[:, None, None], noise, white)
+        kalman.update(measurement, R=Stacked.of(noise), H=Stacked.of(observation))
+        rejected: BoolArray = suspects & (self._distances() > self._gate)
+        kalman.x[rejected] = kalman.x_prior[rejected]
+        kalman.P[rejected] = kalman.P_prior[rejected]
         return rejected
+
+    def _distances(self) -> FloatArray:
+        """(25,) squared Mahalanobis distances of the last update's innovations; 0 where nothing was observed."""
+        innovation = np.asarray(self._kalman.y)
+        distances: FloatArray = (innovation * (np.asarray(self._kalman.SI) @ innovation)).sum(axis=(1, 2))
+        return distances
 
     def _book(self, step: float, measured: BoolArray, rejected: BoolArray) -> None:
         """Age the joints that got no measurement, and give up those for which it was too long."""

@@ -122,8 +122,9 @@ _D_AXIS, _D_P, _D_Q = (_indices([str(row[column]) for row in _DIHEDRAL]) for col
 _D_AXIS_SIGN, _D_P_SIGN = np.array([row[2] for row in _DIHEDRAL]), np.array([row[4] for row in _DIHEDRAL])
 _D_TURNED = np.array([row[6] != 0 for row in _DIHEDRAL])
 
-_ORDER = np.array([[row[0] for row in (*_BETWEEN, *_DIHEDRAL)].index(name) for name in ANGLE_NAMES], dtype=np.intp)
-"""Row of the two tables, one after the other, for each name."""
+_ROWS = [row[0] for row in (*_BETWEEN, *_DIHEDRAL)]
+_ORDER: IntArray = np.array([_ROWS.index(name) for name in ANGLE_NAMES], dtype=np.intp)
+"""Row of the two tables, one after the other, for each name; all below is in the order of the rows."""
 _N_BETWEEN, _N_ANGLES = len(_BETWEEN), len(ANGLE_NAMES)
 
 _JOINTS: IntArray = np.unique(np.concatenate([_FROM, _TO]))
@@ -150,10 +151,9 @@ def _slots() -> tuple[FloatArray, FloatArray]:
 
 
 _B_SLOTS, _D_SLOTS = _slots()
-_USED = np.concatenate([(_B_SLOTS != 0).any(axis=2), (_D_SLOTS != 0).any(axis=2)])[_ORDER].T
-"""(joints, angles) which joint takes part in which angle."""
+_USED = np.concatenate([(slots != 0).any(axis=2) for slots in (_B_SLOTS, _D_SLOTS, _B_SLOTS)]).T
+"""(joints, rows) which joint takes part in which row of the Jacobian."""
 _B_HEADING, _D_HEADING = (int(np.flatnonzero(column == _N_VECTORS)[0]) for column in (_B_B, _D_AXIS))
-_NO_FOLD = np.zeros((_N_ANGLES - _N_BETWEEN, len(_JOINTS), 3))
 _DENSITIES_SQUARED = 3.0 * joint_densities()[_JOINTS, None] ** 2
 
 _TINY = 1e-18
@@ -162,17 +162,14 @@ _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
 _MAX_STDDEV: FloatArray = np.select(
-    [
-        _ORDER < _N_BETWEEN,
-        np.array([name.startswith("trunk") for name in ANGLE_NAMES]),
-    ],
+    [np.arange(_N_ANGLES) < _N_BETWEEN, np.array([name.startswith("trunk") for name in _ROWS])],
     [np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0)],
     1.0 / np.sqrt(chi2.ppf(0.999, 2)),
 )
 """(n,) radians from which an angle is unknown.
 
-That of an angle of which nothing is known (uniform over its range); but for the turns of the arm, where a straight
-elbow or a hanging arm shows no direction at all, that of a direction whose vector is not significantly longer than zero.
+That of an angle of which nothing is known (uniform over its range). But for the turns of the arm, since a straight
+elbow or a hanging arm shows no direction at all: that of a direction whose vector is just significantly longer than 0.
 """
 
 
@@ -245,46 +242,47 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
         infinite standard deviation. Without covariances in the skeleton every standard deviation is infinite, without
         velocities every velocity is NaN.
     """
+    n = _N_ANGLES
     with np.errstate(all="ignore"):  # NaN and infinity are values here: they say that something is not known
         positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-        angles, jacobian, across, fold, singular = _angles_and_jacobians(positions)
-        unknown = np.isnan(angles) | singular
-        stddev = rate_stddev = np.full(_N_ANGLES, np.inf)
+        angles, jacobian, sine, singular = _angles_and_jacobian(positions)
+        unknown = np.isnan(angles)
+        unknown[_N_BETWEEN:] |= singular
+        rates, stddev, rate_stddev = np.full(n, np.nan), np.full(n, np.inf), np.full(n, np.inf)
         if skeleton.covariances is not None:
             covariances = skeleton.covariances[_JOINTS]
             variances = np.where(_USED, ((jacobian @ covariances) * jacobian).sum(axis=2), 0.0)
             variance = variances.sum(axis=0)
             # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far
             # from it none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
-            variance_across = np.where(_USED, ((across @ covariances) * across).sum(axis=2), 0.0).sum(axis=0)
-            variance = variance + variance_across * np.minimum(1.0, 2.0 * variance_across / fold**2)
-            stddev = np.sqrt(variance)
-            unknown |= ~np.isfinite(stddev) | (stddev > _MAX_STDDEV)
+            across = variance[n:]
+            variance[:_N_BETWEEN] += across * np.minimum(1.0, 2.0 * across / sine**2)
+            stddev = np.sqrt(variance[:n])
+            unknown |= ~(stddev <= _MAX_STDDEV)
             stddev[unknown] = np.inf
-        rates = np.full(_N_ANGLES, np.nan)
         if skeleton.velocities is not None:
-            parts = (jacobian * skeleton.velocities[_JOINTS, None, :]).sum(axis=2)
-            rates = np.where(_USED, parts, 0.0).sum(axis=0)
+            parts = (jacobian[:, :n] * skeleton.velocities[_JOINTS, None, :]).sum(axis=2)
+            rates = np.where(_USED[:, :n], parts, 0.0).sum(axis=0)
             if skeleton.covariances is not None:
-                steepness = (jacobian * jacobian).sum(axis=2)
-                bounds = np.cbrt(_DENSITIES_SQUARED * steepness**2 * variances)
-                rate_stddev = np.sqrt(np.where(_USED, bounds, 0.0).sum(axis=0))
+                steepness = (jacobian[:, :n] ** 2).sum(axis=2)
+                bounds = np.cbrt(_DENSITIES_SQUARED * steepness**2 * variances[:, :n])
+                rate_stddev = np.sqrt(np.where(_USED[:, :n], bounds, 0.0).sum(axis=0))
                 rate_stddev[unknown | np.isnan(rates)] = np.inf
-    return JointAngles(skeleton.stamp_ns, ANGLE_NAMES, angles, rates, stddev, rate_stddev)
+    return JointAngles(
+        skeleton.stamp_ns, ANGLE_NAMES, angles[_ORDER], rates[_ORDER], stddev[_ORDER], rate_stddev[_ORDER]
+    )
 
 
-def _angles_and_jacobians(
-    positions: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """All angles and their derivatives.
+def _angles_and_jacobian(positions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """All angles and their derivatives, in the order of the two tables.
 
     Args:
         positions: (25, 3) metres, NaN where unknown.
 
     Returns:
-        (n,) angles; (joints, n, 3) their Jacobian by the used joints; (joints, n, 3) that of the deflection across the
-        fold (zero for dihedral angles); (n,) the sine of the distance from the fold (one for dihedral angles); (n,)
-        dihedral angles that turn about an axis along one of their vectors.
+        (13,) angles; (joints, 20, 3) their Jacobian by the used joints and, in the last 7 rows, that of the deflections
+        across the folds of the angles between vectors; (7,) sines of these angles; (6,) dihedral angles that turn
+        about an axis along one of their vectors.
     """
     vectors = _vectors(positions)
     dots = vectors.T @ vectors
@@ -294,8 +292,6 @@ def _angles_and_jacobians(
     between, sine, gradient, across = _between(
         vectors[:, _B_A], vectors[:, _B_B], squares[_B_A], squares[_B_B], dots[_B_A, _B_B]
     )
-    gradient *= _B_SIGN
-
     y, x, turn_gradient, area_p, area_q = _dihedral(
         vectors[:, _D_AXIS] * _D_AXIS_SIGN,
         vectors[:, _D_P] * _D_P_SIGN,
@@ -307,24 +303,20 @@ def _angles_and_jacobians(
     )
     smaller = np.minimum(area_p / squares[_D_P], area_q / squares[_D_Q]) / squares[_D_AXIS]
     dihedral = np.where(_D_TURNED, np.arctan2(-x, y), np.arctan2(y, x))  # a quarter turn back
+    # NaN of a vector without length gets into the angles, which would be some number otherwise
+    angles = np.concatenate([_B_SIGN * between + _B_OFFSET + 0.0 * sine, dihedral + 0.0 * smaller])
+
+    gradient *= _B_SIGN
     turn_gradient[0] *= _D_AXIS_SIGN
     turn_gradient[1] *= _D_P_SIGN
-
     # the heading is the horizontal part of the hip line
     gradient[1, 2, _B_HEADING] = across[1, 2, _B_HEADING] = 0.0
     turn_gradient[0, 2, _D_HEADING] = 0.0
-
-    between = between + 0.0 * sine  # NaN where a vector has no length
-    dihedral = dihedral + 0.0 * smaller
-    angles = np.concatenate([_B_SIGN * between + _B_OFFSET, dihedral])
-    jacobian = np.concatenate([_B_SLOTS @ gradient.transpose(2, 0, 1), _D_SLOTS @ turn_gradient.transpose(2, 0, 1)])
-    jacobian_across = np.concatenate([_B_SLOTS @ across.transpose(2, 0, 1), _NO_FOLD])
-    fold = np.concatenate([sine, np.ones(_N_ANGLES - _N_BETWEEN)])
-    singular = np.concatenate([np.zeros(_N_BETWEEN, dtype=bool), ~(smaller > _SINGULAR**2)])
-    return (
-        angles[_ORDER],
-        jacobian[_ORDER].transpose(1, 0, 2),
-        jacobian_across[_ORDER].transpose(1, 0, 2),
-        fold[_ORDER],
-        singular[_ORDER],
+    jacobian = np.concatenate(
+        [
+            _B_SLOTS @ gradient.transpose(2, 0, 1),
+            _D_SLOTS @ turn_gradient.transpose(2, 0, 1),
+            _B_SLOTS @ across.transpose(2, 0, 1),
+        ]
     )
+    return angles, jacobian.transpose(1, 0, 2), sine, ~(smaller > _SINGULAR**2)
