@@ -1,0 +1,130 @@
+"""The numbers of a recording: what the table says is what is in the bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from body_tracking.cli import main
+from body_tracking.evaluation.show import summarise
+from body_tracking.evaluation.summary import AngleSeries, EvaluationError, nearest, read, summaries, table
+from body_tracking.filters import make_filter
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.messages import JOINT_STATE, POINT_CLOUD, angles_to_joint_states, skeletons_to_cloud
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter
+from body_tracking.simulation.bags import MOTIONS, simulate
+from body_tracking.skeleton import N_JOINTS, Skeleton, TrackingState
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wave as one sensor at its true place would track it, with the truth beside."""
+    recording = simulate(MOTIONS[0])
+    sensor = recording.sensors[0]
+    tracker = make_filter("lkf_constant_velocity")
+    folder = tmp_path_factory.mktemp("evaluation") / "wave"
+    topics = ("/humans/bodies/ann/joint_states", "/humans/bodies/ann/joint_states_stddev", "/ground_truth/joint_states")
+    with BagWriter(folder) as bag:
+        for topic in ("/filtered/skeleton", "/ground_truth/skeleton"):
+            bag.add_topic(topic, POINT_CLOUD)
+        for topic in topics:
+            bag.add_topic(topic, JOINT_STATE)
+        for truth in recording.truth:
+            states, _ = angles_to_joint_states(positional_angles(truth), "ann", "world", BAG_MESSAGES)
+            bag.write_message(topics[2], states, truth.stamp_ns)
+            bag.write_message("/ground_truth/skeleton", skeletons_to_cloud((truth,), BAG_MESSAGES), truth.stamp_ns)
+        for frame in recording.frames:
+            seen = frame.skeletons[0]
+            if frame.sensor != sensor.pose.sensor:
+                continue
+            world = Skeleton(seen.stamp_ns, "world", sensor.pose.apply(seen.positions), seen.states)
+            result = tracker.update(world)
+            assert result is not None
+            bag.write_message("/filtered/skeleton", skeletons_to_cloud((result,), BAG_MESSAGES), seen.stamp_ns)
+            states, deviations = angles_to_joint_states(positional_angles(result), "ann", "world", BAG_MESSAGES)
+            bag.write_message(topics[0], states, seen.stamp_ns)
+            bag.write_message(topics[1], deviations, seen.stamp_ns)
+    return folder
+
+
+def series(values: list[float], stddev: list[float], name: str = "knee") -> AngleSeries:
+    stamps = np.arange(len(values), dtype=np.int64) * 33_333_333
+    return AngleSeries(stamps, (name,), np.radians(values)[:, None], np.radians(stddev)[:, None])
+
+
+def test_a_summary_leaves_out_what_is_unknown() -> None:
+    (row,) = summaries(series([10.0, 170.0, 30.0, 20.0], [1.0, np.inf, 2.0, 3.0]))
+    assert (row.min, row.max, row.last) == pytest.approx((10.0, 30.0, 20.0))
+    assert row.known == 0.75 and row.stddev == pytest.approx(2.5)
+    assert np.isnan(row.rms_error) and np.isnan(row.within_2_stddev)
+
+
+def test_errors_pass_over_the_cut_at_180_degrees() -> None:
+    (row,) = summaries(series([179.0, -179.0], [1.0, 0.5]), series([-179.0, 179.0], [0.0, 0.0]))
+    assert row.rms_error == pytest.approx(2.0)
+    assert row.within_2_stddev == 0.5
+
+
+def test_an_angle_never_known_is_dashes_and_infinity() -> None:
+    rows = summaries(series([np.nan, 5.0], [np.inf, np.inf]))
+    line = table(rows).splitlines()[-1].split()
+    assert line == ["knee", "-", "-", "-", "inf", "0%"]
+
+
+def test_the_nearest_stamp_is_the_nearest_or_none() -> None:
+    stamps = np.array([0, 100, 200], dtype=np.int64)
+    assert_array_equal(nearest(stamps, np.array([-5, 49, 51, 149, 260, 205]), 20), [0, -1, -1, -1, -1, 2])
+    assert_array_equal(nearest(stamps, np.array([40, 60]), 50), [0, 1])
+    assert_array_equal(nearest(stamps[:1], np.array([3, 400]), 50), [0, -1])
+
+
+def test_a_bag_becomes_a_table_and_a_picture(tracked_bag: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "new" / "wave.png"
+    rows = {row.name: row for row in summarise(tracked_bag, picture)}
+    assert tuple(rows) == ANGLE_NAMES
+    assert picture.read_bytes().startswith(PNG) and picture.stat().st_size > 50_000
+    elbow = rows["elbow_flexion_left"]
+    assert elbow.min < 30.0 and 80.0 < elbow.max < 130.0 and elbow.known > 0.95
+    assert elbow.rms_error < 1.2 * elbow.stddev and elbow.within_2_stddev > 0.9
+    # straight in the T-pose, bent while waving
+    assert 0.1 < rows["humeral_rotation_left"].known < 0.8
+
+
+def test_a_bag_without_truth_or_skeletons_is_shown_all_the_same(tmp_path: Path) -> None:
+    folder, topic = tmp_path / "bare", "/humans/bodies/body1/joint_states"
+    rng = np.random.default_rng(0)
+    with BagWriter(folder) as bag:
+        bag.add_topic(topic, JOINT_STATE)
+        for k in range(5):
+            states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+            angles = positional_angles(Skeleton(1 + k, "world", rng.normal(size=(N_JOINTS, 3)), states))
+            bag.write_message(topic, angles_to_joint_states(angles, "body1", "world", BAG_MESSAGES)[0], 1 + k)
+    rows = summarise(folder, tmp_path / "bare.png")
+    assert all(row.known == 0.0 and np.isinf(row.stddev) for row in rows)
+    assert (tmp_path / "bare.png").read_bytes().startswith(PNG)
+
+
+def test_bags_that_hold_no_angles_are_told_in_one_line(tmp_path: Path, tracked_bag: Path) -> None:
+    with pytest.raises(EvaluationError, match="holds no joint angles"):
+        read(BAGS / "tpose_wave")
+    with pytest.raises(EvaluationError, match="no joint angles of 'bob'"):
+        read(tracked_bag, "bob")
+    with pytest.raises(BagError):
+        read(tmp_path / "nothing")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(EvaluationError, match="file"):
+        summarise(tracked_bag, tmp_path / "file" / "wave.png")
+
+
+def test_the_command_prints_the_table(tracked_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", str(tracked_bag), "-o", str(tmp_path / "wave.png")]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ANGLE_NAMES) and "wave.png" in shown and "rms err" in shown
+    assert main(["show", str(BAGS / "tpose_wave")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
