@@ -47,7 +47,7 @@ class Playback:
 
     The bag's time runs ``rate`` times as fast as the steady clock, from the first step on. Messages that are late,
     because nobody called in time, are returned at once and never left out. The clock never runs ahead of a message that
-    is still to be sent, and runs backwards only where the bag begins anew.
+    is still to be sent, nor beyond the last one, and runs backwards only where the bag begins anew.
 
     Args:
         reader: of the bag; stays open while this is used.
@@ -166,7 +166,7 @@ class Playback:
         pending: RawMessage | None = self._next
         if pending is not None and pending.log_time_ns <= now_ns and not self._paused:
             return Step(tuple(batches), steady_ns)
-        if self._tick_ns and steady_ns >= self._next_tick_ns:
+        if self._tick_ns and steady_ns >= self._next_tick_ns and pending is not None:
             if not batches or batches[-1].clock_ns < now_ns:
                 batches.append(Batch(now_ns, ()))
             # Ticks that were missed are not made up for.

@@ -1,0 +1,223 @@
+"""Import: what a recording holds is what the bag holds, in time order, or there is no bag."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from body_tracking.cli import main
+from body_tracking.errors import BodyTrackingError
+from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
+from body_tracking.recording.importer import import_files
+from body_tracking.recording.info import bag_info
+from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.skeleton import JOINT_NAMES, Skeleton
+
+COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
+
+
+def skeletons(bag: Path) -> dict[str, list[tuple[int, tuple[Skeleton, ...]]]]:
+    """(log time, bodies) of each message by topic."""
+    found: dict[str, list[tuple[int, tuple[Skeleton, ...]]]] = {}
+    with BagReader(bag) as reader:
+        assert reader.warnings == []
+        for message in reader.messages():
+            bodies = cloud_to_skeletons(deserialize(POINT_CLOUD, message.cdr))
+            found.setdefault(message.topic, []).append((message.log_time_ns, bodies))
+    return found
+
+
+def write_csv(path: Path, rows: list[dict[str, object]]) -> Path:
+    columns = [*(name for name in rows[0] if name not in COORDINATES), *COORDINATES]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows({**{name: index / 50 for index, name in enumerate(COORDINATES)}, **row} for row in rows)
+    return path
+
+
+def write_ntu(path: Path, n_frames: int) -> Path:
+    joint = "0.1 0.2 2.5 277.4 191.8 1036.6 519.1 -0.2 0.05 0.97 0.1 2"
+    body = ["1", "72057594037944738 0 1 1 1 1 0 0.02 0.05 2", "25", *[joint] * 25]
+    path.write_text("\n".join([str(n_frames), *body * n_frames]) + "\n")
+    return path
+
+
+def test_the_real_pairs_are_imported_as_they_are(shared_data, tmp_path):
+    for path in sorted((shared_data / "kinect_pairs").glob("p*.csv.gz")):
+        with gzip.open(path, "rt") as file:
+            rows = list(csv.DictReader(file))
+        report = import_files([path], tmp_path / path.name)
+        found = skeletons(tmp_path / path.name)
+        assert set(found) == {"/kinect1/skeleton", "/kinect2/skeleton"}
+        for sensor in ("kinect1", "kinect2"):
+            own = [row for row in rows if row["sensor"] == sensor]
+            # A bag is in the order of receipt, which in one recording runs backwards once.
+            own.sort(key=lambda row: float(row["received"]))
+            messages = found[f"/{sensor}/skeleton"]
+            assert report.sensors[sensor].frames == len(messages) == len(own)
+            assert [at for at, _ in messages] == [round(float(row["received"]) * 1000) * 10**6 for row in own]
+            stamps = [bodies[0].stamp_ns for _, bodies in messages]
+            assert stamps == [round(float(row["stamp"]) * 10_000) * 100_000 for row in own]
+            for (_, (body,)), row in list(zip(messages, own, strict=True))[::200]:
+                expected = np.array([float(row[name]) for name in COORDINATES]).reshape(25, 3) * [-1, -1, 1]
+                np.testing.assert_array_equal(body.positions, expected.astype(np.float32))
+                assert body.frame_id == f"{sensor}_optical_frame"
+        assert report.problems["stamps that run backwards"] > 0
+
+
+def test_the_real_states_are_imported_as_they_are(shared_data, tmp_path):
+    path = shared_data / "kinect_states" / "skip_exercise.csv.gz"
+    import_files([path], tmp_path / "bag")
+    with gzip.open(path, "rt") as file:
+        rows = list(csv.DictReader(file))
+    messages = skeletons(tmp_path / "bag")["/kinect1/skeleton"]
+    assert len(messages) == 344
+    for (at, (body,)), row in zip(messages, rows, strict=True):
+        assert at == body.stamp_ns == round(float(row["stamp"]) * 10_000) * 100_000
+        assert body.states.tolist() == [int(row[f"{joint}_state"]) for joint in JOINT_NAMES]
+
+
+def test_topics_are_sensor_data(tmp_path):
+    import_files([write_csv(tmp_path / "a.csv", [{"stamp": 0}, {"stamp": 1}])], tmp_path / "bag")
+    with BagReader(tmp_path / "bag") as reader:
+        (topic,) = reader.topics.values()
+        assert topic.type_name == POINT_CLOUD and topic.offered == (SENSOR_DATA,)
+
+
+def test_several_views_are_one_bag_in_time_order(tmp_path):
+    files = [write_ntu(tmp_path / f"S001C00{camera}P003R001A010.skeleton", 10) for camera in (1, 2, 3)]
+    report = import_files(files, tmp_path / "bag")
+    assert {name: sensor.frames for name, sensor in report.sensors.items()} == dict.fromkeys(
+        ("kinect1", "kinect2", "kinect3"), 10
+    )
+    with BagReader(tmp_path / "bag") as reader:
+        times = [message.log_time_ns for message in reader.messages()]
+        # As they lie in the file, too: other readers do not sort.
+        assert [block.end_ns for file in reader.files for block in file.blocks] == [times[-1]]
+    assert times == sorted(times) and len(set(times)) == 10
+
+
+def test_names_of_files_without_sensors(tmp_path):
+    files = [write_csv(tmp_path / f"{name}.csv", [{"stamp": 0}]) for name in "abc"]
+    report = import_files(files, tmp_path / "bag", sensors={files[1]: "side"})
+    assert set(report.sensors) == {"kinect1", "side", "kinect3"}
+
+
+def test_a_sensor_in_two_files_is_refused(tmp_path):
+    files = [write_csv(tmp_path / f"{name}.csv", [{"sensor": "k", "stamp": 0}]) for name in "ab"]
+    with pytest.raises(BodyTrackingError, match=r"sensor 'k' is in .*a\.csv and in .*b\.csv"):
+        import_files(files, tmp_path / "bag")
+    with pytest.raises(BodyTrackingError, match="twice"):
+        import_files([files[0], files[0]], tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_a_bad_file_leaves_no_bag_and_costs_none(tmp_path):
+    good = write_csv(tmp_path / "good.csv", [{"stamp": index} for index in range(3000)])
+    bad = write_csv(tmp_path / "bad.csv", [{"stamp": index} for index in range(3000)] + [{"stamp": "x"}])
+    with pytest.raises(BodyTrackingError, match="line 3002"):
+        import_files([bad], tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+    import_files([good], tmp_path / "bag")
+    with pytest.raises(BodyTrackingError, match="exists already"):
+        import_files([good], tmp_path / "bag")
+    with pytest.raises(BodyTrackingError, match="line 3002"):
+        import_files([bad], tmp_path / "bag", overwrite=True)
+    assert len(skeletons(tmp_path / "bag")["/kinect1/skeleton"]) == 3000
+
+
+def test_receipt_before_time_0_is_refused(tmp_path):
+    with pytest.raises(BodyTrackingError, match="-500000000 ns"):
+        import_files([write_csv(tmp_path / "a.csv", [{"stamp": 1, "received": -0.5}])], tmp_path / "bag")
+
+
+def test_a_negative_stamp_is_kept(tmp_path):
+    import_files([write_csv(tmp_path / "a.csv", [{"stamp": -1.5, "received": 0}])], tmp_path / "bag")
+    ((at, (body,)),) = skeletons(tmp_path / "bag")["/kinect1/skeleton"]
+    assert (at, body.stamp_ns) == (0, -1_500_000_000)
+
+
+# --- the command
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = main([str(argument) for argument in arguments])
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+def test_import_and_info_as_json(tmp_path, capsys):
+    file = write_csv(tmp_path / "a.csv", [{"stamp": index / 10} for index in range(11)])
+    code, out, _ = run(capsys, "import", file, "-o", tmp_path / "bag", "--sensor", "left", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["frames"] == 11 and report["recording_s"] == 1.0
+    assert report["sensors"] == {"left": {"frames": 11, "bodies": 1, "seconds": 1.0}}
+    code, out, _ = run(capsys, "bag", "info", tmp_path / "bag", "--json")
+    info = json.loads(out)
+    assert code == 0 and info["messages"] == 11 and info["duration_s"] == 1.0 and info["warnings"] == []
+    (topic,) = info["topics"]
+    assert (topic["name"], topic["type"], topic["count"], topic["rate"]) == (
+        "/left/skeleton",
+        POINT_CLOUD,
+        11,
+        pytest.approx(10.0),
+    )
+    assert topic["qos"][0]["reliability"] == "best_effort"
+
+
+def test_import_and_info_for_people(tmp_path, capsys):
+    file = write_csv(tmp_path / "a.csv", [{"stamp": stamp} for stamp in (0, 1, 1, 0.5)])
+    code, out, err = run(capsys, "import", file, "-o", tmp_path / "bag")
+    assert code == 0 and err == ""
+    assert "/kinect1/skeleton: 4 frames" in out and "1 stamps that repeat" in out
+    code, out, err = run(capsys, "bag", "info", tmp_path / "bag")
+    assert code == 0 and err == ""
+    assert "/kinect1/skeleton" in out and "best_effort" in out and "4" in out
+
+
+def test_a_cut_recording_is_told_of_and_closed(tmp_path, capsys):
+    rows = [{"stamp": index / 30, "Head_x": index * 0.123} for index in range(3000)]
+    import_files([write_csv(tmp_path / "a.csv", rows)], tmp_path / "bag")
+    path = next((tmp_path / "bag").glob("*.mcap"))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    code, out, err = run(capsys, "bag", "info", tmp_path / "bag")
+    assert code == 0 and "warning" in err and "cut off" in err
+    count = bag_info(tmp_path / "bag").messages
+    assert 0 < count < 3000
+    code, out, err = run(capsys, "bag", "recover", tmp_path / "bag", "--json")
+    assert code == 0 and json.loads(out)["messages"] == count and json.loads(out)["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["import", "absent.csv", "-o", "bag"], "no such file"),
+        (["import", "a.txt", "-o", "bag"], "not a .csv"),
+        (["import", "a.csv", "b.csv", "-o", "bag", "--sensor", "left"], "of which"),
+        (["import", "a.csv", "-o", "bag", "--sensor", "left=c.csv"], "no such file is imported"),
+        (["import", "a.csv", "-o", "bag", "--sensor", "l/r"], "letters"),
+        (["import", "a.csv", "-o", "taken"], "exists"),
+        (["import", "a.csv", "-o", "taken", "--overwrite"], "no bag"),
+        (["import", "a.csv", "-o", "a.txt/bag"], "a.txt/bag"),
+        (["bag", "info", "absent"], "no such recording"),
+        (["bag", "info", "a.txt"], "not an mcap file"),
+        (["bag", "recover", "taken"], "no mcap file"),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path, monkeypatch, capsys, arguments, text):
+    monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        write_csv(tmp_path / f"{name}.csv", [{"stamp": 0}])
+    (tmp_path / "a.txt").write_text("no recording")
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "precious.txt").touch()
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and text in err and len(err.strip().splitlines()) == 1 and out == ""
+    assert (tmp_path / "taken" / "precious.txt").exists() and not (tmp_path / "bag").exists()
