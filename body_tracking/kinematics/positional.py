@@ -33,7 +33,8 @@ Uncertainty: first order in the joint covariances, joints independent of each ot
 deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which the first order does
 not see. A plane of elevation with the arm at the side and the rotation of a straight or vertical arm turn about an axis
 that the positions do not show: the standard deviation grows like 1/sin, and is infinity where the deflection that gives
-the direction is not significant, that is within its own 99.9 % ellipse of zero (beyond 0.27 rad).
+the direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own standard deviations, which
+noise alone exceeds once in a thousand frames.
 
 Velocities are the Jacobian times the joint velocities. A skeleton brings no covariance of its velocities; the stated
 deviation rests on a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman
@@ -161,16 +162,20 @@ _TINY = 1e-18
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
-_MAX_STDDEV: FloatArray = np.select(
-    [np.arange(_N_ANGLES) < _N_BETWEEN, np.array([name.startswith("trunk") for name in _ROWS])],
-    [np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0)],
-    1.0 / np.sqrt(chi2.ppf(0.999, 2)),
-)
-"""(n,) radians from which an angle is unknown.
+_MAX_STDDEV: FloatArray = np.where(np.arange(_N_ANGLES) < _N_BETWEEN, np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0))
+"""(13,) radians from which an angle is unknown: the standard deviation of a uniform one, over 180 or 360 deg."""
+_SIGNIFICANT = float(np.sqrt(chi2.ppf(0.999, 2)))
+"""Standard deviations that a deflection must be long to show a direction."""
 
-That of an angle of which nothing is known (uniform over its range). But for the turns of the arm, since a straight
-elbow or a hanging arm shows no direction at all: that of a direction whose vector is just significantly longer than 0.
-"""
+
+def _deflections() -> IntArray:
+    """(2, 6) rows of the angles between a dihedral angle's axis and its two vectors; -1 where there is none."""
+    rows = {frozenset(pair): row for row, pair in enumerate(zip(_B_A.tolist(), _B_B.tolist(), strict=True))}
+    pairs = ([frozenset(pair) for pair in zip(_D_AXIS.tolist(), end.tolist(), strict=True)] for end in (_D_P, _D_Q))
+    return np.array([[rows.get(pair, -1) for pair in column] for column in pairs], dtype=np.intp)
+
+
+_DEFLECTIONS = _deflections()
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -256,6 +261,7 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
             # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far
             # from it none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
             across = variance[n:]
+            unknown[_N_BETWEEN:] |= _insignificant(angles[:_N_BETWEEN], variance[:_N_BETWEEN])
             variance[:_N_BETWEEN] += across * np.minimum(1.0, 2.0 * across / sine**2)
             stddev = np.sqrt(variance[:n])
             unknown |= ~(stddev <= _MAX_STDDEV)
@@ -271,6 +277,14 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
     return JointAngles(
         skeleton.stamp_ns, ANGLE_NAMES, angles[_ORDER], rates[_ORDER], stddev[_ORDER], rate_stddev[_ORDER]
     )
+
+
+def _insignificant(angles: FloatArray, variance: FloatArray) -> BoolArray:
+    """(6,) dihedral angles of which a vector may as well lie along the axis, from the (7,) angles between vectors."""
+    between = _B_SIGN * (angles - _B_OFFSET)
+    deflection = np.minimum(between, np.pi - between)
+    shown = np.append(deflection > _SIGNIFICANT * np.sqrt(variance), True)  # the last is for -1
+    return np.logical_not(shown[_DEFLECTIONS].all(axis=0))
 
 
 def _angles_and_jacobian(positions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:

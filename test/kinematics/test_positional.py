@@ -306,3 +306,14 @@ def test_joint_classes_cover_every_joint() -> None:
     densities = joint_densities()
     assert densities[Joint.SPINE_SHOULDER] < densities[Joint.ELBOW_LEFT] < densities[Joint.HAND_TIP_RIGHT]
     assert (JOINT_CLASSES[MIRROR] == JOINT_CLASSES).all()
+
+
+def test_a_raised_arm_keeps_its_plane_where_a_hanging_one_has_none() -> None:
+    """What decides is whether the arm is surely raised, not how exactly its plane is known."""
+    for elevation, known in ((8.0, False), (80.0, True)):
+        positions = t_pose()
+        direction = np.sin(np.radians(elevation)) * LEFT - np.cos(np.radians(elevation)) * UP
+        arm(positions, "LEFT", direction, direction)
+        angles = positional_angles(skeleton(positions, 0.035))
+        plane = angles.position_stddev[ANGLE_NAMES.index("shoulder_plane_left")]
+        assert np.isfinite(plane) == known
