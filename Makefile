@@ -52,8 +52,9 @@ $(STAMP): setup.py setup.cfg
 
 demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording
 	@rm -rf $(DEMO) && mkdir $(DEMO)
-	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording
+	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording --log-dir $(DEMO)/log
 	$(BIN)/body_tracking show $(DEMO)/recording --output $(DEMO)/joint_angles.png
+	@echo "recording: $(DEMO)/recording"
 
 test: lint ## formatting, lint, types and all tests
 	$(BIN)/python -m pytest

@@ -1,0 +1,130 @@
+"""Write the tables of README.md that the code defines: topics, services, angles, parameters, commands.
+
+With ``--check`` it only says whether they are up to date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from body_tracking import cli, graph
+from body_tracking.kinematics.positional import ANGLE_NAMES
+from body_tracking.parameters import Value
+from body_tracking.recording.qos import Qos
+
+README = Path(__file__).resolve().parent.parent / "README.md"
+SECTION = re.compile(r"(<!-- (\w+): written by make docs -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
+
+
+def _cell(text: str) -> str:
+    """Text in a cell; outside of code, ``<name>`` would be taken for HTML."""
+    parts = text.replace("|", r"\|").split("`")
+    return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(parts))
+
+
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [titles, ["---"] * len(titles), *rows]
+    return "".join("| " + " | ".join(map(_cell, line)) + " |\n" for line in lines)
+
+
+def _qos(qos: Qos) -> str:
+    latched = "latched, " if qos.durability == "transient_local" else ""
+    return f"{latched}{qos.reliability.replace('_', ' ')}, depth {qos.depth}"
+
+
+def topics() -> str:
+    """Every topic of the graph."""
+    rows = [
+        (
+            f"`{topic.name}`",
+            f"`{topic.type_name.replace('/msg/', '/')}`",
+            _qos(topic.qos),
+            topic.publisher,
+            topic.content,
+        )
+        for topic in graph.TOPICS
+    ]
+    return table(("topic", "type", "QoS", "from", "content"), rows)
+
+
+def services() -> str:
+    """Every service of the graph."""
+    return table(
+        ("service", "node", "what it does"), [(f"`{name}`", node, text) for name, node, text in graph.SERVICES]
+    )
+
+
+def angles() -> str:
+    """The names of the joint angles."""
+    return ", ".join(f"`{name}`" for name in ANGLE_NAMES) + "\n"
+
+
+def _default(value: Value) -> str:
+    if isinstance(value, bool):
+        return "`true`" if value else "`false`"
+    if isinstance(value, tuple):
+        return f"`[{', '.join(value)}]`"
+    if isinstance(value, float):
+        return f"`{value!r}`"
+    return f"`{value}`" if value != "" else '`""`'
+
+
+def parameters() -> str:
+    """The parameters of every node."""
+    parts = []
+    for executable in graph.EXECUTABLES:
+        rows = [
+            (f"`{item.name}`{' *' * item.live}", _default(item.default), item.unit, item.constraint, item.doc)
+            for item in graph.parameters_of(executable)
+        ]
+        parts.append(f"### {executable}\n\n" + table(("parameter", "default", "unit", "allowed", "meaning"), rows))
+    return "\n".join(parts)
+
+
+def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for choice in action._choices_actions:
+                below = list(_commands(action.choices[choice.dest]))
+                yield from below or [(f"`{parser.prog} {choice.dest}`", choice.help or "")]
+
+
+def commands() -> str:
+    """The subcommands of ``body_tracking``."""
+    return table(("command", "what it does"), _commands(cli.parser()))
+
+
+WRITERS = {"topics": topics, "services": services, "angles": angles, "parameters": parameters, "commands": commands}
+
+
+def updated(text: str) -> str:
+    """The text of README.md with its tables as the code defines them now."""
+    missing = WRITERS.keys() - {match[2] for match in SECTION.finditer(text)}
+    if missing:
+        raise SystemExit(f"{README.name} has no place for {', '.join(sorted(missing))}")
+    return SECTION.sub(lambda match: f"{match[1]}{WRITERS[match[2]]()}{match[3]}", text)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if not up to date")
+    check = parser.parse_args().check
+    before = README.read_text(encoding="utf-8")
+    after = updated(before)
+    if before == after:
+        return 0
+    if check:
+        print(f"{README.name} is not up to date: make docs", file=sys.stderr)
+        return 1
+    README.write_text(after, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

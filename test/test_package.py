@@ -1,0 +1,266 @@
+"""The package as others get it: built by colcon, as a wheel, and through make."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import body_tracking
+from body_tracking import graph
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED_FOLDERS = ("config", "launch", "rviz", "bags")
+
+# import name -> (distribution, rosdep key); None where rosdistro has no key and README.md gives the pip line.
+# What is not here is a ROS package, declared under its own name.
+LIBRARIES = {
+    "numpy": ("numpy", "python3-numpy"),
+    "scipy": ("scipy", "python3-scipy"),
+    "yaml": ("pyyaml", "python3-yaml"),
+    "matplotlib": ("matplotlib", "python3-matplotlib"),
+    "filterpy": ("filterpy", "python3-filterpy-pip"),
+    "mcap": ("mcap", None),
+    "rosbags": ("rosbags", None),
+}
+
+
+def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    """The finished command; its output is in the failure message where it fails."""
+    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, f"{command} ended with {done.returncode}\n{done.stdout}\n{done.stderr}"
+    return done
+
+
+def files_under(folder: Path) -> set[str]:
+    """Relative paths of the files that a build ships from a folder of the project."""
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".") and "__pycache__" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the project as a clone would be, so that builds leave nothing in the real one."""
+    copy = tmp_path_factory.mktemp("workspace") / "src" / "body_tracking"
+    wanted = ("body_tracking", "resource", *SHARED_FOLDERS)
+    skip = shutil.ignore_patterns("__pycache__", "*.pyc")
+    for folder in wanted:
+        if (ROOT / folder).is_dir():
+            shutil.copytree(ROOT / folder, copy / folder, ignore=skip)
+    for file in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "LICENSE", "README.md"):
+        shutil.copy(ROOT / file, copy)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def manifest() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+@pytest.fixture(scope="module")
+def node_names() -> set[str]:
+    """The node files: one node, one file."""
+    nodes = {path.stem for path in (ROOT / "body_tracking" / "nodes").glob("*.py") if "def main" in path.read_text()}
+    assert "fusion" in nodes
+    return nodes
+
+
+# --- the manifest
+
+
+def test_package_xml_is_a_valid_format_3_manifest() -> None:
+    package_format = pytest.importorskip("catkin_pkg.package")
+    warnings: list[str] = []
+    package = package_format.parse_package(str(ROOT), warnings=warnings)
+    package.validate(warnings=warnings)
+    assert warnings == []
+    assert package.package_format == 3
+    assert [export.content for export in package.exports if export.tagname == "build_type"] == ["ament_python"]
+    assert all((ROOT / licence.file).is_file() for licence in package.licenses)
+
+
+def test_version_is_the_same_everywhere(manifest: ElementTree.Element, wheel: Path) -> None:
+    assert manifest.findtext("version") == body_tracking.__version__
+    assert wheel.name.split("-")[1] == body_tracking.__version__
+
+
+def imports() -> Iterator[tuple[str, str]]:
+    """(top-level module, where) of every import in the shipped Python files, those inside functions too."""
+    for path in [*(ROOT / "body_tracking").rglob("*.py"), *(ROOT / "launch").glob("*.py")]:
+        for statement in ast.walk(ast.parse(path.read_text())):
+            if isinstance(statement, ast.Import):
+                yield from ((name.name.split(".")[0], path.name) for name in statement.names)
+            elif isinstance(statement, ast.ImportFrom) and statement.module:
+                yield statement.module.split(".")[0], path.name
+
+
+def test_every_import_is_a_declared_dependency(manifest: ElementTree.Element, wheel: Path) -> None:
+    declared = {str(depend.text) for depend in manifest.iter("exec_depend")}
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        required = set(re.findall(r"^Requires-Dist: ([\w-]+)[^;\n]*$", archive.read(metadata).decode(), re.MULTILINE))
+    readme = (ROOT / "README.md").read_text()
+    for module, where in set(imports()):
+        if module in sys.stdlib_module_names or module == "body_tracking":
+            continue
+        if module not in LIBRARIES:
+            assert module in declared, f"{where} imports {module}: package.xml does not declare it"
+            continue
+        distribution, rosdep_key = LIBRARIES[module]
+        assert distribution in {name.lower() for name in required}, f"{where} imports {module}: setup.py"
+        if rosdep_key is None:
+            assert re.search(rf"pip install .*\b{distribution}\b", readme), f"{distribution}: no pip line in README.md"
+        else:
+            assert rosdep_key in declared, f"{where} imports {module}: package.xml does not declare {rosdep_key}"
+
+
+# --- the wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built as pip does it, without its download of the build tools."""
+    folder = tmp_path_factory.mktemp("wheel")
+    done = run(
+        sys.executable,
+        *("-W", "always", "-c", "import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])", folder),
+        cwd=project,
+    )
+    assert "Deprecat" not in done.stdout + done.stderr, done.stderr
+    return next(folder.glob("*.whl"))
+
+
+def test_wheel_installs_all_modules_and_share_files(wheel: Path, tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    run(
+        sys.executable,
+        *("-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target", target, wheel),
+        cwd=tmp_path,
+    )
+    modules = {path for path in files_under(ROOT / "body_tracking") if path.endswith((".py", "py.typed"))}
+    assert modules <= files_under(target / "body_tracking")
+    assert "py.typed" in modules
+    share = target / "share" / "body_tracking"
+    for folder in SHARED_FOLDERS:
+        assert files_under(share / folder) == files_under(ROOT / folder), folder
+
+
+# --- colcon
+
+
+@pytest.fixture(scope="module")
+def prefix(project: Path) -> Path:
+    """``install/body_tracking`` of a workspace built with ``colcon build``."""
+    pytest.importorskip("colcon_core")
+    workspace = project.parent.parent
+    run(sys.executable, *("-m", "colcon", "build", "--event-handlers", "console_direct+"), cwd=workspace)
+    return workspace / "install" / "body_tracking"
+
+
+def test_table_of_nodes_lists_every_node_file(node_names: set[str]) -> None:
+    assert set(graph.EXECUTABLES) == node_names
+
+
+def test_colcon_installs_an_executable_per_node(prefix: Path, node_names: set[str]) -> None:
+    executables = {path.name for path in (prefix / "lib" / "body_tracking").iterdir() if os.access(path, os.X_OK)}
+    assert executables == node_names | {"body_tracking"}
+
+
+def test_colcon_installs_what_ros_finds_packages_by(prefix: Path) -> None:
+    assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "body_tracking").is_file()
+    share = prefix / "share" / "body_tracking"
+    assert (share / "package.xml").read_text() == (ROOT / "package.xml").read_text()
+    for folder in SHARED_FOLDERS:
+        assert files_under(share / folder) == files_under(ROOT / folder), folder
+
+
+def in_workspace(prefix: Path, command: str) -> str:
+    """The output of a shell command in the sourced workspace, run with the Python that built it."""
+    env = dict(os.environ, PATH=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    setup = prefix.parent / "setup.sh"
+    return run("sh", "-c", f'. "{setup}" && {command}', cwd=prefix.parent, env=env).stdout
+
+
+def test_installed_nodes_load_from_the_install_prefix(prefix: Path, node_names: set[str]) -> None:
+    pytest.importorskip("rclpy")
+    module = "body_tracking.nodes."
+    lines = "; ".join(f"import {module}{name} as n; print(n.__file__, callable(n.main))" for name in node_names)
+    loaded = in_workspace(prefix, f'python -c "{lines}"').splitlines()
+    assert len(loaded) == len(node_names)
+    assert all(line.startswith(str(prefix)) and line.endswith("True") for line in loaded), loaded
+
+
+def test_installed_command_runs(prefix: Path) -> None:
+    out = in_workspace(prefix, f'"{prefix}/lib/body_tracking/body_tracking" --help')
+    assert {"import", "replay", "up", "calibrate"} <= set(re.findall(r"\w+", out))
+
+
+# --- make and CI
+
+
+def test_make_leaves_other_environments_behind(tmp_path: Path) -> None:
+    """The mark of another environment's ROS wheels and a sourced ROS install must not reach this one's Python."""
+    makefile = tmp_path / "probe.mk"
+    makefile.write_text(f"include {ROOT}/Makefile\nprobe:\n\t@env\n")
+    env = {
+        "PATH": os.environ["PATH"],
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+        "LD_LIBRARY_PATH": "/venv/lib/python3.11/site-packages/ros_rcl.libs:/opt/ros/jazzy/lib:/usr/local/lib",
+        "PYTHONPATH": "/opt/ros/jazzy/lib/python3.12/site-packages",
+        "ROS_DOMAIN_ID": "0",
+    }
+    runs = [
+        dict(
+            line.split("=", 1)
+            for line in run("make", "-f", makefile, "probe", cwd=ROOT, env=env).stdout.split("\n")
+            if "=" in line
+        )
+        for _ in range(3)
+    ]
+    for seen in runs:
+        assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in seen
+        assert "PYTHONPATH" not in seen
+        assert seen["LD_LIBRARY_PATH"] == "/usr/local/lib"
+        assert seen["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+        assert 1 <= int(seen["ROS_DOMAIN_ID"]) <= 100
+
+
+def test_ci_runs_make_test() -> None:
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    assert "make test" in script.read_text()
+
+
+# --- README.md and its picture
+
+
+def test_tables_of_the_readme_are_those_of_the_code() -> None:
+    pytest.importorskip("rclpy")
+    run(sys.executable, "docs/update_readme.py", "--check", cwd=ROOT)
+
+
+def test_picture_shows_every_node_and_topic() -> None:
+    picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
+    texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}
+    # The picture shows two sensors where the table has a pattern.
+    topics = {topic.name.replace("<sensor>", "kinect1") for topic in graph.TOPICS} - {graph.TF_STATIC}
+    assert set(graph.EXECUTABLES) | topics <= texts
+
+
+def test_links_in_the_documentation_lead_somewhere() -> None:
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
+            if "://" not in link:
+                assert (page.parent / link).exists(), f"{page.name} links to {link}"
