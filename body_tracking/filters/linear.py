@@ -245,7 +245,7 @@ class LinearKalmanFilter:
                 "late_frames",
                 "backward_jumps",
                 "gaps",
-                "changes",
+                "frame_changes",
             ),
             0,
         )
@@ -257,7 +257,7 @@ class LinearKalmanFilter:
         self._kalman = KalmanFilter(dim_x=size, dim_z=3)
         self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))
         self._kalman.P = Stacked.of(np.broadcast_to(np.eye(size), (N_JOINTS, size, size)).copy())
-        self._source: tuple[str, int] | None = None
+        self._frame_id: str | None = None
         self._stamp_ns = 0
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
@@ -297,12 +297,12 @@ class LinearKalmanFilter:
     def _step(self, skeleton: Skeleton) -> float | None:
         """Seconds since the last frame; 0 for a first one, None for one to ignore."""
         p = self.parameters
-        source = (skeleton.frame_id, skeleton.body)
         elapsed_ns = skeleton.stamp_ns - self._stamp_ns
-        if self._source is not None:
+        if self._frame_id is not None:
             reason = None
-            if source != self._source:
-                reason = "changes"
+            # the number of the body may change, as sensors number it differently; its place must not jump
+            if skeleton.frame_id != self._frame_id:
+                reason = "frame_changes"
             elif elapsed_ns == 0:
                 self.counters["repeated_stamps"] += 1
                 return None
@@ -316,8 +316,8 @@ class LinearKalmanFilter:
             if reason is not None:
                 self.counters[reason] += 1
                 self.reset()
-        step = 0.0 if self._source is None else elapsed_ns / NANOSECONDS
-        self._source, self._stamp_ns = source, skeleton.stamp_ns
+        step = 0.0 if self._frame_id is None else elapsed_ns / NANOSECONDS
+        self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
         self.counters["frames"] += 1
         return step
 

@@ -247,8 +247,8 @@ def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
     leapt = tracker.update(skeleton(50 * NANOSECONDS, BODY - 1.0))
     assert leapt is not None and tracker.counters["gaps"] == 1
     assert_allclose(leapt.positions, BODY - 1.0)
-    other = tracker.update(skeleton(50 * NANOSECONDS + FRAME_NS, BODY + 2.0, body=3))
-    assert other is not None and tracker.counters["changes"] == 1
+    other = tracker.update(skeleton(50 * NANOSECONDS + FRAME_NS, BODY + 2.0, frame_id="map"))
+    assert other is not None and tracker.counters["frame_changes"] == 1
     assert_allclose(other.positions, BODY + 2.0)
 
 
