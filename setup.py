@@ -48,6 +48,7 @@ setup(
         "matplotlib>=3.8",
         "filterpy>=1.4.5",
         "mcap>=1.2",
+        "lz4>=4",
         "zstandard>=0.22",
         "rosbags>=0.10,<0.12",
     ],

@@ -30,6 +30,7 @@ LIBRARIES = {
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "filterpy": ("filterpy", "python3-filterpy-pip"),
     "mcap": ("mcap", None),
+    "lz4": ("lz4", None),
     "zstandard": ("zstandard", None),
     "rosbags": ("rosbags", None),
 }
