@@ -1,0 +1,260 @@
+"""The offset between two sensors' clocks, from the motion that both saw.
+
+A first guess comes from the times of receipt; it can be wrong by a burst of the network. The speeds of the joints do
+not depend on where a sensor stands, so their correlation over time finds the offset before any pose is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve, savgol_filter
+
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray
+
+STEP = 0.02
+"""Grid of the correlation, seconds; the fine offset comes from the pose estimation."""
+
+DRIFT_PRIOR = 500e-6
+"""Standard deviation of the relative drift of two clocks, 1: the fastest that NTP slews a computer's clock; quartz
+alone has 10-100 ppm."""
+
+DRIFT_STEP = 100e-6
+
+DRIFT_STEPS = 15
+
+PEAK_WIDTH = 0.03
+"""Half width of the parabolas that smooth the likelihood, seconds: a frame, so that it does not follow the jitter."""
+
+MAX_WINDOWS = 240
+"""Windows remembered: twenty minutes of five-second windows."""
+
+SPAN = 4
+"""Speeds are taken over this many frames: limbs move at up to about 5 Hz, what is faster is noise."""
+
+MIN_JOINTS = 8
+"""Joints that must be seen in both of two frames for their speed to count."""
+
+_LIMB_JOINTS: IntArray = np.array([0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 12, 13, 16, 17, 20], dtype=np.intp)
+
+
+FAR_FROM_GUESS = 0.1
+"""Correlation that an offset must have more, per square second that it lies away from the guess."""
+
+FINE_RANGE = 0.15
+"""The fine search looks this far around the offset first found, seconds."""
+
+FINE_STEP = 0.005
+
+SAMPLE_TIME = 0.1
+"""Joint speeds closer together than this are one observation, seconds."""
+
+MIN_STDDEV = 0.002
+"""No amount of motion tells the offset better than this, seconds: stamps jitter, and sensors smooth differently."""
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetEstimate:
+    """Sensor clock minus reference clock.
+
+    Attributes:
+        offset: seconds.
+        correlation: normalised correlation of the joint speeds at that offset, -1 to 1.
+        margin: by how much it exceeds the best correlation more than 0.3 s away, less what that or it lies farther
+            from the guess.
+    """
+
+    offset: float
+    correlation: float
+    margin: float
+
+
+def _speeds(stamps: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Compressed joint speeds: stamps (n - SPAN,), values (n - SPAN, joints), and where they are good."""
+    step = stamps[SPAN:] - stamps[:-SPAN]
+    moved = positions[SPAN:, _LIMB_JOINTS] - positions[:-SPAN, _LIMB_JOINTS]
+    speed = np.linalg.norm(moved, axis=-1) / np.maximum(step, 1e-3)[:, None]
+    known = np.isfinite(speed)
+    good: BoolArray = (known.sum(axis=1) >= MIN_JOINTS) & (step < SPAN * 0.07)
+    # A label that jumps is faster than any limb; the logarithm keeps it from deciding alone.
+    value = np.log1p(5.0 * np.minimum(np.where(known, speed, 0.0), 5.0))
+    # A joint that is not seen moves as the rest does on average.
+    mean = value.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    return 0.5 * (stamps[SPAN:] + stamps[:-SPAN]), np.where(known, value, mean[:, None]), good
+
+
+def _sample(series: tuple[FloatArray, FloatArray, BoolArray], at: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """A series of speeds interpolated linearly: (m, joints), and (m,) where it is known."""
+    stamps, values, good = series
+    index = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
+    known: BoolArray = good[index] & good[index - 1] & (at >= stamps[0]) & (at <= stamps[-1])
+    fraction = (at - stamps[index - 1]) / np.maximum(stamps[index] - stamps[index - 1], 1e-6)
+    value = values[index - 1] + (values[index] - values[index - 1]) * np.clip(fraction, 0.0, 1.0)[:, None]
+    return np.where(known[:, None], value, 0.0), known
+
+
+def correlate_clocks(
+    reference: tuple[FloatArray, FloatArray], sensor: tuple[FloatArray, FloatArray], guess: float, window: float
+) -> OffsetEstimate | None:
+    """Find the offset at which the joint speeds of two recordings of one person agree best.
+
+    Args:
+        reference: stamps (n,) seconds ascending, positions (n, 25, 3) metres.
+        sensor: the same of the other sensor, in its own clock and frame.
+        guess: sensor clock minus reference clock, seconds, known to within ``window``.
+        window: half width of the search, seconds.
+
+    Returns:
+        The best offset, or None where the recordings do not overlap for at least two seconds.
+    """
+    stamps, other = reference[0], sensor[0] - guess
+    if len(stamps) < 2 * SPAN or len(other) < 2 * SPAN:
+        return None
+    # The grid is a multiple of the step, so that a slightly different guess looks at the same lags.
+    first = STEP * np.floor(max(stamps[0], other[0] - window) / STEP)
+    last = min(stamps[-1], other[-1] + window)
+    count = int((last - first) / STEP)
+    lags = int(window / STEP)
+    if count * STEP < 2.0:
+        return None
+    a, known_a = _sample(_speeds(stamps, reference[1]), first + STEP * np.arange(count))
+    b, known_b = _sample(_speeds(other, sensor[1]), first + STEP * np.arange(-lags, count + lags))
+
+    def cross(x: FloatArray, y: FloatArray) -> FloatArray:
+        """Sums over the grid of x(t) y(t + lag), for every lag of the window."""
+        result: FloatArray = fftconvolve(y, x[::-1], mode="valid", axes=0)
+        return result
+
+    # Pearson's correlation over the samples that both cover, per joint, for all lags at once.
+    mask_a, mask_b = known_a[:, None].astype(float), known_b[:, None].astype(float)
+    n = cross(mask_a, mask_b)
+    n_safe = np.maximum(n, 1.0)
+    mean_a, mean_b = cross(a, mask_b) / n_safe, cross(mask_a, b) / n_safe
+    var_a = np.maximum(cross(a * a, mask_b) / n_safe - mean_a**2, 0.0)
+    var_b = np.maximum(cross(mask_a, b * b) / n_safe - mean_b**2, 0.0)
+    covariance = cross(a, b) / n_safe - mean_a * mean_b
+    score = covariance.sum(axis=1) / np.sqrt(np.maximum(var_a.sum(axis=1) * var_b.sum(axis=1), 1e-12))
+    score[n[:, 0] * STEP < 2.0] = -1.0
+    lag = STEP * (np.arange(len(score)) - lags)
+    # Someone who waves looks the same a period later: among equals, the one near the guess.
+    likely = score - FAR_FROM_GUESS * lag**2
+    best = int(np.argmax(likely))
+    far = np.abs(lag - lag[best]) > 0.3
+    margin = float(likely[best] - likely[far].max()) if far.any() else 0.0
+    return OffsetEstimate(guess + float(lag[best]), float(score[best]), margin)
+
+
+class ClockFit:
+    """Offset and drift of one clock, from all the motion so far.
+
+    Every window of motion leaves the correlation rho of the joint speeds for each lag of a grid. The line
+    ``offset + drift t`` with the highest likelihood wins: each window of n independent samples adds
+    n / 2 log(1 / (1 - rho^2)) at its lag, and the drift has a prior. No window has to decide alone, and one in which a
+    sensor sees the body turned around, or nothing moves, correlates badly and says little.
+    """
+
+    def __init__(self, centre: float) -> None:
+        """Look around an offset.
+
+        Args:
+            centre: seconds; rounded to the grid, so that nearly equal centres look at the same lags.
+        """
+        first = round((centre - FINE_RANGE) / FINE_STEP)
+        self._lags = FINE_STEP * (first + np.arange(round(2 * FINE_RANGE / FINE_STEP) + 1))
+        self._elapsed: list[float] = []
+        self._sums: list[FloatArray] = []  # (4, lags) per window: a b, a a, b b, seconds
+
+    def __len__(self) -> int:
+        return len(self._elapsed)
+
+    def add(
+        self,
+        elapsed: float,
+        reference: tuple[FloatArray, FloatArray],
+        sensor: tuple[FloatArray, FloatArray],
+    ) -> bool:
+        """Take a window of motion.
+
+        Args:
+            elapsed: reference time of its middle since the anchor, seconds.
+            reference: stamps (n,) seconds ascending, positions (n, 25, 3) metres: the window.
+            sensor: the same of the other sensor, in its own clock and frame, covering the window and its surroundings.
+
+        Returns:
+            Whether the two overlap enough to say anything.
+        """
+        if len(reference[0]) < 10 or len(sensor[0]) < 10:
+            return False
+        at, a, known_a = _speeds(*reference)
+        series = _speeds(*sensor)
+        sampled = [_sample(series, at + lag) for lag in self._lags]
+        # The same frames at every lag, or their number would decide.
+        both = known_a & np.logical_and.reduce([known for _, known in sampled])
+        seconds = float(both.sum() * np.median(np.diff(at)))
+        if seconds < 1.0:
+            return False
+        own = a[both] - a[both].mean(axis=0)
+        theirs = np.stack([values[both] for values, _ in sampled])
+        theirs -= theirs.mean(axis=1, keepdims=True)
+        sums = np.empty((4, len(self._lags)))
+        sums[0] = np.einsum("nj,lnj->l", own, theirs)
+        sums[1] = (own**2).sum()
+        sums[2] = np.einsum("lnj,lnj->l", theirs, theirs)
+        sums[3] = seconds
+        self._elapsed.append(elapsed)
+        self._sums.append(sums)
+        if len(self) > MAX_WINDOWS:
+            del self._elapsed[0], self._sums[0]
+        return True
+
+    def solve(self) -> tuple[float, float, float] | None:
+        """The clock so far.
+
+        Returns:
+            offset at the anchor (seconds), drift (seconds per second), standard deviation of the offset at the mean
+            time of the windows (seconds); None while there is no motion or the best offset is at the grid's edge.
+        """
+        if not self._elapsed:
+            return None
+        sums = np.stack(self._sums)
+        middle = float(np.average(self._elapsed, weights=sums[:, 1, 0] + 1e-9))
+        elapsed = np.array(self._elapsed) - middle
+        rho = np.clip(sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-12)), 0.0, 0.999999)
+        likelihood = -0.5 * sums[:, 3] / SAMPLE_TIME * np.log1p(-(rho**2))
+        rows = np.arange(len(elapsed))
+        last = len(self._lags) - 1
+
+        def along(values: FloatArray, offset: float, drift: float) -> FloatArray:
+            """(windows,) of values (windows, lags) at each window's lag on a line, linear between the grid's."""
+            place = np.clip((offset + drift * elapsed - self._lags[0]) / FINE_STEP, 0, last - 1e-9)
+            left = place.astype(np.intp)
+            at: FloatArray = values[rows, left] + (place - left) * (values[rows, left + 1] - values[rows, left])
+            return at
+
+        drifts = DRIFT_STEP * np.arange(-DRIFT_STEPS, DRIFT_STEPS + 1)
+        _, offset, drift = max(
+            (along(likelihood, lag, each).sum() - 0.5 * (each / DRIFT_PRIOR) ** 2, lag, each)
+            for each in drifts.tolist()
+            for lag in self._lags[:: round(0.01 / FINE_STEP)].tolist()
+        )
+        # Newton's method on the smoothed likelihood, from the best point of the grid.
+        width = 2 * round(PEAK_WIDTH / FINE_STEP) + 1
+        slope = savgol_filter(likelihood, width, 2, deriv=1, delta=FINE_STEP, axis=1)
+        bend = savgol_filter(likelihood, width, 2, deriv=2, delta=FINE_STEP, axis=1)
+        hessian = np.zeros((2, 2))
+        for _ in range(20):
+            g, h = along(slope, offset, drift), along(bend, offset, drift)
+            gradient = np.array([g.sum(), g @ elapsed - drift / DRIFT_PRIOR**2])
+            hessian = np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2 - DRIFT_PRIOR**-2]])
+            if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
+                return None
+            step = -np.linalg.solve(hessian, gradient)
+            step *= min(1.0, 0.5 * PEAK_WIDTH / max(abs(step[0]), 1e-12), DRIFT_STEP / max(abs(step[1]), 1e-12))
+            offset, drift = offset + float(step[0]), drift + float(step[1])
+            if abs(step[0]) < 1e-6:
+                break
+        if not self._lags[0] + PEAK_WIDTH < offset < self._lags[-1] - PEAK_WIDTH or abs(drift) > drifts[-1]:
+            return None
+        stddev = float(np.sqrt(np.linalg.inv(-hessian)[0, 0]))
+        return offset - drift * middle, drift, float(np.hypot(stddev, MIN_STDDEV))

@@ -1,0 +1,108 @@
+"""Which pairs of frames to remember: a bounded number, spread over where the person went and faced."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.calibration.pairwise import Pairs
+from body_tracking.measurement import body_heading
+from body_tracking.skeleton import N_JOINTS, FloatArray, IntArray, Joint
+
+PLACE_SIZE = 0.3
+"""Side of a place on the floor, metres."""
+
+HEADINGS = 8
+"""Sectors of the body's heading."""
+
+
+class Coverage:
+    """Pairs of frames by place and heading of the body, the newest ``per_place`` of each.
+
+    A minute of standing still must not outweigh a minute of walking, and memory must not grow with the session.
+    """
+
+    def __init__(self, per_place: int, capacity: int) -> None:
+        self._per_place = per_place
+        self._capacity = capacity
+        self._count = 0
+        self._key = np.zeros((capacity, 3), dtype=np.intp)
+        self._order = np.zeros(capacity, dtype=np.intp)
+        self._elapsed = np.zeros(capacity)
+        self._points = np.zeros((capacity, 3, N_JOINTS, 3))
+        self._variance = np.zeros((capacity, N_JOINTS))
+        self._added = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(
+        self, elapsed: float, reference: FloatArray, sensor: FloatArray, velocity: FloatArray, variance: FloatArray
+    ) -> None:
+        """Remember one pair.
+
+        Args:
+            elapsed: seconds of reference time since the anchor of the clock.
+            reference: (25, 3) metres, as in :class:`Pairs`.
+            sensor: (25, 3) metres.
+            velocity: (25, 3) metres per second, of ``sensor``.
+            variance: (25,) square metres.
+        """
+        key = self._place(reference)
+        slot = self._slot(key)
+        self._key[slot] = key
+        self._order[slot] = self._added
+        self._elapsed[slot] = elapsed
+        self._points[slot] = reference, sensor, velocity
+        self._variance[slot] = variance
+        self._added += 1
+
+    def _place(self, reference: FloatArray) -> IntArray:
+        """(3,) of place across, place along the view, sector of the heading; optical frame, so y is up and down."""
+        centre, axis = reference[Joint.SPINE_BASE], body_heading(reference)
+        sector = np.arctan2(axis[2], axis[0]) / (2 * np.pi) * HEADINGS
+        key = np.array([centre[0] / PLACE_SIZE, centre[2] / PLACE_SIZE, sector])
+        place: IntArray = np.floor(np.nan_to_num(key)).astype(np.intp)
+        return place
+
+    def _slot(self, key: IntArray) -> int:
+        same = np.flatnonzero((self._key[: self._count] == key).all(axis=1))
+        if len(same) >= self._per_place:
+            return int(same[np.argmin(self._order[same])])
+        if self._count < self._capacity:
+            self._count += 1
+            return self._count - 1
+        # Full: the place with the most pairs gives up its oldest.
+        _, place, sizes = np.unique(self._key, axis=0, return_inverse=True, return_counts=True)
+        crowded = np.flatnonzero(place.reshape(-1) == np.argmax(sizes))
+        return int(crowded[np.argmin(self._order[crowded])])
+
+    def pairs(self) -> Pairs:
+        """Everything remembered."""
+        n = self._count
+        points = self._points[:n]
+        return Pairs(
+            points[:, 0],
+            points[:, 1],
+            self._variance[:n],
+            len(np.unique(self._key[:n], axis=0)) if n else 0,
+        )
+
+    def shift_clock(self, offset: float, drift: float) -> None:
+        """Move the remembered sensor frames along their velocity after the sensor's clock was corrected.
+
+        Args:
+            offset: seconds added to the sensor's clock offset at the anchor.
+            drift: seconds per second added to its drift.
+        """
+        n = self._count
+        step = offset + drift * self._elapsed[:n]
+        self._points[:n, 1] += step[:, None, None] * self._points[:n, 2]
+
+    @property
+    def oldest(self) -> float:
+        """Elapsed seconds of the oldest pair; infinity when there is none."""
+        return float(self._elapsed[: self._count].min(initial=np.inf))
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._count = 0

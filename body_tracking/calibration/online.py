@@ -1,0 +1,703 @@
+"""Calibration while people move: skeletons in, poses and clocks of the sensors out.
+
+Everything is a function of the stamps: an estimate at reference time T uses what was captured up to T minus
+``settle_time`` and holds from T plus ``activation_delay``, so that a live run and an offline one, in which messages
+arrive a little earlier or later, give the same numbers.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from body_tracking.calibration.clock import FINE_RANGE, ClockFit, correlate_clocks
+from body_tracking.calibration.coverage import Coverage
+from body_tracking.calibration.pairwise import PairEstimate, Pairs, estimate, start_from_midline
+from body_tracking.calibration.result import (
+    CalibrationResult,
+    ClockModel,
+    SensorPose,
+    SensorQuality,
+    level_pose,
+)
+from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
+from body_tracking.measurement import joint_stddev
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
+
+PAIR_PERIOD = 0.1
+"""Seconds of reference time between remembered pairs: frames closer together err alike."""
+
+MAX_BRACKET = 0.09
+"""Interpolate between two frames of a sensor only where they are at most this far apart, seconds."""
+
+GUESS_FRAMES = 30
+"""Frames of a sensor whose delay of receipt gives the first guess of its clock."""
+
+GUESS_GRID = 0.1
+"""The guess is rounded to this, seconds: a few milliseconds of network then make no difference."""
+
+REPAIR_CLOCK = 0.004
+"""Interpolate the frames anew when the clock has moved by more than this since they were paired, seconds."""
+
+CLOCK_WINDOW_NS = 5 * NANOSECONDS
+"""Length of the windows of motion that each tell the offset of the clock."""
+
+CLOCK_STEP = 1.0
+"""A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationParameters:
+    """Parameters of the calibration; the defaults suit Kinect v2 sensors around one person."""
+
+    method: str = field(
+        default="robust",
+        metadata={
+            "doc": "thesis: one still pose, averaged over 50 frames; robust: start from it, then refine over movement",
+            "choices": ("robust", "thesis"),
+        },
+    )
+    reference_height: float = field(
+        default=0.0,
+        metadata={
+            "doc": "height of the reference sensor above the origin of world",
+            "unit": "m",
+            "min": -10,
+            "max": 10,
+        },
+    )
+    reference_pitch: float = field(
+        default=0.0,
+        metadata={"doc": "angle by which the reference sensor looks down", "unit": "rad", "min": -1.6, "max": 1.6},
+    )
+    reference_roll: float = field(
+        default=0.0,
+        metadata={
+            "doc": "roll of the reference sensor about its view, clockwise from behind",
+            "unit": "rad",
+            "min": -3.2,
+            "max": 3.2,
+        },
+    )
+    clock_window: float = field(
+        default=3.0,
+        metadata={
+            "doc": "search the clock offset this far around the guess from the times of receipt",
+            "unit": "s",
+            "min": 0.1,
+            "max": 60,
+        },
+    )
+    clock_correlation: float = field(
+        default=0.6,
+        metadata={
+            "doc": "accept a clock offset when the joint speeds correlate at least this well",
+            "min": 0.1,
+            "max": 1.0,
+        },
+    )
+    clock_margin: float = field(
+        default=0.08,
+        metadata={"doc": "and when that exceeds every other offset's correlation by this much", "min": 0.0, "max": 1.0},
+    )
+    history: float = field(
+        default=30.0,
+        metadata={"doc": "raw frames kept for finding the clock offset", "unit": "s", "min": 5, "max": 600},
+    )
+    pairs_per_place: int = field(
+        default=20,
+        metadata={"doc": "pairs of frames remembered per place (0.3 m) and heading (45 deg)", "min": 3, "max": 1000},
+    )
+    capacity: int = field(default=500, metadata={"doc": "pairs of frames remembered in all", "min": 50, "max": 20000})
+    settle_time: float = field(
+        default=0.3,
+        metadata={"doc": "wait this long for late frames before they are paired", "unit": "s", "min": 0.0, "max": 5},
+    )
+    activation_delay: float = field(
+        default=0.5,
+        metadata={"doc": "a new estimate holds from this long after it was made", "unit": "s", "min": 0.0, "max": 10},
+    )
+    estimate_period: float = field(
+        default=1.0,
+        metadata={
+            "doc": "time between estimates at first; it grows to five times this",
+            "unit": "s",
+            "min": 0.1,
+            "max": 60,
+        },
+    )
+    slew_rotation: float = field(
+        default=0.05,
+        metadata={
+            "doc": "turn a published pose toward a better one no faster than this",
+            "unit": "rad/s",
+            "min": 0.001,
+            "max": 10,
+        },
+    )
+    slew_translation: float = field(
+        default=0.05,
+        metadata={
+            "doc": "and move it at the person's place no faster than this",
+            "unit": "m/s",
+            "min": 0.001,
+            "max": 10,
+        },
+    )
+    max_rotation_stddev: float = field(
+        default=0.05,
+        metadata={"doc": "warn while a pose is known less well than this", "unit": "rad", "min": 0.001, "max": 3.2},
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationUpdate:
+    """A result to be published.
+
+    Attributes:
+        valid_from_ns: reference time from which it holds; 0 for always.
+        result: poses and clocks of every calibrated sensor, the poses stamped with ``valid_from_ns``.
+    """
+
+    valid_from_ns: int
+    result: CalibrationResult
+
+
+class _Track:
+    """The recent frames of one sensor, in ascending order of its own clock."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.positions: list[FloatArray] = []
+        self.states: list[np.ndarray] = []
+        self.delays: list[int] = []
+        self.late = 0
+
+    def push(self, skeleton: Skeleton, received_ns: int) -> bool:
+        """Keep a frame; False when the sensor's clock went back by more than :data:`CLOCK_STEP`."""
+        if self.stamps and skeleton.stamp_ns <= self.stamps[-1]:
+            self.late += 1
+            return self.stamps[-1] - skeleton.stamp_ns < CLOCK_STEP * NANOSECONDS
+        self.stamps.append(skeleton.stamp_ns)
+        known = skeleton.valid
+        self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
+        self.states.append(np.where(known, skeleton.states, 0))
+        if len(self.delays) < GUESS_FRAMES:
+            self.delays.append(received_ns - skeleton.stamp_ns)
+        return True
+
+    def forget_before(self, stamp_ns: int) -> None:
+        # In steps, because each deletion moves the whole list.
+        old = bisect_right(self.stamps, stamp_ns)
+        if old > 256:
+            for values in (self.stamps, self.positions, self.states):
+                del values[:old]
+
+    def until(self, stamp_ns: int, last: int | None = None) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Stamps (n,) seconds, positions (n, 25, 3), states (n, 25) up to a time of the sensor's clock."""
+        stop = bisect_right(self.stamps, stamp_ns)
+        start = 0 if last is None else max(0, stop - last)
+        if stop - start == 0:
+            return np.empty(0), np.empty((0, N_JOINTS, 3)), np.empty((0, N_JOINTS))
+        return (
+            np.array(self.stamps[start:stop]) / NANOSECONDS,
+            np.stack(self.positions[start:stop]),
+            np.stack(self.states[start:stop]),
+        )
+
+    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, np.ndarray] | None:
+        """Positions (25, 3), velocities and states at a time of the sensor's clock, between two frames."""
+        after = bisect_right(self.stamps, stamp_ns)
+        if not 0 < after < len(self.stamps):
+            return None
+        step = (self.stamps[after] - self.stamps[after - 1]) / NANOSECONDS
+        if step > MAX_BRACKET:
+            return None
+        velocity = (self.positions[after] - self.positions[after - 1]) / step
+        elapsed = (stamp_ns - self.stamps[after - 1]) / NANOSECONDS
+        states = np.minimum(self.states[after - 1], self.states[after])
+        return self.positions[after - 1] + elapsed * velocity, velocity, states
+
+
+class _Sensor:
+    """What is known of one sensor beside the reference; rotations and translations are sensor to reference, optical."""
+
+    def __init__(self, parameters: CalibrationParameters) -> None:
+        self.parameters = parameters
+        self.track = _Track()
+        self.rotation: FloatArray | None = None  # as published, slewing toward the target
+        self.translation: FloatArray = np.zeros(3)
+        self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
+        self.clock = ClockModel()
+        self.quality = SensorQuality()
+        self.t_pose = False
+        self.turned = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Start estimating anew; what is published stays."""
+        self.clock_guessed = False
+        self.clock_locked = False
+        self.clock_fit: ClockFit | None = None
+        self.clock_base_ns = 0
+        self.clock_stddev = float("inf")
+        self.clock_window_end: int | None = None
+        self.paired_clock = self.clock
+        self.pairs = Coverage(self.parameters.pairs_per_place, self.parameters.capacity)
+        self.paired_until: int | None = None
+        self.started: tuple[FloatArray, FloatArray] | None = None
+        self.next_estimate = 0
+        self.estimated = False
+        self.movement_since: int | None = None
+
+
+class OnlineCalibration:
+    """Calibrates any number of sensors against the reference sensor, continuously.
+
+    Args:
+        sensors: their names.
+        parameters: see :class:`CalibrationParameters`.
+        reference: the sensor that defines ``world`` and its time; the first one when None.
+    """
+
+    def __init__(
+        self, sensors: Sequence[str], parameters: CalibrationParameters | None = None, reference: str | None = None
+    ) -> None:
+        self.parameters = parameters or CalibrationParameters()
+        self.reference = reference or sensors[0]
+        if self.reference not in sensors:
+            raise CalibrationError(f"reference sensor {self.reference!r} is not among {', '.join(sensors)}")
+        self.events: list[str] = []
+        self._base = level_pose(
+            self.reference,
+            self.parameters.reference_height,
+            self.parameters.reference_pitch,
+            self.parameters.reference_roll,
+        )
+        self._track = _Track()
+        self._sensors = {name: _Sensor(self.parameters) for name in sensors if name != self.reference}
+        self._anchor: int | None = None
+        self._now: int | None = None
+        self._last_step: int | None = None
+        self._changed = False
+
+    # --- frames in
+
+    def push(self, sensor: str, skeleton: Skeleton, received_ns: int) -> list[CalibrationUpdate]:
+        """Take one frame of one sensor.
+
+        Args:
+            sensor: its name; frames of unknown sensors are ignored.
+            skeleton: in the sensor's optical frame and clock.
+            received_ns: when it arrived, in a clock common to all sensors.
+
+        Returns:
+            What is to be published now, mostly nothing.
+        """
+        if sensor == self.reference:
+            if not self._track.push(skeleton, received_ns):
+                self._restart(f"the clock of {sensor} went back: starting again from the calibration so far")
+                self._track.push(skeleton, received_ns)
+            return self._advance(skeleton.stamp_ns)
+        other = self._sensors.get(sensor)
+        if other is not None and not other.track.push(skeleton, received_ns):
+            self.events.append(f"the clock of {sensor} went back: looking for its offset again")
+            other.track = _Track()
+            other.forget()
+            other.track.push(skeleton, received_ns)
+        return []
+
+    def _restart(self, event: str) -> None:
+        self.events.append(event)
+        self._track = _Track()
+        self._anchor = self._now = self._last_step = None
+        for other in self._sensors.values():
+            other.track = _Track()
+            other.forget()
+
+    def _advance(self, now: int) -> list[CalibrationUpdate]:
+        if self._anchor is None:
+            self._anchor = now
+        if self._now is not None and now <= self._now:
+            return []
+        gap = self._now is not None and now - self._now > NANOSECONDS
+        self._now = now
+        horizon = now - round(self.parameters.settle_time * NANOSECONDS)
+        for name, other in self._sensors.items():
+            self._follow(name, other, horizon)
+        self._track.forget_before(now - round(self.parameters.history * NANOSECONDS))
+        if self._last_step is not None and now - self._last_step < PAIR_PERIOD * NANOSECONDS:
+            return []
+        elapsed = 0.0 if self._last_step is None else (now - self._last_step) / NANOSECONDS
+        self._last_step = now
+        for other in self._sensors.values():
+            # While nobody was seen, nothing can jump.
+            self._changed |= self._slew(other, np.inf if gap else elapsed)
+        if not self._changed:
+            return []
+        self._changed = False
+        return [self._update(now + round(self.parameters.activation_delay * NANOSECONDS))]
+
+    # --- one sensor
+
+    def _follow(self, name: str, other: _Sensor, horizon: int) -> None:
+        if not other.clock_guessed and not self._guess_clock(name, other):
+            return
+        own_horizon = other.clock.to_sensor(horizon)
+        other.track.forget_before(own_horizon - round(self.parameters.history * NANOSECONDS))
+        if not other.track.stamps or other.track.stamps[-1] < own_horizon - 2 * NANOSECONDS:
+            return
+        self._pair(other, horizon)
+        if self._now is None or self._now < other.next_estimate:
+            return
+        period = self.parameters.estimate_period
+        if other.movement_since is not None:
+            period *= float(np.clip(0.1 * (self._now - other.movement_since) / NANOSECONDS, 1.0, 5.0))
+        other.next_estimate = self._now + round(period * NANOSECONDS)
+        if other.started is None:
+            self._start(name, other, horizon)
+        if self.parameters.method == "robust":
+            if not other.clock_locked:
+                self._lock_clock(name, other, horizon)
+            if other.clock_locked:
+                self._follow_clock(other, horizon)
+            self._estimate(other)
+
+    def _guess_clock(self, name: str, other: _Sensor) -> bool:
+        if min(len(self._track.delays), len(other.track.delays)) < GUESS_FRAMES:
+            return False
+        guess = float(np.median(self._track.delays) - np.median(other.track.delays)) / NANOSECONDS
+        assert self._anchor is not None
+        if other.rotation is None or abs(other.clock.offset - guess) > CLOCK_STEP:
+            if other.rotation is not None:
+                self.events.append(f"the clock of {name} is not the one that was calibrated: looking for its offset")
+                self._changed = True
+            offset = GUESS_GRID * round(guess / GUESS_GRID)
+            other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
+        else:
+            other.clock = ClockModel(
+                other.clock.to_sensor(self._anchor) - self._anchor, other.clock.drift_ppm, self._anchor
+            )
+        other.clock_guessed = True
+        return True
+
+    def _pair(self, other: _Sensor, horizon: int) -> None:
+        """Remember pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
+        assert self._anchor is not None
+        track, period = self._track, round(PAIR_PERIOD * NANOSECONDS)
+        start = 0 if other.paired_until is None else bisect_right(track.stamps, other.paired_until)
+        for index in range(start, bisect_right(track.stamps, horizon)):
+            stamp = track.stamps[index]
+            if other.paired_until is not None and stamp - other.paired_until < period:
+                continue
+            other.paired_until = stamp
+            seen = other.track.at(other.clock.to_sensor(stamp))
+            if seen is None:
+                continue
+            reference = track.positions[index]
+            stddev = joint_stddev(np.stack([reference, seen[0]]), np.stack([track.states[index], seen[2]]))
+            if np.isfinite(stddev).all(axis=0).sum() < 5:
+                continue
+            other.pairs.add((stamp - self._anchor) / NANOSECONDS, reference, seen[0], seen[1], (stddev**2).sum(axis=0))
+
+    def _pair_anew(self, other: _Sensor, horizon: int) -> None:
+        other.pairs.clear()
+        other.paired_until = None
+        other.paired_clock = other.clock
+        self._pair(other, horizon)
+
+    def _start(self, name: str, other: _Sensor, horizon: int) -> None:
+        """The thesis's calibration, from the first still pose that both sensors see."""
+        own = self._track.until(horizon, FRAMES)
+        theirs = other.track.until(other.clock.to_sensor(horizon), FRAMES)
+        still = is_still(own[0], own[1]) and is_still(theirs[0], theirs[1])
+        if still:
+            try:
+                rotation, translation, residual = still_pose_registration(own[1:], theirs[1:])
+            except CalibrationError:
+                return
+            other.t_pose = is_t_pose(np.nanmean(own[1], axis=0))
+            pose = "T-pose" if other.t_pose else "still pose"
+            self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
+            other.started = rotation, translation
+            if other.rotation is None or self.parameters.method == "thesis":
+                other.quality = SensorQuality(residual=residual, frames=FRAMES)
+                self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
+        elif self.parameters.method == "robust" and other.clock_locked and len(other.pairs) >= 20:
+            # Nobody stands still: the movement itself is a start.
+            start = self._plain_start(other.pairs.pairs())
+            if start is not None:
+                self.events.append(f"{name}: calibrated from movement, no still pose was seen")
+                other.started = start
+
+    @staticmethod
+    def _plain_start(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
+        known = np.isfinite(pairs.variance)
+        try:
+            return rigid_registration(pairs.reference[known], pairs.sensor[known])
+        except CalibrationError:
+            return None
+
+    def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
+        assert self._anchor is not None
+        own = self._since_anchor(self._track, 0, None, horizon)
+        theirs = self._since_anchor(other.track, other.clock.offset_ns, None, other.clock.to_sensor(horizon))
+        found = correlate_clocks(own, theirs, 0.0, self.parameters.clock_window)
+        if (
+            found is None
+            or found.correlation < self.parameters.clock_correlation
+            or found.margin < self.parameters.clock_margin
+        ):
+            return
+        other.clock = ClockModel(
+            other.clock.offset_ns + round(found.offset * NANOSECONDS), other.clock.drift_ppm, self._anchor
+        )
+        other.clock_locked = True
+        other.movement_since = self._now
+        self.events.append(f"{name}: clock offset {other.clock.offset:+.2f} s found from the motion")
+        self._pair_anew(other, horizon)  # the pairs so far were made with the guess
+        # Windows lie on multiples of their length, whenever the clock was found.
+        first = (self._track.stamps[0] - self._anchor) // CLOCK_WINDOW_NS
+        other.clock_window_end = self._anchor + first * CLOCK_WINDOW_NS
+        self._changed = True
+
+    def _since_anchor(
+        self, track: _Track, offset_ns: int, start: int | None, stop: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) in seconds since the anchor, less an offset, and positions, of the frames in (start, stop]."""
+        # Stamps since an epoch have no room for microseconds in a float.
+        first = 0 if start is None else bisect_right(track.stamps, start)
+        last = bisect_right(track.stamps, stop)
+        assert self._anchor is not None
+        stamps = np.array([stamp - self._anchor - offset_ns for stamp in track.stamps[first:last]]) / NANOSECONDS
+        return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
+
+    def _follow_clock(self, other: _Sensor, horizon: int) -> None:
+        """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
+        assert self._anchor is not None and other.clock_window_end is not None
+        around = round(2 * FINE_RANGE * NANOSECONDS)
+        measured = False
+        while other.clock_window_end + CLOCK_WINDOW_NS + around <= horizon:
+            start, stop = other.clock_window_end, other.clock_window_end + CLOCK_WINDOW_NS
+            other.clock_window_end = stop
+            if other.clock_fit is None:
+                other.clock_base_ns, other.clock_fit = other.clock.offset_ns, ClockFit(0.0)
+            measured |= other.clock_fit.add(
+                (start + CLOCK_WINDOW_NS // 2 - self._anchor) / NANOSECONDS,
+                self._since_anchor(self._track, 0, start, stop),
+                self._since_anchor(
+                    other.track,
+                    other.clock_base_ns,
+                    other.clock.to_sensor(start - around),
+                    other.clock.to_sensor(stop + around),
+                ),
+            )
+        found = other.clock_fit.solve() if measured and other.clock_fit is not None else None
+        if found is None:
+            return
+        other.clock = ClockModel(other.clock_base_ns + round(found[0] * NANOSECONDS), 1e6 * found[1], self._anchor)
+        other.clock_stddev = found[2]
+        assert self._now is not None
+        moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
+        if abs(moved) > REPAIR_CLOCK:
+            if self._remembers_all(other) and other.paired_until is not None:
+                self._pair_anew(other, other.paired_until)
+            else:
+                other.pairs.shift_clock(
+                    (other.clock.offset_ns - other.paired_clock.offset_ns) / NANOSECONDS,
+                    1e-6 * (other.clock.drift_ppm - other.paired_clock.drift_ppm),
+                )
+                other.paired_clock = other.clock
+        self._changed = True
+
+    def _estimate(self, other: _Sensor) -> None:
+        if other.started is None or len(other.pairs) < 20:
+            return
+        pairs = other.pairs.pairs()
+        best = self._best(pairs, other)
+        if best is None:
+            return
+        other.started = best.rotation, best.translation
+        other.turned = best.turned
+        if not other.estimated and best.rotation_stddev > other.quality.rotation_stddev:
+            return  # a calibration that was loaded is better than what this session knows so far
+        other.estimated = True
+        other.quality = SensorQuality(
+            best.residual, best.rotation_stddev, best.translation_stddev, other.clock_stddev, len(pairs)
+        )
+        self._aim(other, best.rotation, best.translation, best.centre)
+
+    def _remembers_all(self, other: _Sensor) -> bool:
+        """Whether the raw frames still reach back to the oldest pair."""
+        assert self._anchor is not None
+        if not len(other.pairs):
+            return False
+        oldest = self._anchor + round(other.pairs.oldest * NANOSECONDS)
+        return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
+
+    def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
+        """The better of going on from the last estimate and starting from the spines, which know no left and right."""
+        assert other.started is not None
+        starts = [other.started]
+        midline = start_from_midline(pairs)
+        if midline is not None and Rotation.from_matrix(midline[0] @ other.started[0].T).magnitude() > 0.5:
+            starts.append(midline)
+        found: list[PairEstimate] = []
+        for rotation, translation in starts:
+            try:
+                found.append(estimate(pairs, rotation, translation))
+            except CalibrationError:
+                continue
+        return min(found, key=lambda each: each.cost) if found else None
+
+    def _aim(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
+        other.target = rotation, translation, centre
+        if other.rotation is None:
+            other.rotation, other.translation = rotation, translation
+            self._changed = True
+
+    def _slew(self, other: _Sensor, elapsed: float) -> bool:
+        """Move the published pose toward the target; True when it moved.
+
+        The turn is about the person, so that what the person does is disturbed least.
+        """
+        if other.target is None or other.rotation is None:
+            return False
+        rotation, translation, centre = other.target
+        turn = Rotation.from_matrix(rotation @ other.rotation.T)
+        own_centre = rotation.T @ (centre - translation)
+        place = other.rotation @ own_centre + other.translation
+        angle, distance = float(turn.magnitude()), float(np.linalg.norm(centre - place))
+        if angle < 1e-9 and distance < 1e-9:
+            return False
+        share = min(1.0, self.parameters.slew_rotation * elapsed / max(angle, 1e-12))
+        other.rotation = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix() @ other.rotation
+        place += (centre - place) * min(1.0, self.parameters.slew_translation * elapsed / max(distance, 1e-12))
+        other.translation = place - other.rotation @ own_centre
+        return True
+
+    # --- results
+
+    def _update(self, valid_from_ns: int) -> CalibrationUpdate:
+        return CalibrationUpdate(valid_from_ns, self._result(valid_from_ns, published=True))
+
+    def _result(self, valid_from_ns: int, *, published: bool) -> CalibrationResult:
+        base_rotation = self._base.rotation
+        poses = {self.reference: self._base}
+        clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0)}
+        quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0)}
+        for name, other in self._sensors.items():
+            if other.rotation is None or other.target is None:
+                continue
+            rotation, translation = (other.rotation, other.translation) if published else other.target[:2]
+            poses[name] = SensorPose(
+                name,
+                base_rotation @ translation + self._base.translation,
+                Rotation.from_matrix(base_rotation @ rotation).as_quat(),
+            )
+            clocks[name], quality[name] = other.clock, other.quality
+        stamped = {
+            name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
+            for name, pose in poses.items()
+        }
+        return CalibrationResult(self.reference, stamped, clocks, quality)
+
+    def current_update(self) -> CalibrationUpdate:
+        """What holds now, to be published at the start; valid always."""
+        return self._update(0)
+
+    def result(self) -> CalibrationResult:
+        """The best estimate so far, not slewed."""
+        return self._result(0, published=False)
+
+    def finish(self) -> CalibrationResult:
+        """The best estimate from everything that was pushed, up to the last frame; for recordings."""
+        if self._now is not None and self._anchor is not None and self.parameters.method == "robust":
+            for other in self._sensors.values():
+                if not other.clock_guessed:
+                    continue
+                if other.clock_locked and self._track.stamps[0] <= self._anchor:
+                    # The recording is still here as a whole: measure every window with what is known now.
+                    other.clock_fit, other.clock_window_end = None, self._anchor
+                if other.clock_locked:
+                    self._follow_clock(other, self._now)
+                    if self._remembers_all(other):
+                        self._pair_anew(other, self._now)
+                self._pair(other, self._now)
+                self._estimate(other)
+        return self.result()
+
+    def load(self, result: CalibrationResult) -> None:
+        """Take an earlier calibration; it holds until movement shows a better one.
+
+        Raises:
+            CalibrationError: it belongs to another reference sensor.
+        """
+        if result.reference != self.reference:
+            raise CalibrationError(
+                f"the calibration's reference sensor is {result.reference!r}, this graph's is {self.reference!r}"
+            )
+        base = result.poses.get(self.reference, self._base)
+        self._base = base
+        for name, other in self._sensors.items():
+            pose = result.poses.get(name)
+            if pose is None:
+                continue
+            rotation = base.rotation.T @ pose.rotation
+            translation = base.rotation.T @ (pose.translation - base.translation)
+            other.rotation, other.translation = rotation, translation
+            other.target = rotation, translation, translation
+            other.clock = result.clocks.get(name, ClockModel())
+            other.quality = result.quality.get(name, SensorQuality())
+
+    # --- services
+
+    def start(self) -> str:
+        """Estimate anew from the next still pose; the calibration so far holds until then."""
+        for other in self._sensors.values():
+            other.forget()
+            other.quality = SensorQuality()
+        return "calibrating: stand still (a T-pose is best) for two seconds, then walk about"
+
+    def reset(self) -> str:
+        """Forget every calibration and start again."""
+        for name, other in list(self._sensors.items()):
+            fresh = _Sensor(self.parameters)
+            fresh.track = other.track
+            self._sensors[name] = fresh
+        self._changed = True
+        return self.start()
+
+    def status(self) -> tuple[int, str, dict[str, object]]:
+        """Diagnostic level (0 OK, 1 warning), one line, and values per sensor."""
+        values: dict[str, object] = {"reference": self.reference, "method": self.parameters.method}
+        waiting, unsure = [], []
+        for name, other in self._sensors.items():
+            if other.rotation is None:
+                waiting.append(name)
+                continue
+            quality = other.quality
+            if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
+                unsure.append(name)
+            values |= {
+                f"{name} residual_mm": round(1e3 * quality.residual, 1),
+                f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
+                f"{name} translation_stddev_mm": round(1e3 * quality.translation_stddev, 1),
+                f"{name} clock_offset_s": round(other.clock.offset, 4),
+                f"{name} clock_drift_ppm": round(other.clock.drift_ppm, 1),
+                f"{name} clock_stddev_ms": round(1e3 * quality.clock_stddev, 2),
+                f"{name} clock_from": "motion" if other.clock_locked else "receipt",
+                f"{name} pairs": len(other.pairs),
+                f"{name} turned_share": round(other.turned, 3),
+                f"{name} late_frames": other.track.late,
+            }
+        if waiting:
+            return 1, f"waiting for a still pose seen by {self.reference} and {', '.join(waiting)}", values
+        if unsure:
+            return 1, f"{', '.join(unsure)}: roughly calibrated, walk about to refine", values
+        return 0, "calibrated", values

@@ -1,0 +1,203 @@
+"""The pose of one sensor against another, from a person who moves.
+
+What one still pose cannot give: Kinect skeletons are distorted by the direction from which they are seen, by an
+amount that stays while a person stands and faces the same way, so that averaging more of the same frames does not
+help (DESIGN 4.8). The estimator therefore carries an unknown constant offset per joint beside the pose. While a
+person stands still the offsets take part of what the pose should explain, and the stated uncertainty is large; as the
+person moves, the motion of every joint determines the pose and the offsets are only what is left. The more places and
+headings the pairs come from, the smaller the offset that an average over them can have, so its prior tightens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.measurement import body_heading
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint
+
+MIDLINE: IntArray = np.array(
+    [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD], dtype=np.intp
+)
+"""Joints that are the same whether left and right are exchanged or not."""
+
+OFFSET_STDDEV = 0.06
+"""Prior of the constant offset between two sensors' ideas of one joint, metres (60 mm: what pairs of Kinect v2 at 45 to
+90 degrees show)."""
+
+CAUCHY = 1.3
+"""Residuals beyond this many standard deviations lose influence (Cauchy weights)."""
+
+FRAMES_PER_SAMPLE = 10.0
+"""Pairs of frames 0.1 s apart err together; this many count as one independent observation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """What two sensors saw at the same instants.
+
+    Attributes:
+        reference: (n, 25, 3) metres in the reference sensor's optical frame.
+        sensor: (n, 25, 3) metres in the sensor's optical frame, interpolated to the reference stamps.
+        variance: (n, 25) square metres, the sum of both sensors' variances; infinity where either has no joint.
+        places: number of distinct places and headings of the body among them.
+    """
+
+    reference: FloatArray
+    sensor: FloatArray
+    variance: FloatArray
+    places: int
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairEstimate:
+    """``reference = rotation @ sensor + translation``.
+
+    Attributes:
+        rotation: (3, 3).
+        translation: (3,) metres.
+        covariance: (6, 6) of (rotation vector about ``centre``, translation there), square radians and metres.
+        centre: (3,) metres, where the person was on average, in the reference frame.
+        residual: median distance between what both sensors say of a joint, metres.
+        cost: robust cost of all pairs, for comparing estimates from the same pairs.
+        turned: share of frames in which one sensor sees the body turned around or swapped.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    centre: FloatArray
+    residual: float
+    cost: float
+    turned: float
+
+    @property
+    def rotation_stddev(self) -> float:
+        """Radians, about the axis known worst."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def translation_stddev(self) -> float:
+        """Metres, at the place where the person was, along the axis known worst."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+
+
+def agreeing(reference: FloatArray, sensor_in_reference: FloatArray) -> BoolArray:
+    """Frames in which both sensors give the body's left-right axis the same sense.
+
+    Args:
+        reference: (n, 25, 3) metres.
+        sensor_in_reference: (n, 25, 3) metres, same frame.
+
+    Returns:
+        (n,) false where one of them sees the body turned around or its sides swapped.
+    """
+    same: BoolArray = np.einsum("ni,ni->n", body_heading(reference), body_heading(sensor_in_reference)) > 0.0
+    return same
+
+
+def start_from_midline(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
+    """A start that does not depend on left and right: the spines, wherever the person went.
+
+    Returns:
+        Rotation and translation, or None while the person has not moved enough to fix the rotation about the vertical.
+    """
+    usable = np.isfinite(pairs.variance[:, MIDLINE]).all(axis=1)
+    if usable.sum() < 10:
+        return None
+    target, source = pairs.reference[usable][:, MIDLINE], pairs.sensor[usable][:, MIDLINE]
+    if np.linalg.norm(target[:, 0].std(axis=0)) < 0.25:
+        return None
+    try:
+        return rigid_registration(target.reshape(-1, 3), source.reshape(-1, 3))
+    except CalibrationError:
+        return None
+
+
+def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterations: int = 15) -> PairEstimate:
+    """Refine a pose by iteratively reweighted least squares.
+
+    Minimises over R, t and the joints' offsets b
+
+        sum_nj rho(|a_nj - R s_nj - t - b_j| / sigma_nj) + sum_j |b_j|^2 / (2 sigma_b^2)
+
+    with Cauchy's rho, frames with a turned or swapped body left out, in blocks: pose by the SVD, offsets in closed
+    form, weights from the residuals.
+
+    Args:
+        pairs: at least ten.
+        rotation: (3, 3) start.
+        translation: (3,) start, metres.
+        iterations: how often the blocks are swept.
+
+    Raises:
+        CalibrationError: too few pairs, or none in which the sensors agree on left and right.
+    """
+    if len(pairs) < 10:
+        raise CalibrationError(f"{len(pairs)} pairs of frames, at least 10 are needed")
+    known = np.isfinite(pairs.variance)
+    precision = np.where(known, 1.0 / np.where(known, pairs.variance, 1.0), 0.0)
+    reference = np.where(known[..., None], pairs.reference, 0.0)
+    sensor = np.where(known[..., None], pairs.sensor, 0.0)
+    offset_precision = (1.0 + pairs.places / 4.0) / OFFSET_STDDEV**2
+    offsets = np.zeros((reference.shape[1], 3))
+
+    rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+    sweep = 0
+    while True:
+        rotated = sensor @ rotation.T
+        error = reference - rotated - translation
+        squared = np.einsum("nji,nji->nj", error - offsets, error - offsets) * precision
+        same = agreeing(pairs.reference, pairs.sensor @ rotation.T)
+        if same.sum() < 5:
+            raise CalibrationError("the sensors do not agree on the body's left and right in any frame")
+        weights = precision / (1.0 + squared / CAUCHY**2) * same[:, None]
+        if sweep == iterations:
+            break
+        sweep += 1
+        total = weights.sum(axis=0) / FRAMES_PER_SAMPLE
+        pull = np.einsum("nj,nji->ji", weights, error) / FRAMES_PER_SAMPLE
+        offsets = pull / (total + offset_precision)[:, None]
+        rotation, translation = rigid_registration(
+            (reference - offsets).reshape(-1, 3), sensor.reshape(-1, 3), weights.reshape(-1)
+        )
+
+    centre = np.einsum("nj,nji->i", weights, reference) / weights.sum()
+    arms = rotated + translation - centre
+    return PairEstimate(
+        rotation,
+        translation,
+        _covariance(weights / FRAMES_PER_SAMPLE, arms, offset_precision),
+        centre,
+        float(np.median(np.sqrt(np.einsum("nji,nji->nj", error, error))[known])),
+        float(np.log1p(squared[known]).sum()),
+        float(1.0 - same.mean()),
+    )
+
+
+def _covariance(weights: FloatArray, arms: FloatArray, offset_precision: float) -> FloatArray:
+    """(6, 6) covariance of a small rotation and translation, the joints' offsets marginalised.
+
+    With r_nj = b_j + dt - [arm_nj]x dtheta the information of one joint is a sum of W = sum w, m = sum w arm and
+    S = sum w (|arm|^2 I - arm arm'); eliminating b_j with its prior p subtracts the square of its coupling / (W + p).
+    """
+    total: FloatArray = weights.sum(axis=0)
+    first = np.einsum("nj,nji->ji", weights, arms)
+    second = np.einsum("nj,nji,njk->ik", weights, arms, arms)
+    kept = offset_precision / (total + offset_precision)
+    lost = 1.0 / (total + offset_precision)
+    cross = np.zeros((len(first), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = first
+    cross[:, [1, 2, 0], [2, 0, 1]] = -first
+    information = np.zeros((6, 6))
+    information[:3, :3] = np.trace(second) * np.eye(3) - second - np.einsum("j,jki,jkl->il", lost, cross, cross)
+    information[:3, 3:] = np.einsum("j,jik->ik", kept, cross)
+    information[3:, :3] = information[:3, 3:].T
+    information[3:, 3:] = (kept * total).sum() * np.eye(3)
+    covariance: FloatArray = np.linalg.inv(information + 1e-9 * np.eye(6)).astype(np.float64)
+    return covariance

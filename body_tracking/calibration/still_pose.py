@@ -1,0 +1,87 @@
+"""The thesis's calibration: one still pose, averaged over 50 frames (Schlagenhauf 2017, section 5.3.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.skeleton import BoolArray, FloatArray, Joint, TrackingState
+
+FRAMES = 50
+"""Frames in the average, as in the thesis ("less than two seconds")."""
+
+STILL_DRIFT = 0.035
+"""A body is still while half of its joints keep their mean place from the first half of the frames to the second to
+within this, metres: a sensor's error wanders by a few centimetres."""
+
+STILL_STDDEV = 0.06
+"""... and four of five stray less than this, metres: noise, not a wave of the hand."""
+
+LONGEST = 5.0
+"""Fifty frames that take longer than this are not one pose, seconds."""
+
+
+def is_still(stamps: FloatArray, positions: FloatArray) -> bool:
+    """Whether a person holds a pose.
+
+    Args:
+        stamps: (n,) seconds.
+        positions: (n, 25, 3) metres in any fixed frame.
+    """
+    if len(stamps) < FRAMES or stamps[-1] - stamps[0] > LONGEST:
+        return False
+    half = len(stamps) // 2
+    drift = np.linalg.norm(positions[:half].mean(axis=0) - positions[half:].mean(axis=0), axis=-1)
+    stray = np.linalg.norm(positions.std(axis=0), axis=-1)
+    seen = np.isfinite(drift)
+    if seen.sum() < 3:
+        return False
+    return bool(np.median(drift[seen]) < STILL_DRIFT and np.quantile(stray[seen], 0.8) < STILL_STDDEV)
+
+
+def is_t_pose(pose: FloatArray) -> bool:
+    """Whether both arms are stretched out sideways.
+
+    Args:
+        pose: (25, 3) metres, any frame.
+    """
+    across = pose[Joint.SHOULDER_LEFT] - pose[Joint.SHOULDER_RIGHT]
+    arms = (
+        pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT],
+        pose[Joint.SHOULDER_RIGHT] - pose[Joint.WRIST_RIGHT],
+    )
+    return all(float(arm @ across) > 0.85 * float(np.linalg.norm(arm) * np.linalg.norm(across)) for arm in arms)
+
+
+def _average(positions: FloatArray, states: np.ndarray) -> tuple[FloatArray, BoolArray]:
+    """Mean pose (25, 3), and which joints were Tracked in more than half of the frames."""
+    tracked = (states == TrackingState.TRACKED) & np.isfinite(positions).all(axis=-1)
+    count = tracked.sum(axis=0)
+    total = np.where(tracked[..., None], positions, 0.0).sum(axis=0)
+    return total / np.maximum(count, 1)[:, None], count > len(positions) / 2
+
+
+def still_pose_registration(
+    reference: tuple[FloatArray, np.ndarray], sensor: tuple[FloatArray, np.ndarray]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Average what two sensors saw of one pose, and register the averages on every joint that both track.
+
+    Args:
+        reference: positions (n, 25, 3) metres and states (n, 25) of the reference sensor.
+        sensor: the same of the other.
+
+    Returns:
+        R (3, 3) and t (3,) metres that take the sensor's coordinates into the reference's (eq. 5.1), and the mean
+        residual in metres.
+
+    Raises:
+        CalibrationError: fewer than three joints tracked by both.
+    """
+    target, target_known = _average(*reference)
+    source, source_known = _average(*sensor)
+    both = target_known & source_known
+    if both.sum() < 3:
+        raise CalibrationError(f"{both.sum()} joints are tracked by both sensors, at least 3 are needed")
+    rotation, translation = rigid_registration(target[both], source[both])
+    residual = np.linalg.norm(target[both] - source[both] @ rotation.T - translation, axis=-1)
+    return rotation, translation, float(residual.mean())
