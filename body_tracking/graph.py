@@ -201,7 +201,8 @@ class NodeSpec:
         defaults: parameters that a parameters file may override.
         parameters: parameters that it may not, because the graph hangs together by them.
         remappings: (from, to) of topics.
-        respawn: whether to start it again when it dies; all but the bag player, which is done at the end of its bag.
+        after: how many subscribers topics must have before it is started, as far as the starter can see to that: a
+            source is to wait until everybody listens.
     """
 
     name: str
@@ -210,7 +211,7 @@ class NodeSpec:
     defaults: Mapping[str, Value] = field(default_factory=dict)
     parameters: Mapping[str, Value] = field(default_factory=dict)
     remappings: tuple[tuple[str, str], ...] = ()
-    respawn: bool = True
+    after: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def full_name(self) -> str:
@@ -266,17 +267,25 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     ]
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
+    recorders = int(bool(options.record))
+    # Besides the next node and the recorder nobody is waited for.
+    after = {FUSED: 1 + recorders, FILTERED: 1 + recorders}
     if options.bag:
-        specs.append(_player(options, sensors))
+        specs.append(_player(options, sensors, after))
     else:
         specs += [
-            NodeSpec(f"{sensor}_skeleton", "kinect_skeleton", parameters={"sensor": sensor, **common, **skeletons})
+            NodeSpec(
+                f"{sensor}_skeleton",
+                "kinect_skeleton",
+                parameters={"sensor": sensor, **common, **skeletons},
+                after=after,
+            )
             for sensor in sensors
         ]
     return tuple(specs)
 
 
-def _player(options: GraphOptions, sensors: Sequence[str]) -> NodeSpec:
+def _player(options: GraphOptions, sensors: Sequence[str], after: Mapping[str, int]) -> NodeSpec:
     topics = tuple(skeleton_topic(sensor) for sensor in sensors)
     # Calibration, fusion and, maybe, the recorder.
     listeners = 3 if options.record else 2
@@ -287,4 +296,5 @@ def _player(options: GraphOptions, sensors: Sequence[str]) -> NodeSpec:
         "wait_for_subscribers": tuple(f"{topic}:{listeners}" for topic in topics),
         "reliable": options.reliable,
     }
-    return NodeSpec("bag_player", "bag_player", parameters=parameters, respawn=False)
+    # Every message comes with the clock anyway; each node pays for every tick.
+    return NodeSpec("bag_player", "bag_player", defaults={"clock_rate": 20.0}, parameters=parameters, after=after)

@@ -55,6 +55,9 @@ LAST_BACKOFF = 5.0
 SETTLED = 10.0
 """A node that has run for this long, seconds, starts again with the first back-off."""
 
+LISTENERS_TIMEOUT = 10.0
+"""A source starts after this time even if somebody who should listen does not, seconds."""
+
 STOP_TIMEOUT = 8.0
 """Seconds for a node to end after it was asked to."""
 
@@ -183,7 +186,7 @@ class Child:
     started: float = 0.0
     restarts: int = 0
     backoff: float = FIRST_BACKOFF
-    due: float | None = 0.0
+    due: float | None = field(default_factory=time.monotonic)
     done: bool = False
     reader: threading.Thread | None = None
     last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=3))
@@ -294,8 +297,13 @@ class Supervisor:
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
                 self._ended(child, now, monitor)
-            if child.due is not None and now >= child.due:
+            if child.due is not None and now >= child.due and self._may_start(child, now, monitor):
                 self._start(child)
+
+    def _may_start(self, child: Child, now: float, monitor: GraphMonitor) -> bool:
+        """Whether everybody listens whom the node is to wait for; one who does not come holds nobody up forever."""
+        assert child.due is not None
+        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(child.spec.after)
 
     def _start(self, child: Child) -> None:
         spec = child.spec

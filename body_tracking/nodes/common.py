@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import signal
 import sys
 import time
@@ -23,18 +24,22 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import PointCloud2
 
 from body_tracking import graph
+from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics
 from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.executor import LeanExecutor
 from body_tracking.parameters import (
     Parameter,
     Value,
@@ -197,7 +202,9 @@ class GraphNode(Node):
         """Of skeleton topics, by the parameter ``reliable``."""
         return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else graph.SKELETON)
 
-    def listen(self, topic: str, kind: type[Any], qos: QoSProfile, handle: Callable[[Any, int], None]) -> Subscription:
+    def listen(
+        self, topic: str, kind: type[Any], qos: QoSProfile, handle: Callable[[Any, int], None], *, raw: bool = False
+    ) -> Subscription:
         """Subscribe, so that a message which is not as it should be is counted and logged, and never ends the node.
 
         Args:
@@ -205,6 +212,7 @@ class GraphNode(Node):
             kind: the message class.
             qos: the profile.
             handle: takes the message, and the wall time in nanoseconds at which it was sent.
+            raw: hand over the message as CDR bytes.
         """
 
         def callback(message: Any, info: dict[str, int]) -> None:
@@ -216,20 +224,19 @@ class GraphNode(Node):
                 self.malformed(topic, str(error), "refused")
 
         checked: Any = callback  # rclpy passes the message info to callbacks of two arguments
-        return self.create_subscription(kind, topic, checked, qos)
+        return self.create_subscription(kind, topic, checked, qos, raw=raw)
 
     def listen_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
-        from sensor_msgs.msg import PointCloud2
 
-        def convert(message: Any, sent_ns: int) -> None:
-            skeletons = cloud_to_skeletons(message)
+        def convert(cdr: bytes, sent_ns: int) -> None:
+            skeletons = decode_skeletons(cdr) or cloud_to_skeletons(_deserialized(cdr))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
                 self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
-        return self.listen(topic, PointCloud2, self.skeleton_qos(), convert)
+        return self.listen(topic, PointCloud2, self.skeleton_qos(), convert, raw=True)
 
     def time_jumped_back(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""
@@ -239,7 +246,7 @@ class GraphNode(Node):
 
         Args:
             publisher: where to.
-            message: what.
+            message: what; a message, or one as CDR bytes.
             stamp_ns: its capture time, for the latency.
             sent_ns: wall time at which the input that it answers was sent, for the delay.
         """
@@ -319,6 +326,13 @@ def _parameter_files() -> list[Path]:
     return [Path(sys.argv[i + 1]) for i, word in enumerate(sys.argv[:-1]) if word == "--params-file"]
 
 
+def _deserialized(cdr: bytes) -> Any:
+    try:
+        return deserialize_message(cdr, PointCloud2)
+    except Exception as error:  # the client library's own kinds of errors, one per RMW
+        raise MessageError(f"{len(cdr)} bytes are no PointCloud2") from error
+
+
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     description = f"{parameter.doc} [{parameter.unit}]" if parameter.unit else parameter.doc
     descriptor = ParameterDescriptor(
@@ -347,9 +361,10 @@ def run(node_class: type[GraphNode]) -> None:
             read_file(file)  # rcl's own complaint takes several lines
         rclpy.init()
         node = node_class()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin()
+        # What is there now stays: the collector need not look at it again while frames wait.
+        gc.collect()
+        gc.freeze()
+        LeanExecutor(node).spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except BodyTrackingError as error:

@@ -14,11 +14,12 @@ from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import PointCloud2, TimeReference
 
 from body_tracking import graph
+from body_tracking.cdr import encode_skeletons
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.messages import skeletons_to_cloud, time_reference_to_clock, transform_to_pose
+from body_tracking.messages import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
@@ -78,7 +79,7 @@ class FusionNode(GraphNode):
     def publish(self, fused: list[Skeleton]) -> None:
         """Send the skeletons and set the timer for the next that cannot wait longer."""
         for skeleton in fused:
-            cloud = skeletons_to_cloud([skeleton], ROS)
+            cloud = encode_skeletons([skeleton])
             self.send(self.output, cloud, skeleton.stamp_ns, self.last_sent_ns)
         deadline_ns = self.fusion.deadline_ns
         if deadline_ns == self.deadline_ns:

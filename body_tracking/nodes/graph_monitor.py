@@ -92,6 +92,10 @@ class GraphMonitor:
     def _on_clock(self, message: Any) -> None:
         self.clock_ns = to_nanoseconds(message.clock)
 
+    def listened_to(self, wanted: Mapping[str, int]) -> bool:
+        """Whether each of these topics has at least so many subscribers."""
+        return all(self._node.count_subscribers(topic) >= number for topic, number in wanted.items())
+
     # --- for people
 
     def line(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:

@@ -10,10 +10,10 @@ import re
 from sensor_msgs.msg import JointState
 
 from body_tracking import graph
+from body_tracking.cdr import encode_angles
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages import angles_to_joint_states
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import BODY, RELIABLE, ROS, GraphNode, run
+from body_tracking.nodes.common import BODY, RELIABLE, GraphNode, run
 from body_tracking.parameters import ParameterError
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.skeleton import Skeleton
@@ -40,7 +40,7 @@ class JointAnglesNode(GraphNode):
     def on_filtered(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Compute and publish."""
         skeleton = skeletons[0]
-        states, stddevs = angles_to_joint_states(positional_angles(skeleton), self.body, skeleton.frame_id, ROS)
+        states, stddevs = encode_angles(positional_angles(skeleton), self.body, skeleton.frame_id)
         self.send(self.output, states, skeleton.stamp_ns, sent_ns)
         self.stddev_output.publish(stddevs)
 

@@ -12,9 +12,9 @@ from sensor_msgs.msg import PointCloud2
 
 import body_tracking.recording.source  # noqa: F401  (registers the backend "recording")
 from body_tracking import graph
+from body_tracking.cdr import encode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import skeletons_to_cloud
-from body_tracking.nodes.common import RELIABLE, ROS, GraphNode, run
+from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter
 from body_tracking.sensors import check_sensor_name
 from body_tracking.sensors.live import SourceSettings, backends, open_source
@@ -71,7 +71,7 @@ class KinectSkeleton(GraphNode):
             while self.context.ok() and not self.source.ended:
                 frame = self.source.read(timeout=0.2)
                 if frame is not None:
-                    self.send(self.output, skeletons_to_cloud(frame.skeletons, ROS), frame.skeletons[0].stamp_ns)
+                    self.send(self.output, encode_skeletons(frame.skeletons), frame.skeletons[0].stamp_ns)
         except BodyTrackingError as error:
             self.failure = str(error)
             self.get_logger().error(self.failure)

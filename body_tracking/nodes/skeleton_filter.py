@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking import graph
+from body_tracking.cdr import encode_skeletons
 from body_tracking.filters import FILTERS, LinearKalmanParameters, make_filter
-from body_tracking.messages import skeletons_to_cloud
-from body_tracking.nodes.common import RELIABLE, ROS, GraphNode, run
+from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.skeleton import Skeleton
 
@@ -42,7 +42,7 @@ class SkeletonFilterNode(GraphNode):
         """Filter and publish."""
         filtered = self.filter.update(skeletons[0])
         if filtered is not None:
-            self.send(self.output, skeletons_to_cloud([filtered], ROS), filtered.stamp_ns, sent_ns)
+            self.send(self.output, encode_skeletons([filtered]), filtered.stamp_ns, sent_ns)
 
     def time_jumped_back(self, topic: str) -> None:
         """Start anew."""

@@ -1,0 +1,294 @@
+"""The delay from capture to joint angles through the real processes, beside a chain of bare relays.
+
+Two sensors of 30 Hz that run apart, as two Kinects do (every phase between them occurs), feed the graph's own
+calibration, fusion, filter and angle nodes. Beside them, in the same run and half a frame later each time, the same
+skeleton goes through as many processes that do nothing but publish a ready message of the same type and size for each
+that comes: what a chain of rclpy nodes costs by itself. Delays are from just before a frame is published until its angles are
+received, by one clock, in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+
+import numpy as np
+import rclpy
+import yaml
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState, PointCloud2
+
+from body_tracking import graph
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking.calibration.storage import save
+from body_tracking.graph import GraphOptions, nodes_for
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.messages import (
+    RosMessages,
+    angles_to_joint_states,
+    cloud_to_skeletons,
+    skeletons_to_cloud,
+    to_nanoseconds,
+    to_time,
+    transform_to_pose,
+)
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.supervised import die_with_parent
+from body_tracking.parameters import SECTION, to_ros
+from body_tracking.recording.qos import RELIABLE
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.skeleton import NANOSECONDS, Skeleton
+
+ROOT = Path(__file__).resolve().parent.parent
+BAG = ROOT / "bags" / "tpose_wave"
+ROS = RosMessages()
+SENSORS = ("kinect1", "kinect2")
+CHAIN = ("fusion", "skeleton_filter", "joint_angles")
+PERIODS = (1.0 / 30.0, 1.0 / 29.7)
+"""Seconds: the phase between the sensors goes once around in some 3 s."""
+
+RELAYED = ("/relay/sensor", "/relay/fused", "/relay/filtered", "/relay/joint_states")
+TARGETS = {"median": 2.0, "p99": 2.5}
+
+
+# --- the relays: the other end of this file, one process each
+
+
+def relay(stage: int) -> None:
+    """Publish a ready message of the stage's own type and size for each that comes, with its stamp."""
+    die_with_parent()
+    rclpy.init()
+    node = rclpy.create_node(f"relay{stage}")
+    skeleton = _sample(stage)
+    skeletons, states = to_profile(graph.SKELETON), to_profile(RELIABLE)
+    if stage < len(CHAIN) - 1:
+        outputs = [node.create_publisher(PointCloud2, RELAYED[stage + 1], skeletons)]
+        messages: list[Any] = [skeletons_to_cloud([skeleton], ROS)]
+    else:
+        names = (RELAYED[stage + 1], f"{RELAYED[stage + 1]}_stddev")
+        outputs = [node.create_publisher(JointState, name, states) for name in names]
+        messages = list(angles_to_joint_states(positional_angles(skeleton), "body1", "world", ROS))
+
+    def on_message(received: PointCloud2) -> None:
+        for output, message in zip(outputs, messages, strict=True):
+            message.header.stamp = received.header.stamp
+            output.publish(message)
+
+    node.create_subscription(PointCloud2, RELAYED[stage], on_message, skeletons)
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+def _sample(stage: int) -> Skeleton:
+    """A skeleton of the kind that the graph's node of this stage sends (the last one: receives)."""
+    positions = np.random.default_rng(0).normal(size=(25, 3))
+    covariances = np.broadcast_to(np.eye(3) * 1e-4, (25, 3, 3)).copy()
+    velocities = np.zeros((25, 3)) if stage > 0 else None
+    return Skeleton(0, "world", positions, np.full(25, 2, np.uint8), 1, covariances, velocities)
+
+
+# --- the measurement
+
+
+class Bench:
+    """Publishes both streams and takes the time of what comes back."""
+
+    def __init__(self, frames: dict[str, list[Skeleton]], seconds: float, warm_up: float) -> None:
+        self.frames, self.seconds, self.warm_up = frames, seconds, warm_up
+        self.sent: dict[str, dict[int, int]] = {"graph": {}, "relay": {}}
+        self.received: dict[str, dict[int, int]] = {"graph": {}, "relay": {}}
+        self.node = rclpy.create_node("latency_bench")
+        best_effort, reliable = to_profile(graph.SKELETON), to_profile(RELIABLE)
+        self.outputs = {
+            name: self.node.create_publisher(PointCloud2, graph.skeleton_topic(name), best_effort) for name in SENSORS
+        }
+        self.relay_output = self.node.create_publisher(PointCloud2, RELAYED[0], best_effort)
+        self._listen("graph", graph.joint_states_topic("body1"), reliable)
+        self._listen("relay", RELAYED[-1], reliable)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+
+    def _listen(self, chain: str, topic: str, qos: QoSProfile) -> None:
+        received = self.received[chain]
+
+        def on_message(message: JointState) -> None:
+            received.setdefault(to_nanoseconds(message.header.stamp), time.perf_counter_ns())
+
+        self.node.create_subscription(JointState, topic, on_message, qos)
+
+    def ready(self) -> bool:
+        """Whether everybody is connected."""
+        counts = [self.node.count_subscribers(topic) for topic in (*RELAYED[:-1], graph.FUSED, graph.FILTERED)]
+        sensors = [self.node.count_subscribers(graph.skeleton_topic(name)) for name in SENSORS]
+        return all(counts) and all(count >= 2 for count in sensors)
+
+    def publish(self) -> None:
+        """Send frames at their times: the two sensors, and the relay's half a frame after the first sensor's."""
+        start = time.perf_counter_ns() + NANOSECONDS // 10
+        end = self.warm_up + self.seconds
+        events = [(k * PERIODS[i], name) for i, name in enumerate(SENSORS) for k in range(round(end / PERIODS[i]))]
+        events += [((k + 0.5) * PERIODS[0], "relay") for k in range(round(end / PERIODS[0]))]
+        for at, name in sorted(events):
+            due = start + round(at * NANOSECONDS)
+            stream = self.frames[name if name in SENSORS else SENSORS[0]]
+            skeleton = stream[int(at / PERIODS[0]) % len(stream)]
+            cloud = skeletons_to_cloud([skeleton], ROS)
+            cloud.header.stamp = to_time(due, ROS)
+            time.sleep(max(0, due - time.perf_counter_ns()) / NANOSECONDS)
+            now = time.perf_counter_ns()
+            if at >= self.warm_up and name != SENSORS[1]:
+                self.sent["relay" if name == "relay" else "graph"][due] = now
+            (self.relay_output if name == "relay" else self.outputs[name]).publish(cloud)
+
+    def delays_ms(self, chain: str) -> tuple[np.ndarray, int]:
+        """Delays of the frames that came through, and how many did not."""
+        sent, received = self.sent[chain], self.received[chain]
+        delays = [received[stamp] - at for stamp, at in sent.items() if stamp in received]
+        return np.array(delays) / 1e6, len(sent) - len(delays)
+
+
+def _recorded() -> tuple[dict[str, list[Skeleton]], dict[str, SensorPose]]:
+    """Skeletons of a shipped recording, and where its sensors really stood."""
+    frames: dict[str, list[Skeleton]] = {name: [] for name in SENSORS}
+    poses: dict[str, SensorPose] = {}
+    with BagReader(BAG) as reader:
+        for message in reader.messages([graph.skeleton_topic(name) for name in SENSORS]):
+            skeleton = cloud_to_skeletons(deserialize(reader.topics[message.topic].type_name, message.cdr))[0]
+            frames[message.topic.split("/")[1]].append(skeleton)
+        truth = "/ground_truth/calibration"
+        for message in reader.messages([truth]):
+            pose = transform_to_pose(deserialize(reader.topics[truth].type_name, message.cdr))
+            poses[pose.sensor] = pose
+    return frames, poses
+
+
+def _start(folder: Path, poses: dict[str, SensorPose]) -> list[subprocess.Popen[bytes]]:
+    """The graph's nodes from its own table, and the relays."""
+    file = folder / "calibration.yaml"
+    clocks = {name: ClockModel() for name in SENSORS}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in SENSORS}
+    save(CalibrationResult(SENSORS[0], poses, clocks, quality), file)
+    environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
+    commands = []
+    for spec in nodes_for(GraphOptions(SENSORS, calibration_file=str(file))):
+        if spec.executable == "kinect_skeleton":
+            continue  # this process takes their place, to know when it sent what
+        values = {name: to_ros(value) for name, value in spec.parameters.items()}
+        parameters = folder / f"{spec.name}.parameters.yaml"
+        parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
+        commands.append(["-m", "body_tracking.nodes", spec.executable, "--ros-args", "--params-file", str(parameters)])
+    commands += [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))]
+    return [
+        subprocess.Popen([sys.executable, *command], env=environment, start_new_session=True) for command in commands
+    ]
+
+
+def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+    for process in processes:
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def measure(seconds: float, warm_up: float) -> dict[str, Any]:
+    """Run both chains and compare their delays."""
+    frames, poses = _recorded()
+    rclpy.init()
+    bench = Bench(frames, seconds, warm_up)
+    with tempfile.TemporaryDirectory() as name:
+        processes = _start(Path(name), poses)
+        try:
+            deadline = time.monotonic() + 30.0
+            while not bench.ready():
+                if time.monotonic() > deadline or any(process.poll() is not None for process in processes):
+                    raise SystemExit("latency: the processes did not come up")
+                time.sleep(0.1)
+            time.sleep(0.5)
+            listener = threading.Thread(target=_spin, args=(bench.executor,), daemon=True)
+            listener.start()
+            bench.publish()
+            time.sleep(0.5)
+        finally:
+            _stop(processes)
+            rclpy.try_shutdown()
+    result: dict[str, Any] = {"seconds": seconds, "sensors": len(SENSORS), "processes": len(CHAIN)}
+    for chain in ("graph", "relay"):
+        delays, lost = bench.delays_ms(chain)
+        if not len(delays):
+            raise SystemExit(f"latency: nothing came through the {chain}")
+        median, p99 = np.percentile(delays, [50, 99])
+        result[chain] = {
+            "median_ms": round(float(median), 3),
+            "p99_ms": round(float(p99), 3),
+            "frames": len(delays),
+            "lost": lost,
+        }
+    result["ratio"] = {
+        key: round(result["graph"][f"{key}_ms"] / result["relay"][f"{key}_ms"], 3) for key in ("median", "p99")
+    }
+    return result
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    with contextlib.suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def main() -> int:
+    """The command: 0, also when a target is missed; the figures say it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=40.0, help="to measure (default 40)")
+    parser.add_argument("--warm-up", type=float, default=3.0, help="not measured at the beginning (default 3)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--relay", type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.relay is not None:
+        relay(args.relay)
+        return 0
+    result = measure(args.seconds, args.warm_up)
+    if args.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print(
+        f"capture to joint angles, {len(SENSORS)} sensors at 30 Hz, {len(CHAIN)} processes in series, {args.seconds:g} s"
+    )
+    for chain, text in (("graph", "the graph"), ("relay", "bare relays")):
+        row = result[chain]
+        lost = f", {row['lost']} lost" if row["lost"] else ""
+        print(
+            f"  {text:12} median {row['median_ms']:7.2f} ms   99 % {row['p99_ms']:7.2f} ms   ({row['frames']} frames{lost})"
+        )
+    ratio = result["ratio"]
+    met = all(ratio[key] <= target for key, target in TARGETS.items())
+    print(
+        f"  ratio        median {ratio['median']:7.2f}      99 % {ratio['p99']:7.2f}      "
+        f"(targets {TARGETS['median']} and {TARGETS['p99']}: {'met' if met else 'missed'})"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

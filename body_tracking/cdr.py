@@ -1,0 +1,219 @@
+"""The graph's own messages as CDR bytes, made and read without message objects.
+
+A client library in Python spends more on turning a ``PointCloud2`` into objects and back than our nodes do on its
+content. What is written here is what ``messages`` and a ROS serialiser would write, but for padding, which Fast CDR
+leaves as it is. What is read is only a message of that same layout; anything else is left to ``messages``, which says
+what is wrong with it.
+
+Encoding: OMG CDR, little-endian (XCDR1), as ROS 2 sends it; alignment counts from behind the encapsulation header.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.messages import skeletons_to_cloud
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+_STAMP_AND_LENGTH = struct.Struct("<iII")
+_BODY_BITS = 16
+_JOINTS = np.arange(N_JOINTS, dtype=np.uint32)
+_UPPER_OF_NINE = np.array([0, 1, 2, 4, 5, 8])
+_NINE_OF_UPPER = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+
+
+def _padded(data: bytes, to: int = 4) -> bytes:
+    return data + bytes(-len(data) % to)
+
+
+def _string(text: str) -> bytes:
+    """Its length with the terminating zero, and itself; not padded behind."""
+    data = text.encode() + b"\0"
+    return struct.pack("<I", len(data)) + data
+
+
+# --- skeletons
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """A kind of skeleton message: what stands between its header and its points.
+
+    Attributes:
+        table: ``height`` to the length of ``data``, as CDR with zeros as padding.
+        padding: 0 where the table has padding, 255 elsewhere.
+        words: 32-bit words per point.
+        covariance: whether points have one.
+        velocity: likewise.
+    """
+
+    table: bytes
+    padding: NDArray[np.uint8]
+    words: int
+    covariance: bool
+    velocity: bool
+
+    @property
+    def size(self) -> int:
+        """Bytes of points."""
+        return int.from_bytes(self.table[-4:], "little")
+
+    def fits(self, cdr: bytes, start: int) -> bool:
+        """Whether a message has this table there, whatever another serialiser left in the padding."""
+        given = np.frombuffer(cdr, np.uint8, len(self.table), start)
+        return cdr.startswith(self.table, start) or bytes(given & self.padding) == self.table
+
+
+class _Plain:
+    """A family of message classes (``messages.MessageTypes``) that only holds the fields."""
+
+    def make(self, _type_name: str, /, **fields: Any) -> Any:
+        return SimpleNamespace(**fields)
+
+    def octets(self, data: bytes) -> Any:
+        return data
+
+    def floats(self, values: FloatArray) -> Any:
+        return values
+
+
+@cache
+def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
+    """From the one place that knows the fields."""
+    joints = np.zeros((N_JOINTS, 3))
+    sample = Skeleton(
+        0,
+        "",
+        joints,
+        np.zeros(N_JOINTS, np.uint8),
+        0,
+        np.zeros((N_JOINTS, 3, 3)) if covariance else None,
+        joints if velocity else None,
+    )
+    cloud = skeletons_to_cloud([sample] * bodies, _Plain())
+    table, padding = struct.pack("<III", cloud.height, cloud.width, len(cloud.fields)), b"\xff" * 12
+    for field in cloud.fields:
+        name = _string(field.name)
+        table += _padded(name) + struct.pack("<IB3xI", field.offset, field.datatype, field.count)
+        padding += _padded(b"\xff" * len(name)) + b"\xff\xff\xff\xff\xff\x00\x00\x00\xff\xff\xff\xff"
+    table += struct.pack("<?3xIII", cloud.is_bigendian, cloud.point_step, cloud.row_step, len(cloud.data))
+    padding += b"\xff\x00\x00\x00" + b"\xff" * 12
+    return _Layout(table, np.frombuffer(padding, np.uint8), cloud.point_step // 4, covariance, velocity)
+
+
+def _known_layouts() -> tuple[_Layout, ...]:
+    """Those that are read here: one body of each kind, and some more as sensors see them."""
+    kinds = ((True, False), (True, True), (False, False))
+    return tuple(_layout(1, *kind) for kind in kinds) + tuple(_layout(n, False, False) for n in range(2, 7))
+
+
+def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:
+    """``skeletons_to_cloud``, serialised.
+
+    Args:
+        skeletons: at least one; all with the same stamp, frame and kind.
+    """
+    first = skeletons[0]
+    layout = _layout(len(skeletons), first.covariances is not None, first.velocities is not None)
+    points = np.empty((len(skeletons), N_JOINTS, layout.words), dtype="<f4")
+    labels = points.view("<u4")[:, :, 3]
+    for row, label, skeleton in zip(points, labels, skeletons, strict=True):
+        row[:, :3] = skeleton.positions
+        label[:] = _JOINTS | skeleton.states.astype(np.uint32) << 8 | np.uint32(skeleton.body << _BODY_BITS)
+        if skeleton.covariances is not None:
+            row[:, 4:10] = skeleton.covariances.reshape(N_JOINTS, 9)[:, _UPPER_OF_NINE]
+        if skeleton.velocities is not None:
+            row[:, -3:] = skeleton.velocities
+    dense = b"\x01" if np.isfinite(first.positions).all() else b"\x00"
+    return _header(first.stamp_ns, first.frame_id) + layout.table + points.tobytes() + dense
+
+
+def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
+    """``cloud_to_skeletons`` of a serialised message, for messages as :func:`encode_skeletons` makes them.
+
+    Returns:
+        The bodies; None where the message is anything else, right or wrong.
+    """
+    if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
+        return None
+    sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)
+    start = 16 + (length + 3 & ~3)
+    for layout in _KNOWN:
+        end = start + len(layout.table) + layout.size
+        if end < len(cdr) <= end + 4 and layout.fits(cdr, start):  # behind it is_dense and, maybe, padding
+            break
+    else:
+        return None
+    points: NDArray[np.float32] = np.frombuffer(cdr[end - layout.size : end], "<f4").reshape(-1, N_JOINTS, layout.words)
+    labels = points.view("<u4")[:, :, 3]
+    bodies = labels >> _BODY_BITS
+    states = labels.astype(np.uint16) >> 8
+    if ((labels & 0xFF) != _JOINTS).any() or (bodies != bodies[:, :1]).any() or states.max() > TrackingState.TRACKED:
+        return None
+    if len(bodies) > 1 and (bodies[1:, 0] <= bodies[:-1, 0]).any():
+        return None
+    try:
+        frame_id = cdr[16 : 16 + length - 1].decode()
+    except UnicodeDecodeError:
+        return None
+    values = points.astype(np.float64)
+    return tuple(
+        Skeleton(
+            sec * NANOSECONDS + nanosec,
+            frame_id,
+            value[:, :3],
+            state.astype(np.uint8),
+            int(body[0]),
+            value[:, 4:10][:, _NINE_OF_UPPER].reshape(N_JOINTS, 3, 3) if layout.covariance else None,
+            value[:, -3:] if layout.velocity else None,
+        )
+        for value, state, body in zip(values, states, bodies, strict=True)
+    )
+
+
+def _header(stamp_ns: int, frame_id: str) -> bytes:
+    """Encapsulation and ``std_msgs/Header``, padded to 4."""
+    return _ENCAPSULATION + struct.pack("<iI", *divmod(stamp_ns, NANOSECONDS)) + _padded(_string(frame_id))
+
+
+_KNOWN = _known_layouts()
+
+
+# --- joint angles
+
+
+@cache
+def _names(names: tuple[str, ...], body: str) -> bytes:
+    """``name``, padded to 4."""
+    table = struct.pack("<I", len(names))
+    for name in names:
+        table = _padded(table + _string(f"{name}_{body}"))
+    return table
+
+
+def encode_angles(angles: JointAngles, body: str, frame_id: str) -> tuple[bytes, bytes]:
+    """``angles_to_joint_states``, serialised: values, and standard deviations."""
+    start = _header(angles.stamp_ns, frame_id) + _names(angles.names, body)
+    return (
+        start + _doubles(len(start), angles.position, angles.velocity),
+        start + _doubles(len(start), angles.position_stddev, angles.velocity_stddev),
+    )
+
+
+def _doubles(position: int, *values: FloatArray) -> bytes:
+    """Sequences of ``float64``, aligned to 8 from behind the encapsulation, and an empty one for ``effort``."""
+    data = b""
+    for value in values:
+        data += struct.pack("<I", len(value))
+        data += bytes(-(position + len(data) - 4) % 8) if len(value) else b""
+        data += value.astype("<f8").tobytes()
+    return data + struct.pack("<I", 0)
