@@ -67,8 +67,8 @@ lint: $(STAMP) ## formatting, lint and types
 bench: $(STAMP) ## measure the delay from capture to angle
 	$(BIN)/python benchmarks/latency.py
 
-docs: $(STAMP) ## rewrite the generated tables of README.md
-	$(BIN)/python docs/update_readme.py
+docs: $(STAMP) ## rewrite what the code defines: tables of README.md, config/
+	$(BIN)/python docs/update.py
 
 clean: ## remove everything that make and colcon made
 	rm -rf $(VENV) $(DEMO) build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

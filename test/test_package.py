@@ -248,9 +248,9 @@ def test_ci_runs_make_test() -> None:
 # --- README.md and its picture
 
 
-def test_tables_of_the_readme_are_those_of_the_code() -> None:
+def test_readme_and_parameters_file_are_those_of_the_code() -> None:
     pytest.importorskip("rclpy")
-    run(sys.executable, "docs/update_readme.py", "--check", cwd=ROOT)
+    run(sys.executable, "docs/update.py", "--check", cwd=ROOT)
 
 
 def test_picture_shows_every_node_and_topic() -> None:

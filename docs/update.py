@@ -1,4 +1,4 @@
-"""Write the tables of README.md that the code defines: topics, services, angles, parameters, commands.
+"""Write what the code defines: the tables of README.md, and config/body_tracking.yaml with every parameter.
 
 With ``--check`` it only says whether they are up to date.
 """
@@ -16,7 +16,9 @@ from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import Qos
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+CONFIG = ROOT / "config" / "body_tracking.yaml"
 SECTION = re.compile(r"(<!-- (\w+): written by make docs -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
 
 
@@ -102,8 +104,9 @@ def commands() -> str:
 WRITERS = {"topics": topics, "services": services, "angles": angles, "parameters": parameters, "commands": commands}
 
 
-def updated(text: str) -> str:
+def readme() -> str:
     """The text of README.md with its tables as the code defines them now."""
+    text = README.read_text(encoding="utf-8")
     missing = WRITERS.keys() - {match[2] for match in SECTION.finditer(text)}
     if missing:
         raise SystemExit(f"{README.name} has no place for {', '.join(sorted(missing))}")
@@ -115,15 +118,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if not up to date")
     check = parser.parse_args().check
-    before = README.read_text(encoding="utf-8")
-    after = updated(before)
-    if before == after:
-        return 0
-    if check:
-        print(f"{README.name} is not up to date: make docs", file=sys.stderr)
-        return 1
-    README.write_text(after, encoding="utf-8")
-    return 0
+    code = 0
+    for path, text in ((README, readme()), (CONFIG, graph.config_text())):
+        if path.exists() and path.read_text(encoding="utf-8") == text:
+            continue
+        if check:
+            print(f"{path.relative_to(ROOT)} is not up to date: make docs", file=sys.stderr)
+            code = 1
+        else:
+            path.write_text(text, encoding="utf-8")
+    return code
 
 
 if __name__ == "__main__":
