@@ -46,7 +46,7 @@ $(STAMP): setup.py setup.cfg
 	  echo "make: $$python has no venv module; on Debian or Ubuntu: apt install python3-venv" >&2; exit 1; \
 	fi; \
 	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
-	@echo "installing into $(VENV) (the first time about 300 MB)"
+	@echo "installing into $(VENV) (the first time it takes a minute or two, and 700 MB)"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,test,bench]'
 	@touch $@
 
