@@ -35,6 +35,9 @@ BASE_STDDEV: FloatArray = _base_stddev()
 INFERRED_FACTOR = 3.0
 """An Inferred joint is a guess of the SDK: three times the standard deviation."""
 
+_LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
+_RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
+
 _YAW_DEG = np.array([0.0, 30.0, 60.0, 90.0, 180.0])
 _YAW_FACTOR = np.array([1.0, 1.0, 1.3, 3.2, 3.2])
 """Joint error against the body's yaw to the sensor: table 4.4 of Schlagenhauf 2017 (x1.3 at 60, x3.2 at 90 deg)."""
@@ -51,8 +54,7 @@ def left_right_axes(positions: FloatArray) -> FloatArray:
     Returns:
         (..., 2, 3) metres: the vector from the right to the left shoulder, and that from the right to the left hip.
     """
-    left = positions[..., [Joint.SHOULDER_LEFT, Joint.HIP_LEFT], :]
-    axes: FloatArray = left - positions[..., [Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], :]
+    axes: FloatArray = positions.take(_LEFT_ENDS, axis=-2) - positions.take(_RIGHT_ENDS, axis=-2)
     return axes
 
 
@@ -87,17 +89,19 @@ def viewing_angle(positions: FloatArray) -> FloatArray:
     return angle
 
 
-def joint_stddev(positions: FloatArray, states: np.ndarray) -> FloatArray:
+def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | None = None) -> FloatArray:
     """The standard deviation of each joint position, the same in all directions.
 
     Args:
         positions: (..., 25, 3) metres in the sensor's optical frame.
         states: (..., 25) tracking states.
+        angle: (...) what :func:`viewing_angle` says of the positions, where it is known already.
 
     Returns:
         (..., 25) metres; infinity for joints that are not tracked or not finite.
     """
-    angle = viewing_angle(positions)
+    if angle is None:
+        angle = viewing_angle(positions)
     yaw = np.interp(np.degrees(np.where(np.isfinite(angle), angle, np.pi / 2)), _YAW_DEG, _YAW_FACTOR)
     # Depth noise of a time-of-flight camera grows with distance; below the reference distance it is a floor.
     depth = positions[..., Joint.SPINE_MID, 2]

@@ -20,6 +20,9 @@ BoolArray = NDArray[np.bool_]
 
 NANOSECONDS = 1_000_000_000
 
+MAX_RANGE = 100.0
+"""A coordinate beyond this many metres is no measurement of a person but a damaged number."""
+
 
 class SkeletonError(BodyTrackingError):
     """An array that should be a skeleton is not one."""
@@ -149,8 +152,8 @@ class Skeleton:
 
     @property
     def valid(self) -> BoolArray:
-        """(25,) joints that have a finite position and are not NOT_TRACKED."""
-        known: BoolArray = (self.states > TrackingState.NOT_TRACKED) & np.isfinite(self.positions).all(axis=1)
+        """(25,) joints that have a position within :data:`MAX_RANGE` and are not NOT_TRACKED."""
+        known: BoolArray = (self.states > 0) & (np.abs(self.positions) < MAX_RANGE).all(axis=1)
         return known
 
     def mirrored(self) -> Skeleton:

@@ -142,6 +142,8 @@ def correlate_clocks(
     best = int(np.argmax(likely))
     far = np.abs(lag - lag[best]) > 0.3
     margin = float(likely[best] - likely[far].max()) if far.any() else 0.0
+    # The preference chooses the peak and must not move it.
+    best = int(np.argmax(np.where(np.abs(lag - lag[best]) <= 0.1, score, -np.inf)))
     return OffsetEstimate(guess + float(lag[best]), float(score[best]), margin)
 
 
@@ -233,11 +235,12 @@ class ClockFit:
             return at
 
         drifts = DRIFT_STEP * np.arange(-DRIFT_STEPS, DRIFT_STEPS + 1)
-        _, offset, drift = max(
-            (along(likelihood, lag, each).sum() - 0.5 * (each / DRIFT_PRIOR) ** 2, lag, each)
-            for each in drifts.tolist()
-            for lag in self._lags[:: round(0.01 / FINE_STEP)].tolist()
-        )
+        # On the coarse grid each window is shifted by whole lags.
+        shifts = np.rint(drifts[:, None] * elapsed / FINE_STEP).astype(np.intp)
+        places = np.clip(np.arange(last + 1) + shifts[..., None], 0, last)
+        total = likelihood[rows[None, :, None], places].sum(axis=1) - 0.5 * (drifts[:, None] / DRIFT_PRIOR) ** 2
+        best = np.unravel_index(int(np.argmax(total)), total.shape)
+        drift, offset = float(drifts[best[0]]), float(self._lags[best[1]])
         # Newton's method on the smoothed likelihood, from the best point of the grid.
         width = 2 * round(PEAK_WIDTH / FINE_STEP) + 1
         slope = savgol_filter(likelihood, width, 2, deriv=1, delta=FINE_STEP, axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,7 +43,7 @@ class ClockModel:
         return self.offset_ns / NANOSECONDS
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class SensorPose:
     """The pose of ``<sensor>_optical_frame`` (x right, y down, z forward) in ``world``.
 
@@ -58,7 +59,7 @@ class SensorPose:
     quat_xyzw: FloatArray
     valid_from_ns: int = 0
 
-    @property
+    @cached_property
     def rotation(self) -> FloatArray:
         """(3, 3) rotation matrix, optical to world."""
         matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()

@@ -321,16 +321,10 @@ class Fusion:
                 source.seen_since = stamp
         else:
             source.seen_since = stamp
+        angle = viewing_angle(positions)
+        stddev = joint_stddev(positions, states, angle)
         source.frames.append(
-            _Frame(
-                skeleton.stamp_ns,
-                positions,
-                velocities,
-                joint_stddev(positions, states),
-                states,
-                float(viewing_angle(positions)),
-                skeleton.body,
-            )
+            _Frame(skeleton.stamp_ns, positions, velocities, stddev, states, float(angle), skeleton.body)
         )
 
     def poll(self, now_ns: int) -> list[Skeleton]:

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load
+from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS, LinearKalmanParameters, make_filter
 from body_tracking.fusion.fusion import Fusion, FusionParameters
@@ -29,11 +30,9 @@ from body_tracking.messages import (
     POINT_CLOUD,
     TIME_REFERENCE,
     TRANSFORM,
-    angles_to_joint_states,
     clock_to_time_reference,
     cloud_to_skeletons,
     pose_to_transform,
-    skeletons_to_cloud,
     time_reference_to_clock,
     transform_to_pose,
 )
@@ -133,7 +132,7 @@ def skeletons_of(
     for raw in bag.messages(topics.keys()):
         sensor = topics[raw.topic]
         try:
-            skeletons = cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
+            skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except BodyTrackingError:
             counters[f"malformed {raw.topic}"] += 1
             continue
@@ -204,11 +203,11 @@ class OfflineGraph:
         for sensor, clock in result.clocks.items():
             if sensor != result.reference:
                 reference = clock_to_time_reference(sensor, clock, update.valid_from_ns, BAG_MESSAGES)
-                self._write(graph.CALIBRATION_CLOCK, reference, log_time_ns)
+                self._write(graph.CALIBRATION_CLOCK, serialize(reference), log_time_ns)
                 self.fusion.set_clock(*time_reference_to_clock(reference))
         for pose in result.poses.values():
             transform = pose_to_transform(pose, self.fusion.world, BAG_MESSAGES)
-            self._write(graph.CALIBRATION, transform, log_time_ns)
+            self._write(graph.CALIBRATION, serialize(transform), log_time_ns)
             self.fusion.set_pose(transform_to_pose(transform))
 
     def _fused(self, skeleton: Skeleton, log_time_ns: int) -> None:
@@ -216,22 +215,22 @@ class OfflineGraph:
         if filtered is None:
             return
         arrived = self._through(graph.FILTERED, filtered, log_time_ns)
-        states, stddevs = angles_to_joint_states(
-            positional_angles(arrived), self.settings.body, arrived.frame_id, BAG_MESSAGES
-        )
+        states, stddevs = encode_angles(positional_angles(arrived), self.settings.body, arrived.frame_id)
         self.frames += 1
         self._write(self._states, states, log_time_ns)
         self._write(self._stddevs, stddevs, log_time_ns)
 
     def _through(self, topic: str, skeleton: Skeleton, log_time_ns: int) -> Skeleton:
         """The skeleton as whoever subscribes gets it: in single precision."""
-        cloud = skeletons_to_cloud([skeleton], BAG_MESSAGES)
-        self._write(topic, cloud, log_time_ns)
-        return cloud_to_skeletons(cloud)[0]
+        cdr = encode_skeletons([skeleton])
+        self._write(topic, cdr, log_time_ns)
+        arrived = decode_skeletons(cdr)
+        assert arrived is not None
+        return arrived[0]
 
-    def _write(self, topic: str, message: Any, log_time_ns: int) -> None:
+    def _write(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
         if self._writer is not None:
-            self._writer.write(topic, serialize(message), log_time_ns)
+            self._writer.write(topic, cdr, log_time_ns)
 
 
 class Progress:

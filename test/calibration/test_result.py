@@ -1,0 +1,46 @@
+"""Clocks convert back and forth; the reference pose has the axes that REP-103 asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from body_tracking.calibration.result import ClockModel, level_pose
+from body_tracking.skeleton import NANOSECONDS
+
+STAMPS = st.integers(0, 2_000_000_000 * NANOSECONDS)
+
+
+@given(
+    STAMPS,
+    st.integers(-2_000_000_000, 2_000_000_000),
+    st.floats(-500, 500),
+    st.integers(0, 3600 * NANOSECONDS),
+)
+def test_a_clock_converts_back_and_forth_to_a_nanosecond(anchor: int, offset: int, drift: float, elapsed: int) -> None:
+    clock = ClockModel(offset, drift, anchor)
+    assert abs(clock.to_reference(clock.to_sensor(anchor + elapsed)) - (anchor + elapsed)) <= 1
+
+
+def test_a_fast_clock_runs_ahead() -> None:
+    clock = ClockModel(2 * NANOSECONDS, 100.0, 0)
+    assert clock.to_sensor(10 * NANOSECONDS) == 12 * NANOSECONDS + 1_000_000
+    assert clock.offset == 2.0
+
+
+def test_the_reference_sensor_looks_along_x_with_z_up() -> None:
+    pose = level_pose("kinect1", height=0.9)
+    assert_allclose(pose.apply(np.array([0.0, 0.0, 2.0])), [2.0, 0.0, 0.9], atol=1e-12)  # forward
+    assert_allclose(pose.apply(np.array([1.0, 0.0, 0.0])), [0.0, -1.0, 0.9], atol=1e-12)  # right
+    assert_allclose(pose.apply(np.array([0.0, 1.0, 0.0])), [0.0, 0.0, -0.1], atol=1e-12)  # down
+
+
+def test_a_sensor_that_looks_down_sees_the_floor_ahead() -> None:
+    ahead = level_pose("kinect1", pitch=0.3).apply(np.array([0.0, 0.0, 2.0]))
+    assert_allclose(ahead, [2.0 * np.cos(0.3), 0.0, -2.0 * np.sin(0.3)], atol=1e-12)
+
+
+def test_a_sensor_rolled_clockwise_sees_its_right_lower() -> None:
+    assert level_pose("kinect1", roll=0.2).apply(np.array([1.0, 0.0, 0.0]))[2] < 0.0

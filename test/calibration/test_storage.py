@@ -1,0 +1,74 @@
+"""Calibrations survive the disk, and a damaged file is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality, level_pose
+from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.calibration.storage import load, save
+
+
+def example(seed: int = 0) -> CalibrationResult:
+    rng = np.random.default_rng(seed)
+    pose = SensorPose("kinect2", rng.normal(size=3), Rotation.random(rng=rng).as_quat())
+    return CalibrationResult(
+        "kinect1",
+        {"kinect1": level_pose("kinect1", 0.9), "kinect2": pose},
+        {"kinect1": ClockModel(), "kinect2": ClockModel(int(rng.integers(-(10**10), 10**10)), 42.5, 123456789)},
+        {"kinect1": SensorQuality(0, 0, 0, 0, 0), "kinect2": SensorQuality(0.05, 0.01, 0.004, float("inf"), 400)},
+    )
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_calibration_survives_the_disk(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    path = tmp_path_factory.mktemp("calibration") / "new folder" / "room.yaml"
+    result = example(seed)
+    save(result, path)
+    read = load(path)
+    assert read.reference == result.reference
+    for name, pose in result.poses.items():
+        assert_allclose(read.poses[name].translation, pose.translation, atol=1e-12)
+        assert_allclose(read.poses[name].rotation, pose.rotation, atol=1e-12)
+        assert abs(read.clocks[name].offset_ns - result.clocks[name].offset_ns) <= 1
+        assert read.clocks[name].drift_ppm == result.clocks[name].drift_ppm
+        assert_allclose(read.quality[name].rotation_stddev, result.quality[name].rotation_stddev)
+        assert read.quality[name].clock_stddev == result.quality[name].clock_stddev
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("reference: kinect1", "", "reference"),
+        ("reference: kinect1", "reference: kinect9", "kinect9"),
+        ("quat_xyzw:\n    - ", "quat_xyzw:\n    - 7", "kinect1"),
+        ("translation:\n    - ", "translation:\n    - x", "kinect1"),
+        ("translation:", "place:", "translation"),
+        ("sensors:", "sensors: [", "YAML"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "room.yaml"
+    save(example(), path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(CalibrationError, match=message) as caught:
+        load(path)
+    assert "room.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_an_unwritable_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"nothing\.yaml"):
+        load(tmp_path / "nothing.yaml")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CalibrationError, match="cannot be written"):
+        save(example(), tmp_path / "file" / "room.yaml")

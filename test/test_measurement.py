@@ -1,0 +1,54 @@
+"""The noise model knows the sensor's weaknesses, and the body's heading does not depend on where the sensor stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR, body_heading, joint_stddev, viewing_angle
+from body_tracking.skeleton import MIRROR, Joint
+from walkers import TRACKED, about_y, walk
+
+BODY = walk(np.zeros(1))[0]
+AT_TWO_METRES = BODY - BODY[Joint.SPINE_MID] + [0.0, 0.0, 2.0]
+
+
+def turned(degrees: float) -> np.ndarray:
+    centre = AT_TWO_METRES[Joint.SPINE_SHOULDER]
+    return (AT_TWO_METRES - centre) @ about_y(degrees).T + centre
+
+
+@pytest.mark.parametrize("degrees", [0, 20, 45, 90, 135, 180, -60])
+def test_the_viewing_angle_is_the_bodys_yaw_to_the_sensor(degrees: float) -> None:
+    assert viewing_angle(turned(degrees)) == pytest.approx(np.radians(abs(degrees)), abs=0.02)
+
+
+def test_swapped_sides_look_like_a_back() -> None:
+    assert viewing_angle(AT_TWO_METRES[MIRROR]) == pytest.approx(np.pi, abs=0.02)
+    assert_allclose(body_heading(AT_TWO_METRES[MIRROR]), -body_heading(AT_TWO_METRES))
+
+
+def test_a_joint_is_worth_less_from_the_side_from_afar_and_when_inferred() -> None:
+    frontal = joint_stddev(AT_TWO_METRES, TRACKED)
+    assert_allclose(frontal, BASE_STDDEV)
+    assert_allclose(joint_stddev(turned(90), TRACKED), 3.2 * BASE_STDDEV, rtol=0.03)
+    assert_allclose(joint_stddev(AT_TWO_METRES + [0.0, 0.0, 2.0], TRACKED), 2.0 * BASE_STDDEV)
+    assert_allclose(joint_stddev(AT_TWO_METRES, TRACKED - 1), INFERRED_FACTOR * BASE_STDDEV)
+
+
+def test_what_is_not_tracked_is_worth_nothing() -> None:
+    states = TRACKED.copy()
+    states[Joint.HEAD] = 0
+    positions = AT_TWO_METRES.copy()
+    positions[Joint.FOOT_LEFT] = np.nan
+    stddev = joint_stddev(positions, states)
+    assert np.isinf(stddev[[Joint.HEAD, Joint.FOOT_LEFT]]).all()
+    assert np.isfinite(np.delete(stddev, [Joint.HEAD, Joint.FOOT_LEFT])).all()
+
+
+def test_frames_are_weighed_one_by_one_or_together() -> None:
+    several = np.stack([turned(degrees) for degrees in (0, 30, 60)])
+    states = np.broadcast_to(TRACKED, several.shape[:2])
+    assert_allclose(joint_stddev(several, states), [joint_stddev(body, TRACKED) for body in several])
+    assert_allclose(joint_stddev(several, states, viewing_angle(several)), joint_stddev(several, states))
