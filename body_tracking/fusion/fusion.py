@@ -29,6 +29,9 @@ CLOCK_JUMP = 1.0
 DUE_MARGIN = 0.005
 """A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
 
+FASTEST = 8.0
+"""No joint moves faster than this along an axis, metres per second."""
+
 ACCELERATION = 30.0
 """Typical peak acceleration of a limb, m/s^2; what extrapolation and prediction cannot know."""
 
@@ -94,7 +97,7 @@ class FusionParameters:
         },
     )
     max_output_gap: float = field(
-        default=0.08,
+        default=0.065,
         metadata={
             "doc": "let another sensor give the beat when the reference is silent for this long",
             "unit": "s",
@@ -292,7 +295,8 @@ class Fusion:
         self._remember(source, skeleton, stamp)
         latest = self._pending[-1][0] if self._pending else self._last_ns
         if latest is None:
-            answer = True
+            latest = stamp if source.seen_since is None else source.seen_since
+            answer = sensor == self.reference or stamp - latest > self.parameters.max_output_gap * NANOSECONDS
         elif stamp <= latest:
             answer = False
             if sensor == self.reference:
@@ -315,7 +319,10 @@ class Fusion:
                 # Smoothed over about three frames: the difference of two is mostly noise.
                 share = 1.0 - np.exp(-step / 0.1)
                 change = (positions - last.positions) / step
-                velocities = np.where(np.isfinite(change), last.velocities + share * (change - last.velocities), 0.0)
+                moved = (
+                    np.abs(change).max(axis=1, keepdims=True) < FASTEST
+                )  # False for NaN; a label that jumps is faster
+                velocities = np.where(moved, last.velocities + share * (change - last.velocities), 0.0)
                 source.period += 0.1 * (step - source.period)
             else:
                 source.seen_since = stamp
@@ -562,7 +569,7 @@ class Fusion:
     def _combined(
         self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
     ) -> Skeleton:
-        """The weighted mean (eq. 5.8), with the covariance that the sensors claim plus their disagreement."""
+        """The weighted mean (eq. 5.8), with the covariance that the sensors claim, or their disagreement if larger."""
         used = (weights > 0.0) & np.isfinite(points[..., 0])
         weights = np.where(used, weights, 0.0)
         total = weights.sum(axis=0)
@@ -572,8 +579,12 @@ class Fusion:
         mean = np.einsum("kj,kji->ji", share, points)
         away = np.where(used[..., None], points - mean, 0.0)
         finite = np.where(used & np.isfinite(variance), variance, 0.0)
+        claimed = np.einsum("kj,kj->j", share**2, finite)
         covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
-        covariance[:, [0, 1, 2], [0, 1, 2]] += np.einsum("kj,kj->j", share**2, finite)[:, None]
+        # Only what they disagree beyond their claims: for two sensors the larger of both along their difference.
+        spread = np.trace(covariance, axis1=1, axis2=2)
+        covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]
+        covariance[:, [0, 1, 2], [0, 1, 2]] += claimed[:, None]
         return Skeleton(
             stamp,
             self.world,

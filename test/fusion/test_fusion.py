@@ -1,0 +1,379 @@
+"""One skeleton from several sensors: by stamp, weighted, and not fooled by one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from body_tracking.calibration.online import OnlineCalibration
+from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
+from body_tracking.fusion.fusion import Fusion, FusionError, FusionParameters
+from body_tracking.measurement import left_right_axes
+from body_tracking.sensors.csv_recording import CsvRecording
+from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Joint, Skeleton
+from walkers import OPTICAL_FROM_LEVEL, TRACKED, about_y, frame, walk
+
+FRAME = 1 / 30
+OFFSET = 0.4
+ONE = level_pose("kinect1")
+TWO = SensorPose(
+    "kinect2",
+    OPTICAL_FROM_LEVEL.T @ np.array([2.0, 0.0, 1.4]),
+    Rotation.from_matrix(OPTICAL_FROM_LEVEL.T @ about_y(-60.0)).as_quat(),
+)
+POSES = {"kinect1": ONE, "kinect2": TWO}
+
+Frame = tuple[str, Skeleton, int]
+
+
+def fusion(sensors: Iterable[str] = ("kinect1", "kinect2"), **parameters: object) -> Fusion:
+    made = Fusion(tuple(sensors), FusionParameters(**({"fade_in": 0.0} | parameters)))
+    for sensor in sensors:
+        made.set_pose(POSES[sensor])
+    if "kinect2" in sensors:
+        made.set_clock("kinect2", 0, ClockModel(round(OFFSET * NANOSECONDS)))
+    return made
+
+
+def truth(times: FloatArray) -> FloatArray:
+    """The walk in world."""
+    return walk(times) @ OPTICAL_FROM_LEVEL
+
+
+def frames(seconds: float, noise: float = 0.0, phase: float = 0.013, start: float = 0.0) -> list[Frame]:
+    """Both sensors' frames in order of capture; the time of arrival is that of capture."""
+    rng = np.random.default_rng(0)
+    made = []
+    for sensor, lag, clock in (("kinect1", 0.0, 0.0), ("kinect2", phase, OFFSET)):
+        times = start + np.arange(0.0, seconds, FRAME) + lag
+        pose = POSES[sensor]
+        seen = (truth(times) - pose.translation) @ pose.rotation
+        seen = seen + rng.normal(scale=noise, size=seen.shape)
+        for time, positions in zip(times, seen, strict=True):
+            made.append((sensor, frame(time + clock, positions, sensor), round(time * NANOSECONDS)))
+    return sorted(made, key=lambda each: each[2])
+
+
+def run(made: Fusion, given_frames: Iterable[Frame]) -> list[Skeleton]:
+    fused: list[Skeleton] = []
+    last = 0
+    for sensor, skeleton, now in given_frames:
+        last = now
+        fused += made.poll(now)
+        fused += made.push(sensor, skeleton, now)
+    return fused + made.poll(last + NANOSECONDS)
+
+
+def errors(fused: list[Skeleton]) -> FloatArray:
+    stamps = np.array([skeleton.stamp for skeleton in fused])
+    return np.linalg.norm(np.stack([each.positions for each in fused]) - truth(stamps), axis=-1)
+
+
+def changed(given_frames: list[Frame], sensor: str, change: Callable[[Skeleton], Skeleton | None]) -> list[Frame]:
+    """The frames with those of one sensor changed, or left out."""
+    out = []
+    for name, skeleton, now in given_frames:
+        other = change(skeleton) if name == sensor else skeleton
+        if other is not None:
+            out.append((name, other, now))
+    return out
+
+
+# --- what it is
+
+
+def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
+    fused = run(fusion(), frames(8.0))
+    assert len(fused) == 240
+    assert np.diff([each.stamp_ns for each in fused]).min() > 0
+    assert {each.frame_id for each in fused} == {"world"}
+    # What extrapolation over half a frame cannot know of the hands of a waving person.
+    assert errors(fused)[30:].mean() < 0.002
+    assert errors(fused)[30:].max() < 0.03
+
+
+def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
+    alone = run(fusion(["kinect1"]), [each for each in frames(8.0, 0.02) if each[0] == "kinect1"])
+    together = run(fusion(), frames(8.0, 0.02))
+    assert errors(together)[30:90].mean() < 0.8 * errors(alone)[30:90].mean()
+    for each, other in zip(alone[30:], together[30:], strict=True):
+        assert each.covariances is not None
+        assert other.covariances is not None
+        assert np.linalg.eigvalsh(other.covariances).min() > 0.0
+    assert alone[60].covariances is not None
+    assert together[60].covariances is not None
+    assert np.median(np.trace(together[60].covariances, axis1=1, axis2=2)) < np.median(
+        np.trace(alone[60].covariances, axis1=1, axis2=2)
+    )
+
+
+def test_disagreement_makes_uncertain() -> None:
+    def shifted(seen: Skeleton) -> Skeleton:
+        return frame(seen.stamp, seen.positions + [0.0, 0.16, 0.0], "kinect2")
+
+    trunk = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
+    agreed, apart = run(fusion(), frames(3.0)), run(fusion(), changed(frames(3.0), "kinect2", shifted))
+    for near, far in zip(agreed[10:], apart[10:], strict=True):
+        assert near.covariances is not None
+        assert far.covariances is not None
+        # z is up: the shift is downwards in the optical frame.
+        assert (far.covariances[trunk, 2, 2] > near.covariances[trunk, 2, 2] + 0.0015).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_arrival_a_few_milliseconds_earlier_or_later_changes_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    orderly = frames(4.0, 0.01, phase=0.004)
+    shaken = sorted(
+        ((sensor, skeleton, now + int(rng.integers(0, 8_000_000))) for sensor, skeleton, now in orderly),
+        key=lambda each: each[2],
+    )
+    expected, found = run(fusion(), orderly), run(fusion(), shaken)
+    assert [each.stamp_ns for each in found] == [each.stamp_ns for each in expected]
+    for each, other in zip(found, expected, strict=True):
+        assert_allclose(each.positions, other.positions, atol=1e-12)
+
+
+def test_a_frame_waits_only_for_one_that_is_due() -> None:
+    made = fusion(max_wait=0.01)
+    waits = []
+    for sensor, skeleton, now in frames(3.0, phase=0.016):
+        made.push(sensor, skeleton, now)
+        waits.append(made.deadline_ns is not None)
+    assert not any(waits[30:])
+    # The other sensor misses one frame: its neighbour waits, and not for longer than it may.
+    given_frames = frames(3.0, phase=0.016)
+    missing = next(index for index, each in enumerate(given_frames) if index > 60 and each[0] == "kinect2")
+    made = fusion(max_wait=0.01)
+    for sensor, skeleton, now in given_frames[:missing]:
+        made.push(sensor, skeleton, now)
+    sensor, skeleton, now = given_frames[missing + 1]
+    assert sensor == "kinect1"
+    assert made.push(sensor, skeleton, now) == []
+    assert made.deadline_ns == now + 10_000_000
+    assert made.poll(now + 9_999_999) == []
+    assert len(made.poll(now + 10_000_000)) == 1
+
+
+def test_the_order_of_the_sensors_does_not_matter() -> None:
+    there = run(fusion(), frames(4.0, 0.01))
+    back = Fusion(("kinect2", "kinect1"), FusionParameters(fade_in=0.0), reference="kinect1")
+    for pose in POSES.values():
+        back.set_pose(pose)
+    back.set_clock("kinect2", 0, ClockModel(round(OFFSET * NANOSECONDS)))
+    for each, other in zip(there, run(back, frames(4.0, 0.01)), strict=True):
+        assert_allclose(each.positions, other.positions, atol=1e-12)
+
+
+def test_the_thesis_methods_take_its_weights() -> None:
+    states = TRACKED.copy()
+    states[Joint.WRIST_LEFT] = 1
+
+    def inferred(seen: Skeleton) -> Skeleton:
+        positions = seen.positions.copy()
+        positions[Joint.WRIST_LEFT] += [0.3, 0.0, 0.0]
+        return frame(seen.stamp, positions, "kinect2", states)
+
+    still = [each for each in frames(2.0, phase=0.0) if each[2] < 2 * NANOSECONDS]
+    for method, share in (("thesis_text", 0.0), ("thesis_formula", 1 / 3)):
+        last = run(fusion(method=method), changed(still, "kinect2", inferred))[-1]
+        wrong = np.linalg.norm(last.positions - truth(np.array([last.stamp]))[0], axis=-1)
+        assert wrong[Joint.WRIST_LEFT] == pytest.approx(0.3 * share, abs=1e-6)
+        assert np.delete(wrong, Joint.WRIST_LEFT).max() < 1e-6
+
+
+# --- when sensors fail
+
+
+def test_a_sensor_that_falls_silent_is_dropped_within_a_tenth_of_a_second_and_taken_back() -> None:
+    def paused(seen: Skeleton) -> Skeleton | None:
+        # While it is heard it lies by 10 cm, so that one sees when it counts.
+        clock = seen.stamp - OFFSET
+        return None if 2.0 < clock < 4.0 else frame(seen.stamp, seen.positions + [0.0, 0.1, 0.0], "kinect2")
+
+    def heard(seen: Skeleton) -> Skeleton:
+        return frame(seen.stamp, seen.positions + [0.0, 0.1, 0.0], "kinect2")
+
+    fused = run(fusion(fade_in=0.5), changed(frames(8.0), "kinect2", paused))
+    always = np.median(errors(run(fusion(fade_in=0.5), changed(frames(8.0), "kinect2", heard))), axis=1)
+    stamps = np.array([each.stamp for each in fused])
+    wrong = np.median(errors(fused), axis=1)
+    assert len(fused) == 240
+    assert wrong[(stamps > 1.0) & (stamps < 2.0)].min() > 0.03
+    assert wrong[(stamps > 2.1) & (stamps < 4.0)].max() < 1e-6
+    assert_allclose(wrong[stamps > 5.0], always[stamps > 5.0], atol=0.002)
+    # ... gently.
+    assert np.abs(np.diff(wrong[(stamps > 4.0) & (stamps < 4.6)])).max() < 0.012
+
+
+def test_the_others_go_on_while_the_reference_is_silent() -> None:
+    def gone(seen: Skeleton) -> Skeleton | None:
+        return None if 2.0 < seen.stamp < 4.0 else seen
+
+    fused = run(fusion(), changed(frames(6.0), "kinect1", gone))
+    stamps = np.array([each.stamp for each in fused])
+    assert np.diff(stamps).max() < 0.1
+    assert np.sum((stamps > 2.0) & (stamps < 4.0)) > 20
+    assert errors(fused)[30:].max() < 0.05
+
+
+def test_swapped_sides_of_one_sensor_are_repaired() -> None:
+    def swapped(seen: Skeleton) -> Skeleton:
+        return seen.mirrored() if 2.0 < seen.stamp - OFFSET < 4.0 else seen
+
+    made = fusion()
+    fused = run(made, changed(frames(6.0), "kinect2", swapped))
+    assert made.counters["repaired"] > 50
+    assert errors(fused)[30:].max() < 0.05
+
+
+def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
+    """A sensor whose axis lies across the believed one loses its say on left and right, not the rest."""
+
+    def twisted(seen: Skeleton) -> Skeleton:
+        centre = seen.positions[Joint.SPINE_SHOULDER]
+        turn = about_y(90.0 * min(1.0, max(0.0, seen.stamp - OFFSET - 2.0)))
+        return frame(seen.stamp, (seen.positions - centre) @ turn.T + centre, "kinect2")
+
+    fused = run(fusion(), changed(frames(6.0), "kinect2", twisted))
+    width = np.linalg.norm([left_right_axes(each.positions)[0] for each in fused], axis=1)
+    assert width[60:].min() > 0.75 * np.median(width[:60])
+
+
+def test_both_sensors_reversing_at_once_is_held_and_then_followed_without_a_mirror() -> None:
+    def turned(seen: Skeleton) -> Skeleton:
+        return seen.mirrored() if seen.stamp > 3.0 else seen
+
+    alone = [each for each in frames(8.0) if each[0] == "kinect1"]
+    made = fusion(["kinect1"])
+    fused = run(made, changed(alone, "kinect1", turned))
+    axes = np.stack([left_right_axes(each.positions)[0] for each in fused])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    assert np.einsum("ni,ni->n", axes[1:], axes[:-1]).min() > 0.4  # never through a mirror
+    assert made.counters["reversals_accepted"] > 0
+    # In the end the sensor is believed: it may have been wrong before.
+    assert errors(fused)[-1].max() > 0.2
+
+
+def test_outliers_of_one_joint_are_gated_and_a_new_place_is_accepted_in_the_end() -> None:
+    def wild(seen: Skeleton) -> Skeleton:
+        positions = seen.positions.copy()
+        clock = seen.stamp
+        if 2.0 < clock < 2.1 or clock > 4.0:
+            positions[Joint.WRIST_RIGHT] += [0.0, -0.8, 0.0]
+        return frame(seen.stamp, positions)
+
+    alone = [each for each in frames(6.0) if each[0] == "kinect1"]
+    made = fusion(["kinect1"])
+    fused = run(made, changed(alone, "kinect1", wild))
+    stamps = np.array([each.stamp for each in fused])
+    wrist = np.stack([each.positions[Joint.WRIST_RIGHT] for each in fused]) - truth(stamps)[:, Joint.WRIST_RIGHT]
+    height = wrist[:, 2]
+    assert np.isnan(height[(stamps > 2.0) & (stamps < 2.1)]).all()
+    assert np.nanmax(np.abs(height[(stamps > 2.2) & (stamps < 4.0)])) < 0.05
+    assert_allclose(height[stamps > 4.5], 0.8, atol=0.05)
+    assert made.counters["gated_joints"] > 3
+
+
+def test_late_repeated_and_backward_stamps() -> None:
+    made = fusion()
+    given_frames = frames(3.0)
+    fused = run(made, given_frames)
+    assert made.push("kinect1", given_frames[-2][1], 10 * NANOSECONDS) == []  # repeated
+    assert made.counters["late"] == 1
+    again = run(made, [(sensor, skeleton, now + 20 * NANOSECONDS) for sensor, skeleton, now in frames(3.0)])
+    assert made.counters["resets"] >= 1
+    assert len(again) == len(fused)
+    assert errors(again)[30:].max() < 0.05
+
+
+@pytest.mark.filterwarnings("error")
+def test_joints_that_are_nowhere_are_left_out() -> None:
+    def damaged(seen: Skeleton) -> Skeleton:
+        positions, states = seen.positions.copy(), seen.states.copy()
+        positions[Joint.HAND_LEFT] = np.nan
+        positions[Joint.FOOT_LEFT] = np.inf
+        positions[Joint.HEAD] = 1e30
+        states[Joint.KNEE_RIGHT] = 0
+        return frame(seen.stamp, positions, "kinect1", states)
+
+    nowhere = [Joint.HAND_LEFT, Joint.FOOT_LEFT, Joint.HEAD, Joint.KNEE_RIGHT]
+    alone = [each for each in frames(3.0) if each[0] == "kinect1"]
+    for each in run(fusion(["kinect1"]), changed(alone, "kinect1", damaged)):
+        assert np.isnan(each.positions[nowhere]).all()
+        assert (each.states[nowhere] == 0).all()
+        assert np.isfinite(np.delete(each.positions, nowhere, axis=0)).all()
+    both = run(fusion(), changed(frames(3.0), "kinect1", damaged))
+    assert np.isfinite(both[-1].positions).all()  # the other sensor has them
+    empty = run(fusion(["kinect1"]), changed(alone, "kinect1", lambda s: frame(s.stamp, np.full((25, 3), np.nan))))
+    assert all((each.states == 0).all() for each in empty)
+
+
+# --- calibration
+
+
+def test_nothing_comes_from_a_sensor_that_is_not_calibrated() -> None:
+    made = Fusion(("kinect1", "kinect2"))
+    assert run(made, frames(1.0)) == []
+    assert made.counters["uncalibrated"] == 60
+    made.set_pose(ONE)
+    assert len(run(made, [(s, k, now + 5 * NANOSECONDS) for s, k, now in frames(1.0, start=5.0)])) == 30
+
+
+def test_a_pose_counts_from_its_own_time_on() -> None:
+    made = fusion(["kinect1"])
+    made.set_pose(SensorPose("kinect1", ONE.translation + [0.0, 0.0, 0.5], ONE.quat_xyzw, 2 * NANOSECONDS))
+    alone = [each for each in frames(4.0) if each[0] == "kinect1"]
+    fused = run(made, alone)
+    stamps = np.array([each.stamp for each in fused])
+    spine = np.stack([each.positions[Joint.SPINE_BASE] for each in fused]) - truth(stamps)[:, Joint.SPINE_BASE]
+    assert_allclose(spine[stamps < 2.0, 2], 0.0, atol=1e-9)
+    assert_allclose(spine[stamps > 2.5, 2], 0.5, atol=1e-9)
+
+
+def test_what_nobody_knows_is_counted_or_refused() -> None:
+    made = fusion()
+    assert made.push("kinect9", frames(0.1)[0][1], 0) == []
+    made.set_pose(level_pose("kinect9"))
+    made.set_clock("kinect9", 0, ClockModel())
+    assert made.counters["unknown_sensor"] == 3
+    with pytest.raises(FusionError, match="kinect9"):
+        Fusion(("kinect1",), reference="kinect9")
+    with pytest.raises(FusionError):
+        Fusion(())
+
+
+# --- real sensors
+
+
+@pytest.mark.parametrize("person", ["p02", "p07", "p12"])
+def test_the_shoulders_of_real_people_never_reverse(shared_data: Path, person: str) -> None:
+    """At 90 degrees one sensor sees the body turned around in up to 22 % of its frames."""
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    made = Fusion(("kinect1", "kinect2"))
+    made.set_pose(calibration.current_update().result.poses["kinect1"])
+    fused = []
+    for each in CsvRecording(shared_data / "kinect_pairs" / f"{person}_90deg.csv.gz"):
+        for update in calibration.push(each.sensor, each.skeletons[0], each.received_ns):
+            for name, pose in update.result.poses.items():
+                made.set_clock(name, update.valid_from_ns, update.result.clocks[name])
+                made.set_pose(pose)
+        fused += made.push(each.sensor, each.skeletons[0], each.received_ns)
+    assert made.counters["repaired"] + made.counters["turned"] > 50
+    for half in (0, 1):
+        axes = np.stack([left_right_axes(each.positions)[half] for each in fused])
+        axes = axes[np.isfinite(axes).all(axis=1)]
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        assert np.einsum("ni,ni->n", axes[1:], axes[:-1]).min() > 0.0
+
+
+def test_mirroring_is_its_own_inverse() -> None:
+    assert_allclose(MIRROR[MIRROR], np.arange(25))
