@@ -33,12 +33,9 @@ setup: $(STAMP) ## create .venv with everything in it
 
 # The first Python that is new enough; `make PYTHON=/path/to/python3` chooses another.
 $(STAMP): setup.py setup.cfg
-	@python='$(PYTHON)'; \
-	if [ -z "$$python" ]; then \
-	  for candidate in python3 python3.12 python3.13 python3.11 python3.14; do \
-	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
-	  done; \
-	fi; \
+	@python=; for candidate in $(or $(PYTHON),python3 python3.12 python3.13 python3.11 python3.14); do \
+	  if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
 	if [ -z "$$python" ]; then \
 	  echo "make: no Python >= 3.11 found; install one, or say which: make PYTHON=/path/to/python3" >&2; exit 1; \
 	fi; \
