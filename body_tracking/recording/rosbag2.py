@@ -242,7 +242,7 @@ class BagReader:
         """The files that ``metadata.yaml`` lists; None where it is missing or unreadable."""
         path = self.path / METADATA
         try:
-            information = yaml.safe_load(path.read_text("utf-8"))["rosbag2_bagfile_information"]
+            information = quality.load_yaml(path.read_text("utf-8"))["rosbag2_bagfile_information"]
             storage = str(information["storage_identifier"])
             compression = str(information.get("compression_mode") or "").lower()
             names = [Path(str(name)).name for name in information["relative_file_paths"]]
@@ -500,7 +500,7 @@ class BagWriter:
         self.flush()
         entry = self._entry()
         with self._writing():
-            self._mcap.add_metadata("rosbag2", {"serialized_metadata": _dump(_information([entry]))})
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": quality.dump_yaml(_information([entry]))})
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._sink.synchronise()
         self._shut()
@@ -667,15 +667,11 @@ def _information(entries: Sequence[_Entry]) -> dict[str, Any]:
     }
 
 
-def _dump(content: dict[str, Any]) -> str:
-    return yaml.safe_dump(content, sort_keys=False)
-
-
 def _write_metadata(folder: Path, information: dict[str, Any]) -> None:
     """Replace ``metadata.yaml`` at once: it is whole at any time."""
     draft = folder / f"{METADATA}.tmp"
     with draft.open("w", encoding="utf-8") as file:
-        file.write(_dump({"rosbag2_bagfile_information": information}))
+        file.write(quality.dump_yaml({"rosbag2_bagfile_information": information}))
         file.flush()
         os.fsync(file.fileno())
     draft.replace(folder / METADATA)
