@@ -26,7 +26,7 @@ WORLD = "world"
 CLOCK_JUMP = 1.0
 """A sensor whose stamps go back by more than this starts again, seconds."""
 
-DUE_MARGIN = 0.005
+DUE_MARGIN = 0.002
 """A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
 
 FASTEST = 8.0
@@ -88,9 +88,9 @@ class FusionParameters:
         metadata={"doc": "drop a sensor whose newest frame is older than this", "unit": "s", "min": 0.02, "max": 5.0},
     )
     max_wait: float = field(
-        default=0.01,
+        default=0.05,
         metadata={
-            "doc": "wait at most this long for another sensor's frame that is due",
+            "doc": "wait at most this long for another sensor's frame that is due; 0 for the least delay",
             "unit": "s",
             "min": 0.0,
             "max": 1.0,
@@ -273,39 +273,41 @@ class Fusion:
         Returns:
             The fused skeletons that are complete now, mostly one or none.
         """
+        # What has waited long enough does not know this frame, whether or not somebody polled in between.
+        fused = self.poll(now_ns)
         source = self._sensors.get(sensor)
         if source is None:
             self.counters["unknown_sensor"] += 1
-            return []
+        elif self._accepts(sensor, source, skeleton, now_ns):
+            fused += self.poll(now_ns)
+        return fused
+
+    def _accepts(self, sensor: str, source: _Sensor, skeleton: Skeleton, now_ns: int) -> bool:
+        """Remember a frame, and note whether the output is to answer it; False when it is of no use."""
         if source.frames and skeleton.stamp_ns <= source.frames[-1].stamp_ns:
             if source.frames[-1].stamp_ns - skeleton.stamp_ns < CLOCK_JUMP * NANOSECONDS:
                 self.counters["late"] += 1
-                return self.poll(now_ns)
+                return False
             if sensor == self.reference:
                 self.reset()
             else:
                 source.clear()
                 self.counters["resets"] += 1
-        stamp = source.clock.to_reference(skeleton.stamp_ns)
-        source.activate(stamp)
+        source.activate(source.clock.to_reference(skeleton.stamp_ns))
         stamp = source.clock.to_reference(skeleton.stamp_ns)
         if source.pose(stamp) is None:
             self.counters["uncalibrated"] += 1
-            return self.poll(now_ns)
+            return False
         self._remember(source, skeleton, stamp)
         latest = self._pending[-1][0] if self._pending else self._last_ns
         if latest is None:
-            latest = stamp if source.seen_since is None else source.seen_since
-            answer = sensor == self.reference or stamp - latest > self.parameters.max_output_gap * NANOSECONDS
-        elif stamp <= latest:
-            answer = False
-            if sensor == self.reference:
-                self.counters["late"] += 1
-        else:
-            answer = sensor == self.reference or stamp - latest > self.parameters.max_output_gap * NANOSECONDS
-        if answer:
+            # At the start the reference has the first word.
+            latest = stamp - 1 if sensor == self.reference or source.seen_since is None else source.seen_since
+        if stamp <= latest:
+            self.counters["late"] += sensor == self.reference
+        elif sensor == self.reference or stamp - latest > self.parameters.max_output_gap * NANOSECONDS:
             self._pending.append((stamp, now_ns + round(self.parameters.max_wait * NANOSECONDS)))
-        return self.poll(now_ns)
+        return True
 
     def _remember(self, source: _Sensor, skeleton: Skeleton, stamp: int) -> None:
         known = skeleton.valid

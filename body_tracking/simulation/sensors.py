@@ -45,7 +45,7 @@ class Errors:
     lost: float = 0.015
     lost_run: int = 6
     delay: float = 0.022
-    delay_jitter: float = 0.006
+    delay_jitter: float = 0.003
 
 
 @dataclass(frozen=True, slots=True)
