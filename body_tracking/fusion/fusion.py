@@ -8,7 +8,7 @@ little earlier or later gives the same numbers.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -157,34 +157,55 @@ class _Frame:
     states: np.ndarray
     angle: float
     body: int
+    since_ns: int  # reference time of the first frame of its run, after a silence
 
 
 class _Sensor:
     """The recent frames of one sensor and where and when it is."""
 
     def __init__(self) -> None:
-        self.poses: list[SensorPose] = []  # by valid_from_ns; the first is in force
-        self.clocks: list[tuple[int, ClockModel]] = []
+        self.poses: list[SensorPose] = []  # by valid_from_ns, from the one in force at the last output on
+        self.clocks: list[tuple[int, ClockModel]] = []  # likewise
         self.clear()
 
     def clear(self) -> None:
         self.frames: deque[_Frame] = deque(maxlen=8)
-        self.period = 1.0 / 30.0
-        self.seen_since: int | None = None  # reference time of the first frame after a silence
+        self._steps: deque[float] = deque(maxlen=7)
+
+    def remember(self, frame: _Frame, step: float | None) -> None:
+        """Keep a frame, and how long after the one before it came, if it is of one run with that."""
+        self.frames.append(frame)
+        if step is not None:
+            self._steps.append(step)
 
     @property
-    def clock(self) -> ClockModel:
-        return self.clocks[0][1] if self.clocks else ClockModel()
+    def period(self) -> float:
+        """Seconds between frames, by the median: a lost frame does not make a sensor slower."""
+        return sorted(self._steps)[len(self._steps) // 2] if self._steps else 1.0 / 30.0
 
-    def activate(self, now_ns: int) -> None:
-        """Put the newest pose and clock that are valid by now in force."""
-        while len(self.poses) > 1 and self.poses[1].valid_from_ns <= now_ns:
-            del self.poses[0]
-        while len(self.clocks) > 1 and self.clocks[1][0] <= now_ns:
-            del self.clocks[0]
+    def to_reference(self, sensor_ns: int) -> int:
+        """A stamp of this sensor in the reference's clock, by the relation that is in force then."""
+        found = sensor_ns
+        for index, (valid_from_ns, clock) in enumerate(self.clocks):
+            reference_ns = clock.to_reference(sensor_ns)
+            if index > 0 and reference_ns < valid_from_ns:
+                break
+            found = reference_ns
+        return found
 
     def pose(self, now_ns: int) -> SensorPose | None:
-        return self.poses[0] if self.poses and self.poses[0].valid_from_ns <= now_ns else None
+        """The pose in force at a reference time."""
+        at = bisect_right(self.poses, now_ns, key=_valid_from)
+        return self.poses[at - 1] if at else None
+
+    def forget_before(self, now_ns: int) -> None:
+        """Drop poses and clocks that others have replaced by then."""
+        del self.poses[: max(0, bisect_right(self.poses, now_ns, key=_valid_from) - 1)]
+        del self.clocks[: max(0, bisect_right(self.clocks, now_ns, key=lambda each: each[0]) - 1)]
+
+
+def _valid_from(pose: SensorPose) -> int:
+    return pose.valid_from_ns
 
 
 class Fusion:
@@ -211,7 +232,8 @@ class Fusion:
         self.world = world
         self.counters: Counter[str] = Counter()
         self._sensors = {name: _Sensor() for name in sensors}
-        self._pending: list[tuple[int, int]] = []  # capture time of a frame to be answered, and until when it may wait
+        # Frames that may be answered: capture time, whether not the reference's, and until when it may wait.
+        self._pending: list[tuple[int, bool, int]] = []
         self._forget_output()
 
     def _forget_output(self) -> None:
@@ -248,7 +270,7 @@ class Fusion:
         if sensor is None:
             self.counters["unknown_sensor"] += 1
             return
-        at = bisect_right(sensor.poses, pose.valid_from_ns, key=lambda each: each.valid_from_ns)
+        at = bisect_right(sensor.poses, pose.valid_from_ns, key=_valid_from)
         sensor.poses.insert(at, pose)
 
     def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
@@ -293,20 +315,16 @@ class Fusion:
             else:
                 source.clear()
                 self.counters["resets"] += 1
-        source.activate(source.clock.to_reference(skeleton.stamp_ns))
-        stamp = source.clock.to_reference(skeleton.stamp_ns)
+        stamp = source.to_reference(skeleton.stamp_ns)
+        # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
+        self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:
             self.counters["uncalibrated"] += 1
-            return False
-        self._remember(source, skeleton, stamp)
-        latest = self._pending[-1][0] if self._pending else self._last_ns
-        if latest is None:
-            # At the start the reference has the first word.
-            latest = stamp - 1 if sensor == self.reference or source.seen_since is None else source.seen_since
-        if stamp <= latest:
+        elif self._last_ns is not None and stamp <= self._last_ns:
             self.counters["late"] += sensor == self.reference
-        elif sensor == self.reference or stamp - latest > self.parameters.max_output_gap * NANOSECONDS:
-            self._pending.append((stamp, now_ns + round(self.parameters.max_wait * NANOSECONDS)))
+        else:
+            deadline = now_ns + round(self.parameters.max_wait * NANOSECONDS)
+            insort(self._pending, (stamp, sensor != self.reference, deadline))
         return True
 
     def _remember(self, source: _Sensor, skeleton: Skeleton, stamp: int) -> None:
@@ -314,26 +332,22 @@ class Fusion:
         positions = np.where(known[:, None], skeleton.positions, np.nan)
         states = np.where(known, skeleton.states, 0)
         velocities = np.zeros((N_JOINTS, 3))
-        if source.frames:
-            last = source.frames[-1]
-            step = (skeleton.stamp_ns - last.stamp_ns) / NANOSECONDS
-            if step < self.parameters.silence:
-                # Smoothed over about three frames: the difference of two is mostly noise.
-                share = 1.0 - np.exp(-step / 0.1)
-                change = (positions - last.positions) / step
-                moved = (
-                    np.abs(change).max(axis=1, keepdims=True) < FASTEST
-                )  # False for NaN; a label that jumps is faster
-                velocities = np.where(moved, last.velocities + share * (change - last.velocities), 0.0)
-                source.period += 0.1 * (step - source.period)
-            else:
-                source.seen_since = stamp
+        last = source.frames[-1] if source.frames else None
+        step = np.inf if last is None else (skeleton.stamp_ns - last.stamp_ns) / NANOSECONDS
+        if last is not None and step < self.parameters.silence:
+            # Smoothed over about three frames: the difference of two is mostly noise.
+            share = 1.0 - np.exp(-step / 0.1)
+            change = (positions - last.positions) / step
+            moved = np.abs(change).max(axis=1, keepdims=True) < FASTEST  # False for NaN; a label that jumps is faster
+            velocities = np.where(moved, last.velocities + share * (change - last.velocities), 0.0)
+            since = last.since_ns
         else:
-            source.seen_since = stamp
+            since = stamp
         angle = viewing_angle(positions)
         stddev = joint_stddev(positions, states, angle)
-        source.frames.append(
-            _Frame(skeleton.stamp_ns, positions, velocities, stddev, states, float(angle), skeleton.body)
+        source.remember(
+            _Frame(skeleton.stamp_ns, positions, velocities, stddev, states, float(angle), skeleton.body, since),
+            step if step < self.parameters.silence else None,
         )
 
     def poll(self, now_ns: int) -> list[Skeleton]:
@@ -344,7 +358,11 @@ class Fusion:
         """
         fused = []
         while self._pending:
-            stamp, deadline = self._pending[0]
+            stamp, other, deadline = self._pending[0]
+            # The beat is the reference's; another's frame is answered only when that has been silent for a while.
+            if other and stamp - self._beat(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
+                del self._pending[0]
+                continue
             if now_ns < deadline and self._waits(stamp):
                 break
             del self._pending[0]
@@ -353,12 +371,18 @@ class Fusion:
                 fused.append(skeleton)
         return fused
 
+    def _beat(self, stamp: int) -> int:
+        """When the last output was, or, at the start, when somebody was first seen."""
+        if self._last_ns is not None:
+            return self._last_ns
+        return min((source.frames[0].since_ns for source in self._sensors.values() if source.frames), default=stamp)
+
     def _waits(self, stamp: int) -> bool:
-        """Whether a sensor's frame captured up to a time is due and has not arrived."""
+        """Whether a calibrated sensor's frame captured up to a time is due and has not arrived."""
         for source in self._sensors.values():
-            if not source.frames:
+            if not source.frames or source.pose(stamp) is None:
                 continue
-            age = (stamp - source.clock.to_reference(source.frames[-1].stamp_ns)) / NANOSECONDS
+            age = (stamp - source.to_reference(source.frames[-1].stamp_ns)) / NANOSECONDS
             if 0.0 < age < self.parameters.silence and age > source.period - DUE_MARGIN:
                 return True
         return False
@@ -366,7 +390,7 @@ class Fusion:
     @property
     def deadline_ns(self) -> int | None:
         """When :meth:`poll` should be called, in the clock of ``now_ns``; None while nothing waits."""
-        return self._pending[0][1] if self._pending else None
+        return self._pending[0][2] if self._pending else None
 
     # --- fusion
 
@@ -377,24 +401,23 @@ class Fusion:
         poses: list[SensorPose] = []
         shares: list[float] = []
         for name, source in self._sensors.items():
-            source.activate(stamp)
+            source.forget_before(stamp)
             pose = source.pose(stamp)
             frame = next(
-                (each for each in reversed(source.frames) if source.clock.to_reference(each.stamp_ns) <= stamp), None
+                (each for each in reversed(source.frames) if source.to_reference(each.stamp_ns) <= stamp), None
             )
             if pose is None or frame is None:
                 continue
-            age = (stamp - source.clock.to_reference(frame.stamp_ns)) / NANOSECONDS
+            age = (stamp - source.to_reference(frame.stamp_ns)) / NANOSECONDS
             if age > self.parameters.silence:
                 self.counters["silent"] += 1
                 continue
-            since = stamp if source.seen_since is None else source.seen_since
             fade = self.parameters.fade_in
             names.append(name)
             frames.append(frame)
             ages.append(age)
             poses.append(pose)
-            shares.append(1.0 if fade <= 0.0 else min(1.0, max(0.02, (stamp - since) / NANOSECONDS / fade)))
+            shares.append(1.0 if fade <= 0.0 else min(1.0, max(0.02, (stamp - frame.since_ns) / NANOSECONDS / fade)))
         if not names:
             return None
         self.counters["fused"] += 1

@@ -99,9 +99,14 @@ class LeanExecutor(SingleThreadedExecutor):
 
 
 def _execute_subscriptions(subscriptions: list[Any], wait_set: Any) -> int:
+    """Take one message of each topic that has any, and handle them in the order in which they were sent.
+
+    Two sensors' frames that wait together are then handled as an offline run reads them from the recording.
+    """
     ready = wait_set.get_ready_entities("subscription")
     executed = 0
-    for subscription in subscriptions if ready else ():
+    arrived: list[tuple[int, int, Any]] = []
+    for index, subscription in enumerate(subscriptions if ready else ()):
         handle = subscription.handle
         if handle.pointer not in ready:
             continue
@@ -109,7 +114,11 @@ def _execute_subscriptions(subscriptions: list[Any], wait_set: Any) -> int:
         with handle:
             taken = handle.take_message(subscription.msg_type, subscription.raw)
         if taken is not None:
-            subscription.callback(*(taken[:1] if subscription._callback_type is _MESSAGE_ONLY else taken))
+            arrived.append((taken[1]["source_timestamp"], index, taken))
+    arrived.sort(key=lambda each: each[:2])
+    for _, index, taken in arrived:
+        subscription = subscriptions[index]
+        subscription.callback(*(taken[:1] if subscription._callback_type is _MESSAGE_ONLY else taken))
     return executed
 
 
