@@ -8,6 +8,7 @@ little earlier or later gives the same numbers.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -17,9 +18,10 @@ import numpy as np
 
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
+from body_tracking.fusion.sides import PAIRS, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
-from body_tracking.measurement import joint_stddev, left_right_axes, viewing_angle
-from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
+from body_tracking.measurement import joint_stddev, viewing_angle
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 WORLD = "world"
 
@@ -32,39 +34,17 @@ DUE_MARGIN = 0.002
 FASTEST = 8.0
 """No joint moves faster than this along an axis, metres per second."""
 
+SMOOTHING = 0.1
+"""Time constant of the velocities that carry older frames and the prediction forward, seconds."""
+
 ACCELERATION = 30.0
 """Typical peak acceleration of a limb, m/s^2; what extrapolation and prediction cannot know."""
 
-MORE_FRONTAL = np.pi / 6
-"""A sensor is believed more on left and right when it sees the body this much more from the front, radians ..."""
-
-TRUST_AFTER = 1.0
-"""... for this long, while it agrees with the one believed so far, seconds."""
-
-SAME_SENSE = 0.5
-"""Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
-
-_LOWER = np.isin(
-    np.arange(N_JOINTS), [joint for joint in Joint if joint.name.startswith(("HIP", "KNEE", "ANKLE", "FOOT"))]
-)
-_LATERAL = np.arange(N_JOINTS) != MIRROR
-_HALVES = (np.flatnonzero(_LATERAL & ~_LOWER), np.flatnonzero(_LATERAL & _LOWER))
-"""The joints that have a left and a right: of the upper and of the lower body."""
-
-_PAIRS = (
-    np.array([Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT], dtype=np.intp),
-    np.array([Joint.HIP_LEFT, Joint.HIP_RIGHT], dtype=np.intp),
-)
-"""The ends of their left-right axes."""
-
 _WIDTHS = ((0.15, 0.6), (0.05, 0.4))
-"""Lengths of these axes that can be a person's, as a Kinect sees it, metres."""
+"""Lengths of the left-right axes of shoulders and hips that can be a person's, as a Kinect sees it, metres."""
 
-TURN_RATE = 8.0
-"""A person's shoulders turn no faster than this, radians per second (throwing athletes' trunks reach it)."""
 
-TURN_ONCE = np.pi / 3
-"""... and by no more than this between two outputs, however long they are apart, radians."""
+_DIAGONAL = np.arange(3)
 
 
 class FusionError(BodyTrackingError):
@@ -153,7 +133,7 @@ class _Frame:
     stamp_ns: int
     positions: FloatArray
     velocities: FloatArray
-    stddev: FloatArray
+    variance: FloatArray
     states: np.ndarray
     angle: float
     body: int
@@ -239,17 +219,12 @@ class Fusion:
     def _forget_output(self) -> None:
         self._pending.clear()
         self._last_ns: int | None = None
-        self._position: FloatArray = np.full((N_JOINTS, 3), np.nan)
+        self._position: FloatArray = np.zeros((N_JOINTS, 3))
         self._velocity: FloatArray = np.zeros((N_JOINTS, 3))
         self._known_ns: FloatArray = np.full(N_JOINTS, -np.inf)
         self._rejected_since: dict[str, FloatArray] = {name: np.full(N_JOINTS, np.nan) for name in self._sensors}
-        self._trusted: str | None = None
-        self._trusted_ns = 0
-        self._axes: FloatArray = np.zeros((2, 3))
-        self._heading: FloatArray = np.zeros(2)
-        self._heading_ns: FloatArray = np.full(2, -np.inf)
-        self._better_since: int | None = None
-        self._reversed_since: FloatArray = np.full(2, np.nan)
+        self._rejecting = False
+        self._sides = Sides(self.parameters.turned_hold)
 
     def reset(self) -> None:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""
@@ -329,24 +304,28 @@ class Fusion:
 
     def _remember(self, source: _Sensor, skeleton: Skeleton, stamp: int) -> None:
         known = skeleton.valid
-        positions = np.where(known[:, None], skeleton.positions, np.nan)
-        states = np.where(known, skeleton.states, 0)
-        velocities = np.zeros((N_JOINTS, 3))
+        positions, states = skeleton.positions, skeleton.states
+        if not known.all():
+            positions = np.where(known[:, None], positions, np.nan)
+            states = np.where(known, states, 0)
         last = source.frames[-1] if source.frames else None
-        step = np.inf if last is None else (skeleton.stamp_ns - last.stamp_ns) / NANOSECONDS
+        step = math.inf if last is None else (skeleton.stamp_ns - last.stamp_ns) / NANOSECONDS
         if last is not None and step < self.parameters.silence:
             # Smoothed over about three frames: the difference of two is mostly noise.
-            share = 1.0 - np.exp(-step / 0.1)
+            share = 1.0 - math.exp(-step / SMOOTHING)
             change = (positions - last.positions) / step
-            moved = np.abs(change).max(axis=1, keepdims=True) < FASTEST  # False for NaN; a label that jumps is faster
-            velocities = np.where(moved, last.velocities + share * (change - last.velocities), 0.0)
+            velocities = last.velocities + share * (change - last.velocities)
+            fast = ~(np.abs(change).max(axis=1) < FASTEST)  # and NaN; a label that jumps is faster than a limb
+            if fast.any():
+                velocities[fast] = 0.0
             since = last.since_ns
         else:
+            velocities = np.zeros((N_JOINTS, 3))
             since = stamp
         angle = viewing_angle(positions)
-        stddev = joint_stddev(positions, states, angle)
+        variance = joint_stddev(positions, states, angle) ** 2
         source.remember(
-            _Frame(skeleton.stamp_ns, positions, velocities, stddev, states, float(angle), skeleton.body, since),
+            _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since),
             step if step < self.parameters.silence else None,
         )
 
@@ -421,214 +400,103 @@ class Fusion:
         if not names:
             return None
         self.counters["fused"] += 1
-        gap = np.inf if self._last_ns is None else (stamp - self._last_ns) / NANOSECONDS
         self._last_ns = stamp
         thesis = self.parameters.method != "covariance"
-        ahead = np.zeros(len(ages)) if thesis else np.minimum(ages, self.parameters.extrapolate)
         points = np.stack(
             [
-                pose.apply(frame.positions + step * frame.velocities)
-                for pose, frame, step in zip(poses, frames, ahead.tolist(), strict=True)
+                pose.apply(
+                    frame.positions + (0.0 if thesis else min(age, self.parameters.extrapolate)) * frame.velocities
+                )
+                for pose, frame, age in zip(poses, frames, ages, strict=True)
             ]
         )
         states = np.stack([frame.states for frame in frames])
-        stddev = np.stack([frame.stddev for frame in frames])
+        variance = np.stack([frame.variance for frame in frames])
         body = frames[0].body
         if thesis:
             weights = thesis_text(states) if self.parameters.method == "thesis_text" else thesis_formula(states)
-            return self._combined(stamp, body, points, stddev**2, weights, states)
+            return self._combined(stamp, body, points, variance, weights, states)
         # What moves between a sensor's capture and the output's is not known better than this.
-        variance = stddev**2 + (0.5 * ACCELERATION * np.square(ages))[:, None] ** 2
-        self._settle_sides(stamp, names, frames, points, variance, states)
-        weights = self._gated(stamp, gap, names, points, variance) * np.array(shares)[:, None]
-        fused = self._turned_gently(stamp, self._combined(stamp, body, points, variance, weights, states))
-        self._follow(stamp, gap, fused.positions)
+        variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
+        self._sides.settle(stamp, names, [frame.angle for frame in frames], points, variance, states, self.counters)
+        weights = self._gated(stamp, names, points, variance)
+        if min(shares) < 1.0:
+            weights *= np.array(shares)[:, None]
+        fused = self._combined(stamp, body, points, variance, weights, states)
+        fused = self._sides.turn_gently(stamp, fused, self.counters)
+        self._follow(stamp, fused.positions)
         return fused
 
-    def _turned_gently(self, stamp: int, fused: Skeleton) -> Skeleton:
-        """Turn shoulders and hips, with arms and legs, no faster than a person can.
-
-        When the sensors that are believed change their mind at once about which way a body faces, the output follows
-        them on the way that a body would take, and never through a mirror.
-        """
-        axes = left_right_axes(fused.positions)
-        heading = np.arctan2(axes[:, 1], axes[:, 0])
-        known = np.isfinite(heading)
-        elapsed = (stamp - self._heading_ns) / NANOSECONDS
-        turn = (heading - self._heading + np.pi) % (2 * np.pi) - np.pi
-        most = np.minimum(TURN_RATE * elapsed, TURN_ONCE)
-        excess = np.where(
-            known & (elapsed < TRUST_AFTER) & (np.abs(turn) > most), np.sign(turn) * (np.abs(turn) - most), 0.0
-        )
-        self._heading = np.where(known, heading - excess, self._heading)
-        self._heading_ns = np.where(known, stamp, self._heading_ns)
-        if not excess.any():
-            return fused
-        assert fused.covariances is not None
-        positions, covariances = fused.positions.copy(), fused.covariances.copy()
-        for half in np.flatnonzero(excess):
-            joints, angle = _HALVES[half], -float(excess[half])
-            pair = _PAIRS[half]
-            centre = positions[pair].mean(axis=0)
-            arms = positions[joints] - centre
-            rotation = np.array(
-                [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
-            )
-            moved = arms @ rotation.T
-            # What was turned is as uncertain as it was moved.
-            covariances[joints] += np.einsum("ji,jk->jik", moved - arms, moved - arms)
-            positions[joints] = centre + moved
-        self.counters["turned_gently"] += 1
-        return Skeleton(
-            fused.stamp_ns, fused.frame_id, positions, fused.states, fused.body, covariances, fused.velocities
-        )
-
-    def _settle_sides(
-        self,
-        stamp: int,
-        names: list[str],
-        frames: list[_Frame],
-        points: FloatArray,
-        variance: FloatArray,
-        states: np.ndarray,
-    ) -> None:
-        """Repair or reject, in place, what a sensor sees turned around or with its sides swapped.
-
-        A Kinect takes every body to face it, and sometimes turns only the shoulders. Of sensors that contradict each
-        other one is believed: the one that saw the body from the front while they agreed. Where a sensor's left-right
-        axis is opposite to the believed one, left and right are exchanged; where it is across, only the joints of the
-        midline are kept; upper and lower body each by their own axis.
-        """
-        axes = left_right_axes(points)
-        axes[..., 2] = 0.0
-        length = np.linalg.norm(axes, axis=-1)
-        usable = np.isfinite(length) & (length > 0.02)
-        units = np.where(usable[..., None], axes / np.where(usable, length, 1.0)[..., None], 0.0)
-        if not usable.any():
-            return
-        believed = self._believed(stamp, names, frames, units, usable)
-        agreement = np.einsum("kai,ai->ka", units, believed)
-        for index, half in np.argwhere(usable & (agreement < SAME_SENSE)):
-            joints = _HALVES[half]
-            if agreement[index, half] < -SAME_SENSE:
-                other = MIRROR[joints]
-                points[index, joints] = points[index, other]
-                variance[index, joints] = 2.0 * variance[index, other]
-                states[index, joints] = states[index, other]
-                self.counters["repaired"] += 1
-            else:
-                variance[index, joints] = np.inf
-                self.counters["turned"] += 1
-
-    def _believed(
-        self, stamp: int, names: list[str], frames: list[_Frame], units: FloatArray, usable: BoolArray
-    ) -> FloatArray:
-        """(2, 3) the axes of shoulders and hips that are taken for true.
-
-        They are those of the believed sensor; another takes over that sees the body more from the front for a while and
-        agrees with it. While the believed one is missing for a moment, its last axes stand.
-        """
-        angles = np.where(usable[:, 0], [frame.angle for frame in frames], np.inf)
-        recent = self._trusted is not None and stamp - self._trusted_ns <= TRUST_AFTER * NANOSECONDS
-        if self._trusted in names and usable[names.index(self._trusted)].all():
-            trusted = names.index(self._trusted)
-        elif recent:
-            return self._axes
-        else:
-            trusted = int(np.argmin(angles))
-            self._reversed_since[:] = np.nan
-        agreeing = usable[:, 0] & (units[:, 0] @ units[trusted, 0] > np.cos(np.pi / 4))
-        better = int(np.argmin(np.where(agreeing, angles, np.inf)))
-        if angles[trusted] - angles[better] <= MORE_FRONTAL:
-            self._better_since = None
-        elif self._better_since is None:
-            self._better_since = stamp
-        elif stamp - self._better_since > TRUST_AFTER * NANOSECONDS:
-            trusted, self._better_since = better, None
-        self._axes = self._senses(stamp, units[trusted], recent)[:, None] * units[trusted]
-        self._trusted, self._trusted_ns = names[trusted], stamp
-        return self._axes
-
-    def _senses(self, stamp: int, axes: FloatArray, recent: bool) -> FloatArray:
-        """(2,) of +1, or -1 while the believed sensor has just turned shoulders or hips around between two frames."""
-        against = recent & (np.einsum("ai,ai->a", self._axes, axes) < -SAME_SENSE)
-        self._reversed_since[~against] = np.nan
-        self._reversed_since[against & np.isnan(self._reversed_since)] = stamp
-        held = against & (stamp - self._reversed_since <= self.parameters.turned_hold * NANOSECONDS)
-        self.counters["reversals_accepted"] += int((against & ~held).sum())
-        return np.where(held, -1.0, 1.0)
-
-    def _gated(self, stamp: int, gap: float, names: list[str], points: FloatArray, variance: FloatArray) -> FloatArray:
+    def _gated(self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray) -> FloatArray:
         """(k, 25) weights: the inverse variances, less for joints away from their prediction, none beyond the gate."""
-        finite = np.isfinite(variance) & np.isfinite(points[..., 0])
-        weights = np.where(finite, 1.0 / np.where(finite, variance, 1.0), 0.0)
-        elapsed = np.where(np.isfinite(self._known_ns), (stamp - self._known_ns) / NANOSECONDS, np.inf)
-        predictable = elapsed < self.parameters.reacquire
-        if not predictable.any():
-            return weights
-        step = np.where(predictable, elapsed, 0.0)
-        predicted = self._position + step[:, None] * self._velocity
-        spread = 0.03**2 + (0.5 * ACCELERATION * step**2 + 0.5 * step) ** 2
-        total = np.where(finite, variance, 1.0) + spread
-        squared = np.square(points - predicted).sum(axis=2) / total
-        far = finite & predictable & (squared > self.parameters.gate**2)
+        # A joint that is nowhere has an infinite variance; one without a recent past has an infinite prediction error.
+        weights = 1.0 / variance
+        elapsed = (stamp - self._known_ns) / NANOSECONDS
+        spread = 0.03**2 + (0.5 * ACCELERATION * elapsed**2 + 0.5 * elapsed) ** 2
+        spread[elapsed > self.parameters.reacquire] = np.inf
+        away = points - (self._position + np.minimum(elapsed, 1.0)[:, None] * self._velocity)
+        squared = np.einsum("kji,kji->kj", away, away) / (variance + spread)
+        far = squared > self.parameters.gate**2  # False for NaN
+        if far.any() or self._rejecting:
+            self._judge(stamp, names, far)
+        # Both shoulders and both hips from the same sensors, or the axis between them means nothing; and the believed
+        # sensor's at once, when it has turned them as a whole.
+        believed = names.index(self._sides.trusted) if self._sides.trusted in names else None
+        for pair, (least, most) in zip(PAIRS, _WIDTHS, strict=True):
+            far[:, pair] |= far[:, pair[::-1]]
+            if believed is not None and least < math.dist(*points[believed, pair].tolist()) < most:
+                far[believed, pair] = False
+                squared[believed, pair] = 0.0
+        weights /= 1.0 + squared / 4.0
+        weights[far | ~np.isfinite(weights)] = 0.0
+        self.counters["gated_joints"] += int(np.count_nonzero(far))
+        return weights
+
+    def _judge(self, stamp: int, names: list[str], far: BoolArray) -> None:
+        """Believe, in place, a sensor again that has insisted on a rejected joint for long enough."""
         for index, name in enumerate(names):
             since = self._rejected_since[name]
             since[~far[index]] = np.nan
             since[far[index] & np.isnan(since)] = stamp
-            insists = far[index] & (stamp - since > self.parameters.reacquire * NANOSECONDS)
-            far[index] &= ~insists
-        # Both shoulders and both hips from the same sensors, or the axis between them means nothing; and the believed
-        # sensor's at once, when it has turned them as a whole.
-        for pair, (least, most) in zip(_PAIRS, _WIDTHS, strict=True):
-            far[:, pair] = far[:, pair].any(axis=1, keepdims=True)
-            if self._trusted in names:
-                believed = names.index(self._trusted)
-                if least < np.linalg.norm(points[believed, pair[0]] - points[believed, pair[1]]) < most:
-                    far[believed, pair] = False
-                    squared[believed, pair] = 0.0
-        self.counters["gated_joints"] += int(far.sum())
-        soft = np.where(predictable & finite, 1.0 / (1.0 + squared / 4.0), 1.0)
-        return np.where(far, 0.0, weights * soft)
+            far[index] &= stamp - since <= self.parameters.reacquire * NANOSECONDS
+        self._rejecting = any(not np.isnan(since).all() for since in self._rejected_since.values())
 
     def _combined(
         self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
     ) -> Skeleton:
         """The weighted mean (eq. 5.8), with the covariance that the sensors claim, or their disagreement if larger."""
-        used = (weights > 0.0) & np.isfinite(points[..., 0])
-        weights = np.where(used, weights, 0.0)
+        used = weights > 0.0
+        if not used.all():
+            used &= np.isfinite(points[..., 0])
+            weights = np.where(used, weights, 0.0)
+            points = np.where(used[..., None], points, 0.0)
+            variance = np.where(used, variance, 0.0)
+            states = np.where(used, states, 0)
         total = weights.sum(axis=0)
         known = total > 0.0
         share = weights / np.where(known, total, 1.0)
-        points = np.where(used[..., None], points, 0.0)
         mean = np.einsum("kj,kji->ji", share, points)
-        away = np.where(used[..., None], points - mean, 0.0)
-        finite = np.where(used & np.isfinite(variance), variance, 0.0)
-        claimed = np.einsum("kj,kj->j", share**2, finite)
+        away = points - mean
+        claimed = np.einsum("kj,kj,kj->j", share, share, variance)
         covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
         # Only what they disagree beyond their claims: for two sensors the larger of both along their difference.
-        spread = np.trace(covariance, axis1=1, axis2=2)
+        spread = np.einsum("jii->j", covariance)
         covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]
-        covariance[:, [0, 1, 2], [0, 1, 2]] += claimed[:, None]
-        return Skeleton(
-            stamp,
-            self.world,
-            np.where(known[:, None], mean, np.nan),
-            np.where(used, states, 0).max(axis=0).astype(np.uint8),
-            body,
-            np.where(known[:, None, None], covariance, np.nan),
-        )
+        covariance[:, _DIAGONAL, _DIAGONAL] += claimed[:, None]
+        if not known.all():
+            mean[~known], covariance[~known] = np.nan, np.nan
+        return Skeleton(stamp, self.world, mean, states.max(axis=0), body, covariance)
 
-    def _follow(self, stamp: int, gap: float, positions: FloatArray) -> None:
+    def _follow(self, stamp: int, positions: FloatArray) -> None:
         """Keep position and smoothed velocity of the output for the next prediction."""
         known = np.isfinite(positions[:, 0])
-        if gap < self.parameters.reacquire:
-            elapsed = (stamp - self._known_ns) / NANOSECONDS
-            recent = known & (elapsed < self.parameters.reacquire)
-            change = (positions - self._position) / np.where(recent, elapsed, 1.0)[:, None]
-            smoothing = (1.0 - np.exp(-np.where(recent, elapsed, 0.0) / 0.1))[:, None]
-            self._velocity = np.where(recent[:, None], self._velocity + smoothing * (change - self._velocity), 0.0)
+        elapsed = (stamp - self._known_ns) / NANOSECONDS
+        smoothing = (1.0 - np.exp(-elapsed / SMOOTHING))[:, None]
+        velocity = self._velocity + smoothing * ((positions - self._position) / elapsed[:, None] - self._velocity)
+        velocity[~(elapsed < self.parameters.reacquire)] = 0.0
+        if known.all():
+            self._position, self._velocity, self._known_ns = positions, velocity, np.full(N_JOINTS, float(stamp))
         else:
-            self._velocity = np.zeros((N_JOINTS, 3))
-        self._position = np.where(known[:, None], positions, self._position)
-        self._known_ns = np.where(known, stamp, self._known_ns)
+            self._position = np.where(known[:, None], positions, self._position)
+            self._velocity = np.where(known[:, None], velocity, self._velocity)
+            self._known_ns = np.where(known, stamp, self._known_ns)

@@ -1,0 +1,217 @@
+"""Which way a person faces, when sensors disagree about left and right.
+
+A Kinect takes every body to face it, and sometimes turns only the shoulders. Upper and lower body each have a heading
+here, the direction of their left-right axis in the horizontal plane of ``world``; it is a plain number, because the
+arithmetic of two angles per sensor is cheaper without arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
+
+SAME_SENSE = 0.5
+"""Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
+
+MORE_FRONTAL = math.pi / 6
+"""A sensor is believed more on left and right when it sees the body this much more from the front, radians ..."""
+
+TRUST_AFTER = round(1.0 * NANOSECONDS)
+"""... for this long, while it agrees with the one believed so far, nanoseconds."""
+
+TURN_RATE = 8.0
+"""A person's shoulders turn no faster than this, radians per second (throwing athletes' trunks reach it)."""
+
+TURN_ONCE = math.pi / 3
+"""... and by no more than this between two outputs, however long they are apart, radians."""
+
+_SHORTEST = 0.02
+"""An axis shorter than this has no direction, metres."""
+
+PAIRS = (
+    np.array([Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT], dtype=np.intp),
+    np.array([Joint.HIP_LEFT, Joint.HIP_RIGHT], dtype=np.intp),
+)
+"""The ends of the left-right axes of the upper and of the lower body."""
+
+_ENDS = np.concatenate(PAIRS)
+_LOWER = np.isin(
+    np.arange(N_JOINTS), [joint for joint in Joint if joint.name.startswith(("HIP", "KNEE", "ANKLE", "FOOT"))]
+)
+_LATERAL = np.arange(N_JOINTS) != MIRROR
+HALVES = (np.flatnonzero(_LATERAL & ~_LOWER), np.flatnonzero(_LATERAL & _LOWER))
+"""The joints that have a left and a right: of the upper and of the lower body."""
+
+
+def _headings(ends: Sequence[Sequence[float]]) -> list[float]:
+    """The headings of both halves from the (x, y) of their four ends, radians; NaN for an axis without direction."""
+    found = []
+    for (left_x, left_y, *_), (right_x, right_y, *_) in (ends[0:2], ends[2:4]):
+        x, y = left_x - right_x, left_y - right_y
+        found.append(math.atan2(y, x) if math.hypot(x, y) > _SHORTEST else math.nan)
+    return found
+
+
+class Sides:
+    """Decides whom to believe on left and right, and keeps the output from turning faster than a person can.
+
+    Args:
+        hold: seconds for which a reversal that all sensors see at once is not believed.
+    """
+
+    def __init__(self, hold: float) -> None:
+        self._hold_ns = round(hold * NANOSECONDS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self.trusted: str | None = None
+        self._trusted_ns = 0
+        self._better_since: int | None = None
+        self._axes = [math.nan, math.nan]  # headings taken for true
+        self._reversed_since: list[int | None] = [None, None]
+        self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
+
+    def settle(
+        self,
+        stamp: int,
+        names: Sequence[str],
+        angles: Sequence[float],
+        points: FloatArray,
+        variance: FloatArray,
+        states: np.ndarray,
+        counters: Counter[str],
+    ) -> None:
+        """Repair or reject, in place, what a sensor sees turned around or with its sides swapped.
+
+        Where a sensor's left-right axis is opposite to the believed one, left and right are exchanged; where it is
+        across, only the joints of the midline are kept; upper and lower body each by their own axis.
+
+        Args:
+            stamp: reference time, nanoseconds.
+            names: k sensors.
+            angles: k angles under which they see the body, radians.
+            points: (k, 25, 3) metres in world.
+            variance: (k, 25) square metres.
+            states: (k, 25).
+            counters: counts ``repaired``, ``turned`` and ``reversals_accepted``.
+        """
+        headings = [_headings(ends) for ends in points[:, _ENDS].tolist()]
+        believed = self._believed(stamp, names, angles, headings, counters)
+        for index, found in enumerate(headings):
+            for half, joints in enumerate(HALVES):
+                agreement = math.cos(found[half] - believed[half])
+                if not agreement < SAME_SENSE:  # NaN for an axis that is not known: nothing to be said
+                    continue
+                if agreement < -SAME_SENSE:
+                    other = MIRROR[joints]
+                    points[index, joints] = points[index, other]
+                    variance[index, joints] = 2.0 * variance[index, other]
+                    states[index, joints] = states[index, other]
+                    counters["repaired"] += 1
+                else:
+                    variance[index, joints] = np.inf
+                    counters["turned"] += 1
+
+    def _believed(
+        self,
+        stamp: int,
+        names: Sequence[str],
+        angles: Sequence[float],
+        headings: list[list[float]],
+        counters: Counter[str],
+    ) -> list[float]:
+        """The headings that are taken for true.
+
+        They are those of the believed sensor; another takes over that sees the body more from the front for a while
+        and agrees with it. While the believed one is missing for a moment, its last headings stand.
+        """
+        known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
+        recent = self.trusted is not None and stamp - self._trusted_ns <= TRUST_AFTER
+        trusted = next((index for index in known if names[index] == self.trusted), None)
+        if trusted is None:
+            if recent or not known:
+                return self._axes
+            trusted = min(known, key=lambda index: angles[index])
+            self._reversed_since = [None, None]
+        upper = headings[trusted][0]
+        agreeing = [index for index in known if math.cos(headings[index][0] - upper) > math.sqrt(0.5)]
+        better = min(agreeing, key=lambda index: angles[index])
+        if angles[trusted] - angles[better] <= MORE_FRONTAL:
+            self._better_since = None
+        elif self._better_since is None:
+            self._better_since = stamp
+        elif stamp - self._better_since > TRUST_AFTER:
+            trusted, self._better_since = better, None
+        self._axes = [
+            self._held(stamp, half, heading, recent, counters) for half, heading in enumerate(headings[trusted])
+        ]
+        self.trusted, self._trusted_ns = names[trusted], stamp
+        return self._axes
+
+    def _held(self, stamp: int, half: int, heading: float, recent: bool, counters: Counter[str]) -> float:
+        """The heading, or its opposite while the believed sensor has just turned the body around between two frames."""
+        if not (recent and math.cos(self._axes[half] - heading) < -SAME_SENSE):
+            self._reversed_since[half] = None
+            return heading
+        since = self._reversed_since[half]
+        if since is None:
+            since = self._reversed_since[half] = stamp
+        if stamp - since <= self._hold_ns:
+            return heading + math.pi
+        counters["reversals_accepted"] += 1
+        return heading
+
+    def turn_gently(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
+        """Turn shoulders and hips, with arms and legs, no faster than a person can.
+
+        When the believed sensors change their mind at once about which way a body faces, the output follows them on
+        the way that a body would take, and never through a mirror.
+
+        Args:
+            stamp: reference time, nanoseconds.
+            fused: with covariances.
+            counters: counts ``turned_gently``.
+        """
+        for half, heading in enumerate(_headings(fused.positions[_ENDS].tolist())):
+            if math.isnan(heading):
+                continue
+            before, before_ns = self._output[half]
+            excess = 0.0
+            if stamp - before_ns < TRUST_AFTER and not math.isnan(before):
+                turn = math.remainder(heading - before, math.tau)
+                most = min(TURN_RATE * (stamp - before_ns) / NANOSECONDS, TURN_ONCE)
+                excess = math.copysign(max(abs(turn) - most, 0.0), turn)
+            self._output[half] = heading - excess, stamp
+            if excess:
+                fused = _turned(fused, half, -excess)
+                counters["turned_gently"] += 1
+        return fused
+
+
+def _turned(skeleton: Skeleton, half: int, angle: float) -> Skeleton:
+    """One half of a body turned about the vertical through the middle of its axis."""
+    assert skeleton.covariances is not None
+    positions, covariances = skeleton.positions.copy(), skeleton.covariances.copy()
+    joints = HALVES[half]
+    centre = positions[PAIRS[half]].mean(axis=0)
+    arms = positions[joints] - centre
+    cosine, sine = math.cos(angle), math.sin(angle)
+    moved = arms @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    # What was turned is as uncertain as it was moved.
+    covariances[joints] += np.einsum("ji,jk->jik", moved - arms, moved - arms)
+    positions[joints] = centre + moved
+    return Skeleton(
+        skeleton.stamp_ns,
+        skeleton.frame_id,
+        positions,
+        skeleton.states,
+        skeleton.body,
+        covariances,
+        skeleton.velocities,
+    )
