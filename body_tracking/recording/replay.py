@@ -12,67 +12,29 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from body_tracking import graph
-from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
-from body_tracking.calibration.storage import load
-from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
+from body_tracking.calibration.online import CalibrationParameters
+from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.filters import FILTERS, LinearKalmanParameters, make_filter
-from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.filters import FILTERS, LinearKalmanParameters
+from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages import (
-    JOINT_STATE,
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    clock_to_time_reference,
-    cloud_to_skeletons,
-    pose_to_transform,
-    time_reference_to_clock,
-    transform_to_pose,
-)
+from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
 from body_tracking.parameters import Value, check_all, fields_of, matches, parameters_from, read_file
-from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize, serialize
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.stages import DEFAULT_FILTER, ReplaySettings, Sink, Upstream, start_downstream
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
-DEFAULT_FILTER = "lkf_constant_velocity"
 _JUMP_BACK_NS = NANOSECONDS
 _P = TypeVar("_P")
 
 
 class ReplayError(BodyTrackingError):
     """The bag holds nothing to run the graph on."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReplaySettings:
-    """What the offline graph is to do; defaults as the nodes'.
-
-    Attributes:
-        sensors: the first is the reference unless ``reference`` says otherwise.
-        reference: or empty.
-        filter_name: one of the filters.
-        body: the id in topics and names of angles.
-        calibration: parameters of the calibration.
-        fusion: parameters of the fusion.
-        filter_parameters: parameters of the filter.
-        calibration_file: start from this calibration; None for none.
-    """
-
-    sensors: tuple[str, ...]
-    reference: str = ""
-    filter_name: str = DEFAULT_FILTER
-    body: str = graph.DEFAULT_BODY
-    calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
-    fusion: FusionParameters = field(default_factory=FusionParameters)
-    filter_parameters: Mapping[str, Any] = field(default_factory=dict)
-    calibration_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,91 +110,6 @@ def skeletons_of(
         yield sensor, subject, raw.log_time_ns, raw.cdr
 
 
-class OfflineGraph:
-    """Calibration, fusion, filter and angles in one process, connected by their messages.
-
-    Args:
-        settings: what to run.
-        writer: where everything goes; None to only compute.
-    """
-
-    def __init__(self, settings: ReplaySettings, writer: BagWriter | None = None) -> None:
-        self.settings = settings
-        self.counters: Counter[str] = Counter()
-        self.frames = 0
-        reference = settings.reference or None
-        self.calibration = OnlineCalibration(settings.sensors, settings.calibration, reference)
-        if settings.calibration_file is not None:
-            self.calibration.load(load(settings.calibration_file))
-        self.fusion = Fusion(settings.sensors, settings.fusion, reference)
-        self.filter = make_filter(settings.filter_name, **settings.filter_parameters)
-        self._writer = writer
-        self._states = graph.joint_states_topic(settings.body)
-        self._stddevs = graph.joint_states_stddev_topic(settings.body)
-        if writer is not None:
-            for topic, kind, qos in (
-                (graph.CALIBRATION, TRANSFORM, LATCHED),
-                (graph.CALIBRATION_CLOCK, TIME_REFERENCE, LATCHED),
-                (graph.FUSED, POINT_CLOUD, SENSOR_DATA),
-                (graph.FILTERED, POINT_CLOUD, SENSOR_DATA),
-                (self._states, JOINT_STATE, RELIABLE),
-                (self._stddevs, JOINT_STATE, RELIABLE),
-            ):
-                writer.add_topic(topic, kind, qos)
-        self._started = False
-
-    def push(self, sensor: str, skeleton: Skeleton, log_time_ns: int) -> None:
-        """One frame of one sensor."""
-        if not self._started:
-            self._started = True
-            self._calibrated(self.calibration.current_update(), log_time_ns)
-        for update in self.calibration.push(sensor, skeleton, log_time_ns):
-            self._calibrated(update, log_time_ns)
-        for fused in self.fusion.push(sensor, skeleton, log_time_ns):
-            self._fused(fused, log_time_ns)
-
-    def finish(self, log_time_ns: int) -> None:
-        """What still waits for a frame that does not come."""
-        deadline = self.fusion.deadline_ns
-        if deadline is not None:
-            for fused in self.fusion.poll(max(deadline, log_time_ns)):
-                self._fused(fused, log_time_ns)
-
-    def _calibrated(self, update: CalibrationUpdate, log_time_ns: int) -> None:
-        result = update.result
-        for sensor, clock in result.clocks.items():
-            if sensor != result.reference:
-                reference = clock_to_time_reference(sensor, clock, update.valid_from_ns, BAG_MESSAGES)
-                self._write(graph.CALIBRATION_CLOCK, serialize(reference), log_time_ns)
-                self.fusion.set_clock(*time_reference_to_clock(reference))
-        for pose in result.poses.values():
-            transform = pose_to_transform(pose, self.fusion.world, BAG_MESSAGES)
-            self._write(graph.CALIBRATION, serialize(transform), log_time_ns)
-            self.fusion.set_pose(transform_to_pose(transform))
-
-    def _fused(self, skeleton: Skeleton, log_time_ns: int) -> None:
-        filtered = self.filter.update(self._through(graph.FUSED, skeleton, log_time_ns))
-        if filtered is None:
-            return
-        arrived = self._through(graph.FILTERED, filtered, log_time_ns)
-        states, stddevs = encode_angles(positional_angles(arrived), self.settings.body, arrived.frame_id)
-        self.frames += 1
-        self._write(self._states, states, log_time_ns)
-        self._write(self._stddevs, stddevs, log_time_ns)
-
-    def _through(self, topic: str, skeleton: Skeleton, log_time_ns: int) -> Skeleton:
-        """The skeleton as whoever subscribes gets it: in single precision."""
-        cdr = encode_skeletons([skeleton])
-        self._write(topic, cdr, log_time_ns)
-        arrived = decode_skeletons(cdr)
-        assert arrived is not None
-        return arrived[0]
-
-    def _write(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
-        if self._writer is not None:
-            self._writer.write(topic, cdr, log_time_ns)
-
-
 class Progress:
     """A percentage on stderr, where that is a terminal."""
 
@@ -269,35 +146,37 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         CalibrationError: the calibration file belongs to other sensors.
     """
     began = time.perf_counter()
+    counters: Counter[str] = Counter()
     with BagReader(bag_path) as bag:
         topics = sensor_topics(bag, settings.sensors)
-        passed = [topic for topic in bag.topics if topic in topics or topic.startswith("/ground_truth/")]
-        settings = _with_sensors(settings, tuple(topics.values()))
-        with BagWriter(out, overwrite=overwrite) as writer:
-            for topic in passed:
-                writer.add_topic(topic, bag.topics[topic].type_name, bag.topics[topic].qos)
-            offline = OfflineGraph(settings, writer)
+        settings = replace(settings, sensors=tuple(topics.values()))
+        truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
+        passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in (*topics, *truth)}
+        downstream = start_downstream(settings, out, passed, overwrite=overwrite)
+        try:
+            upstream = Upstream(settings, downstream)
             progress = Progress(bag.start_ns, bag.end_ns)
-            last = bag.start_ns
-            counters = offline.counters
-            truth = _Passed(bag, [topic for topic in passed if topic not in topics], writer)
+            beside = _Passed(bag, truth, downstream)
             for sensor, skeleton, log_time_ns, cdr in skeletons_of(bag, topics, counters):
-                truth.until(log_time_ns)
-                writer.write(graph.skeleton_topic(sensor), cdr, log_time_ns)
-                offline.push(sensor, skeleton, log_time_ns)
+                beside.until(log_time_ns)
+                downstream.take(graph.skeleton_topic(sensor), cdr, log_time_ns)
+                upstream.push(sensor, skeleton, log_time_ns)
                 progress.at(log_time_ns)
-                last = log_time_ns
-            truth.until(None)
-            offline.finish(last)
-            progress.end()
-        if not offline.frames:
+            beside.until(None)
+            upstream.finish(bag.end_ns)
+            written = downstream.finish()
+        except BaseException:
+            downstream.abandon()
+            raise
+        progress.end()
+        if not written.frames:
             raise ReplayError(
                 f"{bag_path}: no frame of {', '.join(settings.sensors)} came through ({_listed(counters)})"
             )
-        counters.update({f"fusion {name}": count for name, count in offline.fusion.counters.items()})
-        counters.update({f"filter {name}": count for name, count in offline.filter.counters.items()})
+        counters.update({f"fusion {name}": count for name, count in upstream.fusion.counters.items()})
+        counters.update({f"filter {name}": count for name, count in written.counters.items()})
         return ReplayReport(
-            offline.frames,
+            written.frames,
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
             {name: count for name, count in sorted(counters.items()) if count},
@@ -308,24 +187,19 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
 class _Passed:
     """Messages that go from one bag to the other as they are, in step with the rest."""
 
-    def __init__(self, bag: BagReader, topics: Collection[str], writer: BagWriter) -> None:
+    def __init__(self, bag: BagReader, topics: Collection[str], sink: Sink) -> None:
         self._messages = iter(bag.messages(topics)) if topics else iter(())
         self._next = next(self._messages, None)
-        self._writer = writer
+        self._sink = sink
 
     def until(self, log_time_ns: int | None) -> None:
         while self._next is not None and (log_time_ns is None or self._next.log_time_ns <= log_time_ns):
-            self._writer.write(self._next.topic, self._next.cdr, self._next.log_time_ns)
+            self._sink.take(self._next.topic, self._next.cdr, self._next.log_time_ns)
             self._next = next(self._messages, None)
 
 
 def _listed(counters: Mapping[str, int]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in sorted(counters.items())) or "nothing at all"
-
-
-def _with_sensors(settings: ReplaySettings, sensors: tuple[str, ...]) -> ReplaySettings:
-    values = {name: getattr(settings, name) for name in ReplaySettings.__slots__}
-    return ReplaySettings(**(values | {"sensors": sensors}))
 
 
 # --- the command

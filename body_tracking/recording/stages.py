@@ -1,0 +1,298 @@
+"""The graph offline in two stages that only messages connect: what sees sensors, and what writes results.
+
+The second stage runs in a process of its own where the system can fork, because each takes about half of the time; the
+messages, their order and the numbers are the same either way.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol
+
+from body_tracking import graph
+from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
+from body_tracking.calibration.storage import load
+from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
+from body_tracking.filters import make_filter
+from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.messages import (
+    JOINT_STATE,
+    POINT_CLOUD,
+    TIME_REFERENCE,
+    TRANSFORM,
+    clock_to_time_reference,
+    pose_to_transform,
+    time_reference_to_clock,
+    transform_to_pose,
+)
+from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, serialize
+from body_tracking.skeleton import Skeleton
+
+DEFAULT_FILTER = "lkf_constant_velocity"
+
+_BATCH = 128
+"""Messages that go through the pipe at once: each trip costs as much as several of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySettings:
+    """What the offline graph is to do; defaults as the nodes'.
+
+    Attributes:
+        sensors: the first is the reference unless ``reference`` says otherwise.
+        reference: or empty.
+        filter_name: one of the filters.
+        body: the id in topics and names of angles.
+        calibration: parameters of the calibration.
+        fusion: parameters of the fusion.
+        filter_parameters: parameters of the filter.
+        calibration_file: start from this calibration; None for none.
+    """
+
+    sensors: tuple[str, ...]
+    reference: str = ""
+    filter_name: str = DEFAULT_FILTER
+    body: str = graph.DEFAULT_BODY
+    calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
+    fusion: FusionParameters = field(default_factory=FusionParameters)
+    filter_parameters: Mapping[str, Any] = field(default_factory=dict)
+    calibration_file: Path | None = None
+
+
+class Sink(Protocol):
+    """Where a stage's messages go."""
+
+    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One serialised message."""
+
+
+class Upstream:
+    """Calibration and fusion, connected by their messages.
+
+    Args:
+        settings: what to run.
+        sink: gets every message that the two publish.
+    """
+
+    def __init__(self, settings: ReplaySettings, sink: Sink) -> None:
+        reference = settings.reference or None
+        self.calibration = OnlineCalibration(settings.sensors, settings.calibration, reference)
+        if settings.calibration_file is not None:
+            self.calibration.load(load(settings.calibration_file))
+        self.fusion = Fusion(settings.sensors, settings.fusion, reference)
+        self._sink = sink
+        self._started = False
+
+    def push(self, sensor: str, skeleton: Skeleton, log_time_ns: int) -> None:
+        """One frame of one sensor."""
+        if not self._started:
+            self._started = True
+            self._calibrated(self.calibration.current_update(), log_time_ns)
+        for update in self.calibration.push(sensor, skeleton, log_time_ns):
+            self._calibrated(update, log_time_ns)
+        for fused in self.fusion.push(sensor, skeleton, log_time_ns):
+            self._sink.take(graph.FUSED, encode_skeletons([fused]), log_time_ns)
+
+    def finish(self, log_time_ns: int) -> None:
+        """What still waits for a frame that does not come."""
+        while self.fusion.deadline_ns is not None:
+            for fused in self.fusion.poll(self.fusion.deadline_ns):
+                self._sink.take(graph.FUSED, encode_skeletons([fused]), log_time_ns)
+
+    def _calibrated(self, update: CalibrationUpdate, log_time_ns: int) -> None:
+        result = update.result
+        for sensor, clock in result.clocks.items():
+            if sensor != result.reference:
+                reference = clock_to_time_reference(sensor, clock, update.valid_from_ns, BAG_MESSAGES)
+                self._sink.take(graph.CALIBRATION_CLOCK, serialize(reference), log_time_ns)
+                self.fusion.set_clock(*time_reference_to_clock(reference))
+        for pose in result.poses.values():
+            transform = pose_to_transform(pose, self.fusion.world, BAG_MESSAGES)
+            self._sink.take(graph.CALIBRATION, serialize(transform), log_time_ns)
+            self.fusion.set_pose(transform_to_pose(transform))
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What the second stage did.
+
+    Attributes:
+        frames: joint angle messages.
+        counters: of the filter.
+    """
+
+    frames: int
+    counters: Mapping[str, int]
+
+
+class Downstream:
+    """Writes every message, and filters the fused skeletons and turns them to angles.
+
+    Args:
+        settings: what to run.
+        out: the bag to be made.
+        topics: type and QoS of further topics that will be written.
+        overwrite: replace ``out`` if it is there.
+
+    Raises:
+        BagError: ``out`` cannot be written.
+        FilterError: the filter or its parameters make no sense.
+    """
+
+    def __init__(
+        self, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], *, overwrite: bool
+    ) -> None:
+        self._filter = make_filter(settings.filter_name, **settings.filter_parameters)
+        self._body = settings.body
+        self._states = graph.joint_states_topic(settings.body)
+        self._stddevs = graph.joint_states_stddev_topic(settings.body)
+        self._frames = 0
+        self._writer = BagWriter(out, overwrite=overwrite)
+        published = {
+            graph.CALIBRATION: (TRANSFORM, LATCHED),
+            graph.CALIBRATION_CLOCK: (TIME_REFERENCE, LATCHED),
+            graph.FUSED: (POINT_CLOUD, SENSOR_DATA),
+            graph.FILTERED: (POINT_CLOUD, SENSOR_DATA),
+            self._states: (JOINT_STATE, RELIABLE),
+            self._stddevs: (JOINT_STATE, RELIABLE),
+        }
+        for topic, (type_name, qos) in {**topics, **published}.items():
+            self._writer.add_topic(topic, type_name, qos)
+
+    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One serialised message."""
+        self._writer.write(topic, cdr, log_time_ns)
+        if topic == graph.FUSED:
+            self._fused(cdr, log_time_ns)
+
+    def _fused(self, cdr: bytes, log_time_ns: int) -> None:
+        # Through messages, as in the live graph: skeletons travel in single precision.
+        filtered = self._filter.update(_decoded(cdr))
+        if filtered is None:
+            return
+        published = encode_skeletons([filtered])
+        self._writer.write(graph.FILTERED, published, log_time_ns)
+        arrived = _decoded(published)
+        states, stddevs = encode_angles(positional_angles(arrived), self._body, arrived.frame_id)
+        self._writer.write(self._states, states, log_time_ns)
+        self._writer.write(self._stddevs, stddevs, log_time_ns)
+        self._frames += 1
+
+    def finish(self) -> Written:
+        """Close the bag; one without angles is removed again."""
+        if self._frames:
+            self._writer.close()
+        else:
+            self._writer.discard()
+        return Written(self._frames, dict(self._filter.counters))
+
+    def abandon(self) -> None:
+        """Remove the unfinished bag."""
+        self._writer.discard()
+
+
+def _decoded(cdr: bytes) -> Skeleton:
+    skeletons = decode_skeletons(cdr)
+    assert skeletons is not None
+    return skeletons[0]
+
+
+class ForkedDownstream:
+    """:class:`Downstream` in a process of its own; same arguments, same errors."""
+
+    def __init__(
+        self, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], *, overwrite: bool
+    ) -> None:
+        context = multiprocessing.get_context("fork")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, settings, out, topics, overwrite), daemon=True)
+        self._batch: list[tuple[str, bytes, int]] = []
+        with warnings.catch_warnings():
+            # Python 3.12 warns of forking with threads; those of the numeric libraries are prepared for it.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._process.start()
+        theirs.close()
+        self._receive()
+
+    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One serialised message."""
+        self._batch.append((topic, cdr, log_time_ns))
+        if len(self._batch) >= _BATCH:
+            self._send()
+
+    def finish(self) -> Written:
+        """Close the bag; one without angles is removed again."""
+        self._send()
+        self._connection.send(None)
+        written = self._receive()
+        self._process.join()
+        assert isinstance(written, Written)
+        return written
+
+    def abandon(self) -> None:
+        """Remove the unfinished bag."""
+        self._connection.close()
+        self._process.join()
+
+    def _send(self) -> None:
+        try:
+            self._connection.send(self._batch)
+        except BrokenPipeError:
+            self._receive()  # raises why
+        self._batch = []
+
+    def _receive(self) -> Written | None:
+        try:
+            answer = self._connection.recv()
+        except EOFError:
+            self._process.join()
+            raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
+        if isinstance(answer, BaseException):
+            self._process.join()
+            raise answer
+        assert answer is None or isinstance(answer, Written)
+        return answer
+
+
+def _serve(
+    connection: Connection, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], overwrite: bool
+) -> None:
+    """The other process."""
+    stage: Downstream | None = None
+    try:
+        stage = Downstream(settings, out, topics, overwrite=overwrite)
+        connection.send(None)
+        while (batch := connection.recv()) is not None:
+            for topic, cdr, log_time_ns in batch:
+                stage.take(topic, cdr, log_time_ns)
+        connection.send(stage.finish())
+    except (EOFError, KeyboardInterrupt):
+        if stage is not None:
+            stage.abandon()
+    except BaseException as error:
+        if stage is not None:
+            stage.abandon()
+        connection.send(error)
+
+
+def start_downstream(
+    settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], *, overwrite: bool
+) -> Downstream | ForkedDownstream:
+    """The second stage, beside this process where that is possible and there are processors for both.
+
+    Raises:
+        BagError: ``out`` cannot be written.
+        FilterError: the filter or its parameters make no sense.
+    """
+    if hasattr(os, "fork") and len(os.sched_getaffinity(0)) > 1 and threading.active_count() == 1:
+        return ForkedDownstream(settings, out, topics, overwrite=overwrite)
+    return Downstream(settings, out, topics, overwrite=overwrite)
