@@ -63,11 +63,15 @@ def calibrate(
         names = tuple(topics.values())
         calibration = OnlineCalibration(names, replace(parameters, history=WHOLE), reference or None)
         progress = Progress(bag.start_ns, bag.end_ns)
+        frames = 0
         for sensor, skeleton, log_time_ns, _ in skeletons_of(bag, topics, counters):
+            frames += 1
             calibration.push(sensor, skeleton, log_time_ns)
             progress.at(log_time_ns)
         progress.end()
         events = [*bag.warnings, *(f"{name}: {count}" for name, count in sorted(counters.items()))]
+    if not frames:
+        raise CalibrationError(f"{bag_path}: no frame can be used ({'; '.join(events) or 'there is none'})")
     result = calibration.finish()
     missing = [name for name in names if name not in result.poses]
     if missing:

@@ -1,0 +1,188 @@
+"""The offline graph: deterministic, the same in one process and in two, and clear about bags that it cannot use."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.messages import JOINT_STATE, to_nanoseconds
+from body_tracking.parameters import ParameterError
+from body_tracking.recording import replay as replay_module
+from body_tracking.recording.replay import ReplayError, replay
+from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
+from body_tracking.recording.stages import Downstream, ForkedDownstream, ReplaySettings
+
+ROOT = Path(__file__).resolve().parents[2]
+BAG = ROOT / "bags" / "tpose_wave"
+ANGLES = "/humans/bodies/body1/joint_states"
+
+
+def contents(bag: Path) -> list[RawMessage]:
+    with BagReader(bag) as reader:
+        return list(reader.messages())
+
+
+def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "body_tracking.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("replay") / "out"
+    replay(BAG, out, ReplaySettings(()))
+    return out
+
+
+def test_everything_that_the_graph_publishes_is_in_the_new_bag(replayed: Path) -> None:
+    with BagReader(replayed) as bag, BagReader(BAG) as original:
+        counts = {topic: info.count for topic, info in bag.topics.items()}
+        for topic in ("/kinect1/skeleton", "/kinect2/skeleton", "/ground_truth/skeleton"):
+            assert counts[topic] == original.topics[topic].count
+        assert counts["/fused/skeleton"] == counts["/filtered/skeleton"] == counts[ANGLES] > 400
+        assert counts[f"{ANGLES}_stddev"] == counts[ANGLES]
+        assert counts["/calibration"] >= 2
+        assert counts["/calibration/clock"] >= 1
+
+
+def test_the_same_bag_gives_the_same_messages(replayed: Path, tmp_path: Path) -> None:
+    replay(BAG, tmp_path / "again", ReplaySettings(()))
+    assert contents(tmp_path / "again") == contents(replayed)
+
+
+@pytest.mark.parametrize("stage", [Downstream, ForkedDownstream])
+def test_one_process_and_two_give_the_same_messages(
+    replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: type[Downstream] | type[ForkedDownstream]
+) -> None:
+    monkeypatch.setattr(replay_module, "start_downstream", stage)
+    report = replay(BAG, tmp_path / "out", ReplaySettings(()))
+    assert contents(tmp_path / "out") == contents(replayed)
+    assert report.counters["filter frames"] == report.frames
+
+
+def test_the_angles_follow_the_truth(replayed: Path) -> None:
+    """Elbow flexion of the simulated wave, where both are known, against the ground truth of the bag."""
+    with BagReader(replayed) as bag:
+        angles = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([ANGLES])]
+        truth = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages(["/ground_truth/joint_states"])]
+    stamps = np.array([to_nanoseconds(each.header.stamp) for each in truth])
+    for name in ("elbow_flexion_left_body1", "elbow_flexion_right_body1"):
+        column = angles[0].name.index(name)
+        true_column = next(index for index, each in enumerate(truth[0].name) if name.startswith(each.split("_body")[0]))
+        known = np.array([each.position[true_column] for each in truth])
+        errors = [
+            each.position[column] - known[np.argmin(np.abs(stamps - to_nanoseconds(each.header.stamp)))]
+            for each in angles[90:]
+        ]
+        assert np.degrees(np.sqrt(np.nanmean(np.square(errors)))) < 12.0
+
+
+def test_the_command_ends_with_what_it_did(tmp_path: Path) -> None:
+    done = command("replay", BAG, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["frames"] > 400
+    assert report["recording_s"] == pytest.approx(14.5, abs=0.1)
+    assert 0.0 < report["elapsed_s"] < 60.0
+    again = command("replay", BAG, "-o", tmp_path / "out")
+    assert again.returncode == 2
+    assert again.stderr.count("\n") == 1
+    assert command("replay", BAG, "-o", tmp_path / "out", "--overwrite").returncode == 0
+
+
+def test_calibrate_prints_poses_and_clocks(tmp_path: Path) -> None:
+    for method in ("thesis", "robust"):
+        done = command("calibrate", BAG, "--method", method, "--json", "-o", tmp_path / f"{method}.yaml")
+        assert done.returncode == 0, done.stderr
+        result = json.loads(done.stdout)
+        assert result["reference"] == "kinect1"
+        sensor = result["sensors"]["kinect2"]
+        # Simulated: 2 m to the right and ahead, turned by 90 degrees, its clock 2.7 s behind.
+        assert np.allclose(sensor["translation"], [2.0, -2.0, 0.06], atol=0.25)
+        assert np.linalg.norm(sensor["quat_xyzw"]) == pytest.approx(1.0)
+        assert sensor["relative_yaw_deg"] == pytest.approx(90.0, abs=6.0)
+        assert sensor["clock_offset_s"] == pytest.approx(-2.7, abs=0.06)
+        assert sensor["residual_mm"] < 100.0
+    text = command("calibrate", BAG).stdout
+    assert "kinect2: at (" in text
+    # A saved calibration can be used from the first frame on.
+    done = command("replay", BAG, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["counters"].get("fusion uncalibrated", 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        ("nothing", "no such"),
+        ("empty", "no topic"),
+        ("other type", "expected sensor_msgs/msg/PointCloud2"),
+        ("malformed", "no frame"),
+    ],
+)
+def test_a_bag_without_skeletons_is_named_in_one_line(tmp_path: Path, make: str, message: str) -> None:
+    bag = tmp_path / "bag"
+    if make != "nothing":
+        with BagWriter(bag) as writer:
+            if make == "empty":
+                writer.add_topic("/tf", "geometry_msgs/msg/TransformStamped")
+            elif make == "other type":
+                writer.add_topic("/kinect1/skeleton", JOINT_STATE)
+            else:
+                writer.add_topic("/kinect1/skeleton", "sensor_msgs/msg/PointCloud2")
+                writer.write("/kinect1/skeleton", b"\x00\x01\x00\x00 no such message", 1)
+    for words in (("replay", bag, "-o", tmp_path / "out"), ("calibrate", bag)):
+        done = command(*words)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        if words[0] == "replay":
+            assert message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_failure_of_the_second_stage_is_told_and_leaves_no_bag(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for stage in (Downstream, ForkedDownstream):
+        with pytest.raises(BagError):
+            stage(ReplaySettings(("kinect1",)), tmp_path / "file" / "out", {}, overwrite=False)
+        with pytest.raises(BodyTrackingError, match="no_such_filter"):
+            stage(ReplaySettings(("kinect1",), filter_name="no_such_filter"), tmp_path / "out", {}, overwrite=False)
+    broken = ForkedDownstream(ReplaySettings(("kinect1",)), tmp_path / "out", {}, overwrite=False)
+    with pytest.raises(BagError):
+        for _ in range(1000):
+            broken.take("/nobody", b"", 0)
+        broken.finish()
+    assert not (tmp_path / "out").exists()
+
+
+def test_parameters_are_checked_before_anything_runs(tmp_path: Path) -> None:
+    for text, message in (
+        ("fusion: {ros__parameters: {gait: 3.0}}", "did you mean 'gate'"),
+        ("calibration: {ros__parameters: {method: best}}", "method"),
+        ("skeleton_filter: {ros__parameters: {white_noise_share: 7.0}}", "white_noise_share"),
+    ):
+        file = tmp_path / "parameters.yaml"
+        file.write_text(text)
+        done = command("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert command("replay", BAG, "-o", tmp_path / "out", "--filter", "ukf").returncode == 2
+    done = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")
+    assert "kinect7" in done.stderr
+
+
+def test_errors_have_one_base() -> None:
+    for error in (ReplayError, BagError, ParameterError):
+        assert issubclass(error, BodyTrackingError)
