@@ -153,31 +153,32 @@ def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
             break
     else:
         return None
-    points: NDArray[np.float32] = np.frombuffer(cdr[end - layout.size : end], "<f4").reshape(-1, N_JOINTS, layout.words)
-    labels = points.view("<u4")[:, :, 3]
-    bodies = labels >> _BODY_BITS
-    states = labels.astype(np.uint16) >> 8
-    if ((labels & 0xFF) != _JOINTS).any() or (bodies != bodies[:, :1]).any() or states.max() > TrackingState.TRACKED:
-        return None
-    if len(bodies) > 1 and (bodies[1:, 0] <= bodies[:-1, 0]).any():
-        return None
+    points: NDArray[np.float32] = np.frombuffer(cdr, "<f4", layout.size // 4, end - layout.size)
+    points = points.reshape(-1, N_JOINTS, layout.words)
     try:
-        frame_id = cdr[16 : 16 + length - 1].decode()
+        frame_id = cdr[16 : 15 + length].decode()
     except UnicodeDecodeError:
         return None
-    values = points.astype(np.float64)
-    return tuple(
-        Skeleton(
-            sec * NANOSECONDS + nanosec,
-            frame_id,
-            value[:, :3],
-            state.astype(np.uint8),
-            int(body[0]),
-            value[:, 4:10][:, _NINE_OF_UPPER].reshape(N_JOINTS, 3, 3) if layout.covariance else None,
-            value[:, -3:] if layout.velocity else None,
+    stamp_ns = sec * NANOSECONDS + nanosec
+    skeletons: list[Skeleton] = []
+    for value, label in zip(points.astype(np.float64), points.view("<u4")[:, :, 3].tolist(), strict=True):
+        body = label[0] >> _BODY_BITS
+        states = bytes([word >> 8 & 0xFF for word in label])
+        expected = [number | state << 8 | body << _BODY_BITS for number, state in enumerate(states)]
+        if label != expected or max(states) > TrackingState.TRACKED or (skeletons and body <= skeletons[-1].body):
+            return None
+        skeletons.append(
+            Skeleton(
+                stamp_ns,
+                frame_id,
+                value[:, :3],
+                np.frombuffer(states, np.uint8),
+                body,
+                value[:, 4:10].take(_NINE_OF_UPPER, axis=1).reshape(N_JOINTS, 3, 3) if layout.covariance else None,
+                value[:, -3:] if layout.velocity else None,
+            )
         )
-        for value, state, body in zip(values, states, bodies, strict=True)
-    )
+    return tuple(skeletons)
 
 
 def _header(stamp_ns: int, frame_id: str) -> bytes:

@@ -14,6 +14,8 @@ from body_tracking.errors import BodyTrackingError
 SUBCOMMANDS = (
     "recording.importer",
     "recording.info",
+    "recording.replay",
+    "calibration.offline",
     "up",
     "evaluation.show",
     "simulation.bags",

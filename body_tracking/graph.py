@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import (
@@ -19,7 +19,7 @@ from body_tracking.messages import (
     TIME_REFERENCE,
     TRANSFORM,
 )
-from body_tracking.parameters import Parameter, Value
+from body_tracking.parameters import Parameter, Value, as_yaml
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.sensors import check_sensor_name
 
@@ -283,6 +283,29 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
             for sensor in sensors
         ]
     return tuple(specs)
+
+
+def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
+    """The nodes of a graph, and those that it would have live, with a bag and with a recorder."""
+    variants = [options] + [replace(options, bag=bag, record="recording") for bag in ("", options.bag or "bag")]
+    return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
+
+
+CONFIG_HEADER = """\
+# Every parameter of every node at its default. Written by `make docs` from the code; copy it, keep what you change:
+#   body_tracking up --params-file my_parameters.yaml
+#   ros2 launch body_tracking two_kinects.launch.py params_file:=my_parameters.yaml
+# What the graph hangs together by (names of sensors, the bag, simulated time) is the command line's to say, not the
+# file's. A section /** is about all nodes that have the parameter.
+"""
+
+
+def config_text() -> str:
+    """``config/body_tracking.yaml``; needs ROS to import the nodes."""
+    sections = {}
+    for spec in sorted(all_nodes_for(GraphOptions()), key=lambda spec: EXECUTABLES.index(spec.executable)):
+        sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in spec.parameters]
+    return f"{CONFIG_HEADER}\n{as_yaml(sections)}"
 
 
 def _player(options: GraphOptions, sensors: Sequence[str], after: Mapping[str, int]) -> NodeSpec:

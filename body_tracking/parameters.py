@@ -7,6 +7,7 @@ and the documentation prints it. Knows no ROS library.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
@@ -176,6 +177,25 @@ def _flatten(values: Mapping[object, object], prefix: str, flat: dict[str, objec
             _flatten(value, f"{prefix}{key}.", flat)
         else:
             flat[f"{prefix}{key}"] = value
+
+
+def as_yaml(sections: Mapping[str, Sequence[Parameter]]) -> str:
+    """A parameters file with every parameter at its default, explained.
+
+    Args:
+        sections: the parameters of each node.
+    """
+    lines: list[str] = []
+    for node, table in sections.items():
+        lines += ["", f"{node}:", f"  {SECTION}:"]
+        for parameter in table:
+            notes = [part for part in (parameter.unit, parameter.constraint) if part]
+            notes += ["may change while running"] if parameter.live else []
+            text = parameter.doc + (f" ({'; '.join(notes)})" if notes else "")
+            lines += textwrap.wrap(text, 112, initial_indent="    # ", subsequent_indent="    # ")
+            value = yaml.safe_dump(to_ros(parameter.default), default_flow_style=True).splitlines()[0]
+            lines.append(f"    {parameter.name}: {value}")
+    return "\n".join(lines[1:]) + "\n"
 
 
 def matches(pattern: str, node: str) -> bool:

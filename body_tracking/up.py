@@ -48,15 +48,17 @@ from body_tracking.skeleton import NANOSECONDS
 if TYPE_CHECKING:
     from body_tracking.nodes.graph_monitor import GraphMonitor
 
-FIRST_BACKOFF = 0.2
-"""Seconds before a node that died is started again; doubles with each death soon after a start, up to the last."""
+BACKOFFS = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Seconds before a node that died is started again: at once, and later with each death soon after a start."""
 
-LAST_BACKOFF = 5.0
 SETTLED = 10.0
-"""A node that has run for this long, seconds, starts again with the first back-off."""
+"""A node that has run for this long, seconds, is started again at once."""
 
 LISTENERS_TIMEOUT = 10.0
 """A source starts after this time even if somebody who should listen does not, seconds."""
+
+START_DELAY = 5.0
+"""Recordings in place of sensors begin this long after the start, in step, seconds; by then every node is there."""
 
 STOP_TIMEOUT = 8.0
 """Seconds for a node to end after it was asked to."""
@@ -69,6 +71,38 @@ LINE_PERIOD = 5.0
 
 _ROS_LOG = re.compile(r"^(?:\x1b\[[0-9;]*m)?\[(DEBUG|INFO|WARN|ERROR|FATAL)\]")
 _FAST_DDS = re.compile(r"RTPS_|\[[A-Z_]+ (?:Error|Warning)\]")
+
+
+_LOOPBACK = """\
+<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com">
+  <profiles>
+    <transport_descriptors>
+      <transport_descriptor>
+        <transport_id>loopback</transport_id>
+        <type>UDPv4</type>
+        <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
+        <maxInitialPeersRange>64</maxInitialPeersRange>
+      </transport_descriptor>
+    </transport_descriptors>
+    <participant profile_name="body_tracking" is_default_profile="true">
+      <rtps>
+        <userTransports><transport_id>loopback</transport_id></userTransports>
+        <useBuiltinTransports>false</useBuiltinTransports>
+        <builtin>
+          <discovery_config>
+            <leaseDuration><sec>1</sec><nanosec>500000000</nanosec></leaseDuration>
+            <leaseAnnouncement><nanosec>300000000</nanosec></leaseAnnouncement>
+          </discovery_config>
+          <metatrafficUnicastLocatorList><locator/></metatrafficUnicastLocatorList>
+          <initialPeersList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></initialPeersList>
+        </builtin>
+      </rtps>
+    </participant>
+  </profiles>
+</dds>
+"""
+"""Fast DDS on this machine alone, as ``LOCALHOST`` has it, but without shared memory and with a short lease."""
 
 
 class UpError(BodyTrackingError):
@@ -117,7 +151,10 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
 
 
 def parameters_for(
-    specs: Sequence[NodeSpec], file: Path | None, defaults: Mapping[str, Mapping[str, Value]] | None = None
+    specs: Sequence[NodeSpec],
+    file: Path | None,
+    defaults: Mapping[str, Mapping[str, Value]] | None = None,
+    absent: Sequence[NodeSpec] = (),
 ) -> dict[str, dict[str, Value]]:
     """Every parameter that is set, for each node: the graph's defaults, then the file, then what the graph needs.
 
@@ -125,23 +162,26 @@ def parameters_for(
         specs: the nodes.
         file: a ROS parameters file, or None.
         defaults: more defaults by node name.
+        absent: nodes that the file may be about too, although they are not started.
 
     Raises:
         ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
             allowed.
     """
-    tables = {spec.name: {item.name: item for item in graph.parameters_of(spec.executable)} for spec in specs}
+    possible = {spec.name: spec for spec in (*absent, *specs)}
+    tables = {
+        name: {item.name: item for item in graph.parameters_of(spec.executable)} for name, spec in possible.items()
+    }
     sections = read_file(file) if file is not None else {}
     for pattern, values in sections.items():
-        about = [spec for spec in specs if matches(pattern, spec.full_name)]
+        about = [spec for spec in possible.values() if matches(pattern, spec.full_name)]
         if not about:
-            there = ", ".join(spec.full_name for spec in specs)
-            raise ParameterError(f"{file}: {pattern}: no such node; the graph has {there}")
-        known = set().union(*(tables[spec.name] for spec in about))
-        for name in values:
-            if name not in known and not is_ros_own(name):
-                check = [item for spec in about for item in tables[spec.name].values()]
-                _check(check, {name: values[name]}, f"{file}: {pattern}")
+            there = ", ".join(spec.full_name for spec in possible.values())
+            raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
+        known: dict[str, Parameter] = {}
+        for spec in about:
+            known |= tables[spec.name]
+        _check(known.values(), {n: v for n, v in values.items() if not is_ros_own(n)}, f"{file}: {pattern}")
     result: dict[str, dict[str, Value]] = {}
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
@@ -176,6 +216,7 @@ class Child:
         process: None while it is not running.
         started: steady time of its last start, seconds.
         restarts: how often it was started again.
+        deaths: how often in a row it died soon after its start.
         due: steady time of the next start; None while it runs, or when it is not to run any more.
         done: it has ended on purpose.
     """
@@ -185,7 +226,7 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     restarts: int = 0
-    backoff: float = FIRST_BACKOFF
+    deaths: int = 0
     due: float | None = field(default_factory=time.monotonic)
     done: bool = False
     reader: threading.Thread | None = None
@@ -347,8 +388,8 @@ class Supervisor:
             self.failure = child.last_lines[-1] if child.last_lines else f"{child.spec.name} could not start"
             self.stopping.set()
             return
-        child.backoff = FIRST_BACKOFF if now - child.started > SETTLED else min(2.0 * child.backoff, LAST_BACKOFF)
-        child.due = now + child.backoff
+        child.deaths = 1 if now - child.started > SETTLED else child.deaths + 1
+        child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
         child.restarts += 1
         if playing and monitor.clock_ns:
             child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
@@ -447,26 +488,49 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+def _stay_on_this_machine(folder: Path) -> None:
+    """Let this process and the nodes talk over the loopback interface, unless the user chose something else.
+
+    A node that was killed leaves shared memory behind that the others go on writing to, and stays known to them for 20
+    seconds; until they notice, up to 3 s, whoever takes its place hears nothing. So no shared memory here, and a short
+    lease. With the range ``LOCALHOST`` rmw_fastrtps insists on shared memory; the profile does the same without it.
+    """
+    chosen = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
+    if chosen is None and "ROS_LOCALHOST_ONLY" not in os.environ:
+        chosen = os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    profiles = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+    others = (*profiles, "FASTDDS_BUILTIN_TRANSPORTS", "ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
+    fast_dds = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") == "rmw_fastrtps_cpp"
+    if chosen != "LOCALHOST" or not fast_dds or any(name in os.environ for name in others):
+        return
+    file = folder / "loopback.xml"
+    file.write_text(_LOOPBACK, encoding="utf-8")
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SUBNET"  # of the loopback interface
+    for name in profiles:
+        os.environ[name] = str(file)
+
+
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
-    # Set before rclpy is imported, by whoever imports it first.
-    if not any(name in os.environ for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY")):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     options = options_for(args)
     specs = graph.nodes_for(options)
     try:
         from body_tracking.nodes.graph_monitor import GraphMonitor
     except ImportError as error:
         raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
-    parameters_for(specs, args.params_file)  # what is wrong is said before a folder is made
+    absent = graph.all_nodes_for(options)
+    parameters_for(specs, args.params_file, absent=absent)  # what is wrong is said before a folder is made
     folder = _log_folder(args.log_dir)
+    _stay_on_this_machine(folder)
     defaults: dict[str, dict[str, Value]] = {
         # A calibration node that is started again goes on from here.
         "calibration": {"calibration_file": str(folder / "calibration.yaml")}
     }
-    start = time.time() + 3.0  # when every node is there; in step, whoever is started again
-    defaults |= {spec.name: {"start_time": start} for spec in specs if spec.executable == "kinect_skeleton"}
-    parameters = parameters_for(specs, args.params_file, defaults)
+    parameters = parameters_for(specs, args.params_file, defaults, absent)
+    start = time.time() + START_DELAY
+    for spec in specs:
+        if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
+            parameters[spec.name]["start_time"] = start
     monitor = GraphMonitor(str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)

@@ -1,15 +1,21 @@
-"""``python -m body_tracking.nodes <executable> [--ros-args ...]``: a node without an installed script, for ``up``."""
+"""``python -m body_tracking.nodes <executable> [--ros-args ...]``: a node without an installed script, for ``up``.
+
+``python -m body_tracking.nodes parameters`` prints ``config/body_tracking.yaml``.
+"""
 
 from __future__ import annotations
 
 import importlib
 import sys
 
-from body_tracking.graph import EXECUTABLES
+from body_tracking.graph import EXECUTABLES, config_text
 from body_tracking.nodes.supervised import die_with_parent
 
 if __name__ == "__main__":
     die_with_parent()
+    if sys.argv[1:] == ["parameters"]:
+        print(config_text(), end="")
+        sys.exit(0)
     if len(sys.argv) < 2 or sys.argv[1] not in EXECUTABLES:
         print(f"usage: python -m body_tracking.nodes {{{','.join(EXECUTABLES)}}} [--ros-args ...]", file=sys.stderr)
         sys.exit(2)

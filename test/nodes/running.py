@@ -1,0 +1,106 @@
+"""Nodes as real processes in a ROS domain of their own, and a node to talk to them."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def environment() -> dict[str, str]:
+    """Of processes that only hear each other."""
+    return {
+        **os.environ,
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(random.randint(1, 100)),
+        "RCUTILS_COLORIZED_OUTPUT": "0",
+    }
+
+
+def stop(process: subprocess.Popen[Any]) -> int:
+    """End a process as Ctrl-C does; its exit code."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(15.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise
+
+
+class Running:
+    """Processes and a node."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.environment = environment()
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=int(self.environment["ROS_DOMAIN_ID"]))
+        self.node = rclpy.create_node("bench", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, RELIABLE)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGINT)
+        for process in self.processes.values():
+            stop(process)
+        rclpy.try_shutdown(context=self.context)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            self.diagnostics[status.name.partition(":")[0]] = values | {"": status.message}
+
+    def start(self, executable: str, **parameters: object) -> subprocess.Popen[bytes]:
+        """Start a node; its output goes to a file."""
+        arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        with (self.folder / f"{executable}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+            )
+        self.processes[executable] = process
+        return process
+
+    def log(self, executable: str) -> str:
+        """What a node printed so far."""
+        return (self.folder / f"{executable}.log").read_text()
+
+    def until(self, condition: Callable[[], object], timeout: float = 20.0) -> bool:
+        """Spin until something is so; whether it became so in time."""
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def collect(self, kind: type[Any], topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
+        """A list into which the messages of a topic come."""
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, qos)
+        return received

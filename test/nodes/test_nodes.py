@@ -1,0 +1,334 @@
+"""The nodes as processes over DDS: what they refuse, what they survive, what they say of it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from running import RELIABLE, Running, environment, stop  # noqa: E402
+from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from body_tracking import graph  # noqa: E402
+from body_tracking.calibration.result import level_pose  # noqa: E402
+from body_tracking.calibration.storage import load  # noqa: E402
+from body_tracking.messages import (  # noqa: E402
+    RosMessages,
+    cloud_to_skeletons,
+    pose_to_transform,
+    skeletons_to_cloud,
+    to_nanoseconds,
+    to_time,
+)
+from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
+from body_tracking.skeleton import Skeleton  # noqa: E402
+
+ROS = RosMessages()
+BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+FRAME_NS = 33_333_333
+
+
+def recorded(sensor: str) -> list[Skeleton]:
+    """The frames of one sensor of a shipped recording."""
+    topic = graph.skeleton_topic(sensor)
+    with BagReader(BAG) as reader:
+        type_name = reader.topics[topic].type_name
+        return [cloud_to_skeletons(deserialize(type_name, message.cdr))[0] for message in reader.messages([topic])]
+
+
+# --- parameters
+
+
+@pytest.mark.parametrize(
+    ("executable", "parameter", "said"),
+    [
+        ("kinect_skeleton", "sensr:=kinect1", "unknown parameter 'sensr'; did you mean 'sensor'?"),
+        ("kinect_skeleton", "rate:=-1.0", "parameter 'rate': -1.0, expected 0.01 to 100"),
+        ("kinect_skeleton", "backend:=xbox", "parameter 'backend': 'xbox', expected one of recording"),
+        ("kinect_skeleton", "sensor:=fused", "sensor name 'fused' is reserved"),
+        ("kinect_skeleton", "file:=/nowhere.csv", "/nowhere.csv: no such file"),
+        ("calibration", "calibration_fil:=a", "unknown parameter 'calibration_fil'"),
+        ("calibration", "capacity:=1.5", "parameter 'capacity': 1.5, expected a whole number"),
+        ("calibration", "reference:=kinect9", "kinect9"),
+        ("fusion", "silence:=99.0", "parameter 'silence': 99.0, expected 0.02 to 5"),
+        ("fusion", "sensors:=3", "parameter 'sensors': 3, expected a list of strings"),
+        ("skeleton_filter", "filter:=ekg", "parameter 'filter': 'ekg', expected one of"),
+        ("skeleton_filter", "gate_probability:=true", "parameter 'gate_probability': True, expected a number"),
+        ("joint_angles", "body:=a/b", "parameter 'body': 'a/b'"),
+        ("bag_player", "bags:=x", "unknown parameter 'bags'; did you mean 'bag'?"),
+        ("bag_recorder", "chunk_seconds:=-1.0", "parameter 'chunk_seconds'"),
+    ],
+)
+def test_a_node_refuses_a_bad_parameter_in_one_line(executable: str, parameter: str, said: str) -> None:
+    command = [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", "-p", parameter]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=30, env=environment())
+    lines = result.stderr.strip().splitlines()
+    assert result.returncode == 2
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{executable}: ")
+    assert said in lines[0]
+
+
+def test_a_section_for_all_nodes_may_hold_what_only_some_know(tmp_path: Path) -> None:
+    def run(name: str) -> subprocess.CompletedProcess[str]:
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(f"/**:\n  ros__parameters:\n    {name}: map\n")
+        command = [
+            sys.executable,
+            "-m",
+            "body_tracking.nodes",
+            "kinect_skeleton",
+            "--ros-args",
+            "--params-file",
+            str(file),
+        ]
+        return subprocess.run(command, capture_output=True, text=True, timeout=30, env=environment())
+
+    # The node gets past its parameters, to the recording that it was not given.
+    assert "needs the parameter 'file'" in run("world_frame").stderr
+    assert "unknown parameter 'wurld_frame'" in run("wurld_frame").stderr
+
+
+# --- messages
+
+
+def valid() -> PointCloud2:
+    return skeletons_to_cloud([recorded("kinect1")[0]], ROS)
+
+
+def changed(change: Callable[[PointCloud2], object]) -> PointCloud2:
+    cloud = valid()
+    change(cloud)
+    return cloud
+
+
+def with_points(change: Callable[[np.ndarray], None]) -> PointCloud2:
+    cloud = valid()
+    data = np.frombuffer(bytes(cloud.data), np.uint8).reshape(25, 16).copy()
+    change(data)
+    cloud.data = data.tobytes()
+    return cloud
+
+
+def _no_points(cloud: PointCloud2) -> None:
+    cloud.width, cloud.row_step, cloud.data = 0, 0, b""
+
+
+def _other_count(cloud: PointCloud2) -> None:
+    cloud.width, cloud.row_step, cloud.data = 24, 24 * 16, bytes(cloud.data)[: 24 * 16]
+
+
+def _state_three(data: np.ndarray) -> None:
+    data[7, 13] = 3
+
+
+def _joint_twice(data: np.ndarray) -> None:
+    data[7, 12] = 8
+
+
+MALFORMED: dict[str, Callable[[], Any]] = {
+    "missing fields": lambda: changed(lambda cloud: setattr(cloud, "fields", cloud.fields[:3])),
+    "another type": lambda: changed(lambda cloud: setattr(cloud.fields[0], "datatype", 8)),
+    "a field beyond the point": lambda: changed(lambda cloud: setattr(cloud.fields[2], "offset", 15)),
+    "too few bytes": lambda: changed(lambda cloud: setattr(cloud, "data", bytes(cloud.data)[:-1])),
+    "a wrong row step": lambda: changed(lambda cloud: setattr(cloud, "row_step", 7)),
+    "a wrong point step": lambda: changed(lambda cloud: setattr(cloud, "point_step", 0)),
+    "big-endian": lambda: changed(lambda cloud: setattr(cloud, "is_bigendian", True)),
+    "no points": lambda: changed(_no_points),
+    "another number of points": lambda: changed(_other_count),
+    "a state above 2": lambda: with_points(_state_three),
+    "a joint twice": lambda: with_points(_joint_twice),
+    "no message at all": lambda: b"\x00\x01\x00\x00garbage",
+}
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with Running(tmp_path_factory.mktemp("nodes")) as running:
+        for executable in ("calibration", "fusion"):
+            running.start(executable, reliable=True)
+        for executable in ("skeleton_filter", "joint_angles"):
+            running.start(executable, reliable=True)
+        assert running.until(lambda: len(running.diagnostics) >= 4)
+        yield running
+
+
+INPUTS = {
+    "calibration": "/kinect2/skeleton",
+    "fusion": "/kinect2/skeleton",
+    "skeleton_filter": graph.FUSED,
+    "joint_angles": graph.FILTERED,
+}
+
+
+@pytest.mark.parametrize("topic", sorted(set(INPUTS.values())))
+def test_every_malformed_message_is_counted_and_survived(nodes: Running, topic: str) -> None:
+    readers = [name for name, own in INPUTS.items() if own == topic]
+    publisher = nodes.node.create_publisher(PointCloud2, topic, RELIABLE)
+    assert nodes.until(lambda: publisher.get_subscription_count() == len(readers))
+    for make in MALFORMED.values():
+        publisher.publish(make())
+    counted = dict.fromkeys(readers, 0)
+
+    def all_counted() -> bool:
+        for name in readers:
+            counted[name] = int(nodes.diagnostics[name].get("malformed", 0))
+        return min(counted.values()) >= len(MALFORMED)
+
+    nodes.until(all_counted)
+    assert counted == dict.fromkeys(readers, len(MALFORMED))
+    for name in readers:
+        assert nodes.processes[name].poll() is None
+        assert topic in nodes.diagnostics[name]["last malformed"]
+        assert "malformed message ignored" in nodes.log(name)
+    publisher.publish(valid())
+    assert nodes.until(lambda: all(int(nodes.diagnostics[name].get("received", 0)) >= 1 for name in readers))
+    nodes.node.destroy_publisher(publisher)
+
+
+def test_a_pose_that_is_none_is_counted(nodes: Running) -> None:
+    before = int(nodes.diagnostics["fusion"].get("malformed", 0))
+    publisher = nodes.node.create_publisher(TransformStamped, graph.CALIBRATION, LATCHED)
+    assert nodes.until(lambda: publisher.get_subscription_count() == 1)
+    no_rotation = pose_to_transform(level_pose("kinect1"), "world", ROS)
+    no_rotation.transform.rotation.w = no_rotation.transform.rotation.x = 0.0
+    no_sensor = pose_to_transform(level_pose("kinect1"), "world", ROS)
+    no_sensor.child_frame_id = "kinect1"
+    for message in (no_rotation, no_sensor):
+        publisher.publish(message)
+    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("malformed", 0)) == before + 2)
+    nodes.node.destroy_publisher(publisher)
+
+
+def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Running) -> None:
+    angles = nodes.collect(JointState, graph.joint_states_topic("body1"))
+    stddevs = nodes.collect(JointState, graph.joint_states_stddev_topic("body1"))
+    publisher = nodes.node.create_publisher(PointCloud2, "/kinect1/skeleton", RELIABLE)
+    assert nodes.until(lambda: publisher.get_subscription_count() == 2)
+    frames = recorded("kinect1")
+
+    def send(start_ns: int, unseen: bool = False) -> None:
+        for index, frame in enumerate(frames[:20]):
+            positions = np.full((25, 3), np.nan) if unseen else frame.positions
+            states = np.zeros(25, np.uint8) if unseen else frame.states
+            body = Skeleton(start_ns + index * FRAME_NS, frame.frame_id, positions, states, frame.body)
+            publisher.publish(skeletons_to_cloud([body], ROS))
+            nodes.executor.spin_once(timeout_sec=0.005)
+
+    start = 10**12
+    send(start)
+    assert nodes.until(lambda: len(angles) >= 20 and len(stddevs) >= 20)
+    elbow = angles[-1].name.index("elbow_flexion_left_body1")
+    assert np.isfinite(angles[-1].position[elbow])
+    assert 0.0 < stddevs[-1].position[elbow] < 1.0
+    assert angles[-1].header.frame_id == "world"
+    assert to_nanoseconds(angles[0].header.stamp) == start  # the capture time, to the nanosecond
+
+    send(start + 20 * FRAME_NS, unseen=True)
+    angles.clear()
+    back = start + 100 * FRAME_NS
+    send(back)
+    assert nodes.until(lambda: angles and to_nanoseconds(angles[-1].header.stamp) == back + 19 * FRAME_NS)
+    assert np.isfinite(angles[-1].position[elbow])
+
+    # The recording begins again: stamps far behind are a jump of time, after which everything goes on.
+    angles.clear()
+    send(start)
+    assert nodes.until(lambda: angles and to_nanoseconds(angles[-1].header.stamp) == start + 19 * FRAME_NS)
+    assert "time jumped back" in nodes.log("fusion")
+    assert "time jumped back" in nodes.log("skeleton_filter")
+
+    # Stamps that repeat or run back a little are counted and change nothing.
+    for back_ns in (0, FRAME_NS):
+        cloud = skeletons_to_cloud([frames[0]], ROS)
+        cloud.header.stamp = to_time(start + 19 * FRAME_NS - back_ns, ROS)
+        publisher.publish(cloud)
+    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("repeated stamps", 0)) == 1)
+    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("stamps backwards", 0)) >= 2)
+    assert all(process.poll() is None for process in nodes.processes.values())
+
+
+def test_the_filter_may_change_while_it_runs_but_not_to_nonsense(nodes: Running) -> None:
+    client = nodes.node.create_client(SetParameters, "/skeleton_filter/set_parameters")
+    assert client.wait_for_service(10.0)
+
+    def set_parameter(name: str, value: ParameterValue) -> tuple[bool, str]:
+        future = client.call_async(SetParameters.Request(parameters=[Parameter(name=name, value=value)]))
+        assert nodes.until(future.done)
+        result = future.result().results[0]
+        return result.successful, result.reason
+
+    assert set_parameter("filter", ParameterValue(type=4, string_value="lkf_zero_velocity"))[0]
+    assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"][""].startswith("lkf_zero_velocity"))
+    refused, reason = set_parameter("filter", ParameterValue(type=4, string_value="wishful"))
+    assert not refused
+    assert "expected one of" in reason
+    assert not set_parameter("gate_probability", ParameterValue(type=3, double_value=7.0))[0]
+    assert set_parameter("gate_probability", ParameterValue(type=3, double_value=0.999))[0]
+    assert not set_parameter("reliable", ParameterValue(type=1, bool_value=False))[0]
+
+
+def test_who_comes_late_gets_the_calibration_and_services_answer(nodes: Running) -> None:
+    poses = nodes.collect(TransformStamped, graph.CALIBRATION, LATCHED)
+    assert nodes.until(lambda: poses)
+    assert poses[0].child_frame_id == "kinect1_optical_frame"
+    assert poses[0].header.frame_id == "world"
+    for service in (graph.START_SERVICE, graph.RESET_SERVICE):
+        client = nodes.node.create_client(Trigger, service)
+        assert client.wait_for_service(10.0)
+        future = client.call_async(Trigger.Request())
+        assert nodes.until(future.done)
+        assert future.result().success
+        assert future.result().message
+
+
+# --- nodes on their own
+
+
+def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        received = running.collect(PointCloud2, "/kinect2/skeleton")
+        start = time.time() + 4.0  # by then it knows who listens
+        running.start("kinect_skeleton", sensor="kinect2", file=BAG, rate=20.0, reliable=True, start_time=start)
+        frames = recorded("kinect2")
+        stamps = [frame.stamp_ns for frame in frames]
+        running.until(lambda: received and to_nanoseconds(received[-1].header.stamp) == stamps[-1])
+        assert [to_nanoseconds(cloud.header.stamp) for cloud in received] == stamps
+        last = cloud_to_skeletons(received[-1])[0]
+        assert np.array_equal(last.positions, frames[-1].positions, equal_nan=True)
+        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == "ended")
+        assert stop(running.processes["kinect_skeleton"]) == 0
+
+
+def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    with Running(tmp_path) as running:
+        running.start("calibration", reliable=True, calibration_file=file)
+        running.start("bag_player", bag=BAG, rate=8.0, reliable=True, wait_for_subscribers='["/kinect1/skeleton"]')
+        assert running.until(lambda: running.processes["bag_player"].poll() is not None, timeout=30.0)
+        assert stop(running.processes["calibration"]) == 0
+    result = load(file)
+    assert result.reference == "kinect1"
+    assert set(result.poses) == {"kinect1", "kinect2"}
+    with Running(tmp_path) as running:
+        running.start("calibration", calibration_file=file)
+        poses = running.collect(TransformStamped, graph.CALIBRATION, LATCHED)
+        clocks = running.collect(TimeReference, graph.CALIBRATION_CLOCK, LATCHED)
+        assert running.until(lambda: len(poses) == 2 and len(clocks) == 1)
+        loaded = {pose.child_frame_id: pose.transform.translation for pose in poses}
+        assert loaded["kinect2_optical_frame"].x == pytest.approx(result.poses["kinect2"].translation[0])
+        assert clocks[0].source == "kinect2"

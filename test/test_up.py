@@ -1,0 +1,275 @@
+"""``body_tracking up`` as its user meets it: the real graph over a shipped recording, killed in every place."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from body_tracking import cli, graph  # noqa: E402
+from body_tracking.fusion.fusion import FusionParameters  # noqa: E402
+from body_tracking.graph import GraphOptions  # noqa: E402
+from body_tracking.messages import to_nanoseconds  # noqa: E402
+from body_tracking.parameters import ParameterError  # noqa: E402
+from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
+from body_tracking.up import parameters_for  # noqa: E402
+
+BAGS = Path(__file__).resolve().parent.parent / "bags"
+BAG = BAGS / "tpose_wave"
+ANGLES = graph.joint_states_topic("body1")
+STDDEVS = graph.joint_states_stddev_topic("body1")
+NODES = ("joint_angles", "skeleton_filter", "fusion", "calibration", "bag_recorder", "bag_player")
+
+
+class Up:
+    """A running ``body_tracking up``, and an ear for its angles."""
+
+    def __init__(self, folder: Path, *arguments: str | Path) -> None:
+        domain = random.randint(1, 100)
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        environment.pop("ROS_AUTOMATIC_DISCOVERY_RANGE", None)  # up stays on this machine by itself
+        self.output = folder / "up.log"
+        with self.output.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "body_tracking.cli", "up", "--log-dir", folder, *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+            )
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("listener", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.received: list[float] = []
+        self.node.create_subscription(JointState, ANGLES, self._on_angles, 10)
+
+    def _on_angles(self, message: JointState) -> None:
+        self.received.append(time.monotonic())
+
+    def text(self) -> str:
+        return self.output.read_text()
+
+    def nodes(self) -> dict[str, psutil.Process]:
+        """The nodes by executable, as far as they have started."""
+        found = {}
+        for process in psutil.Process(self.process.pid).children():
+            try:
+                command = process.cmdline()
+            except psutil.Error:
+                continue
+            if "body_tracking.nodes" in command and process.status() != psutil.STATUS_ZOMBIE:
+                found[command[command.index("body_tracking.nodes") + 1]] = process
+        return found
+
+    def until(self, condition: Callable[[], object], timeout: float) -> bool:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        rclpy.try_shutdown(context=self.context)
+
+
+@pytest.fixture
+def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
+    started: list[Up] = []
+
+    def start(*arguments: str | Path) -> Up:
+        started.append(Up(tmp_path, *arguments))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.close()
+
+
+def angles_in(path: Path, topic: str) -> dict[int, Any]:
+    """Position by capture time, and its names."""
+    with BagReader(path) as reader:
+        type_name = reader.topics[topic].type_name
+        messages = [deserialize(type_name, found.cdr) for found in reader.messages([topic])]
+    return {to_nanoseconds(message.header.stamp): np.array(message.position) for message in messages}
+
+
+def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
+    up: Callable[..., Up], tmp_path: Path
+) -> None:
+    # How long to wait for a late frame is the one decision by the wall clock; wait for as long as it takes.
+    file = tmp_path / "parameters.yaml"
+    file.write_text("fusion: {ros__parameters: {max_wait: 1.0}}\n")
+    graph_up = up("--bag", BAG, "--record", tmp_path / "live", "--reliable", "--params-file", file)
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
+    assert graph_up.process.returncode == 0, graph_up.text()
+    assert "frames of joint angles" in graph_up.text()
+    replay(BAG, tmp_path / "offline", ReplaySettings(("kinect1", "kinect2"), fusion=FusionParameters(max_wait=1.0)))
+    for topic in (ANGLES, STDDEVS):
+        live, offline = angles_in(tmp_path / "live", topic), angles_in(tmp_path / "offline", topic)
+        assert len(live) > 350
+        assert live.keys() == offline.keys()
+        for stamp, values in live.items():
+            np.testing.assert_allclose(values, offline[stamp], rtol=0.0, atol=1e-6)
+    # Each angle is known at some time; the rotation of the arms while they are straight (T-pose) is not.
+    finite = np.isfinite(np.array(list(live.values())))
+    assert finite.any(axis=0).all()
+    assert not finite.all()
+    with BagReader(tmp_path / "live") as reader:
+        assert reader.whole
+        assert reader.topics[graph.skeleton_topic("kinect1")].count == 423
+
+
+def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
+    up: Callable[..., Up], tmp_path: Path
+) -> None:
+    graph_up = up("--bag", BAGS / "tpose_torso_twist", "--rate", "0.5", "--record", tmp_path / "recording")
+    assert graph_up.until(lambda: len(graph_up.received) > 30, timeout=40.0), graph_up.text()
+    for name in NODES:
+        before = graph_up.nodes()
+        assert set(before) == set(NODES)
+        killed = time.monotonic()
+        before[name].kill()
+        pid = before[name].pid
+
+        def restarted(name: str = name, pid: int = pid) -> bool:
+            process = graph_up.nodes().get(name)
+            return process is not None and process.pid != pid
+
+        assert graph_up.until(restarted, timeout=10.0), graph_up.text()
+        graph_up.received.clear()
+        assert graph_up.until(lambda: graph_up.received, timeout=10.0), f"{name}: {graph_up.text()}"
+        print(f"{name}: back after {graph_up.received[0] - killed:.2f} s")
+        assert graph_up.received[0] - killed < 3.0, f"{name}: {graph_up.text()}"
+        assert graph_up.process.poll() is None
+        others = graph_up.nodes()
+        assert all(others[other].pid == before[other].pid for other in NODES if other != name)
+        graph_up.until(lambda: False, timeout=0.7)
+    for name in NODES:
+        assert f"{name} died (killed by signal 9)" in graph_up.text()
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
+    assert graph_up.process.returncode == 0, graph_up.text()
+    with BagReader(tmp_path / "recording") as reader:
+        reader.verify()
+        assert reader.topics[ANGLES].count > 200
+    stamps = sorted(angles_in(tmp_path / "recording", ANGLES))
+    with BagReader(BAGS / "tpose_torso_twist") as reader:
+        first_ns, last_ns = reader.start_ns, reader.end_ns
+    # The player went on where it was, not from the beginning: one pass over the bag, to its end.
+    assert stamps[-1] - stamps[0] < last_ns - first_ns
+    assert stamps[-1] - stamps[0] > 0.8 * (last_ns - first_ns)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_nothing_is_left_behind(up: Callable[..., Up], tmp_path: Path, how: signal.Signals) -> None:
+    graph_up = up("--bag", BAG, "--record", tmp_path / "recording")
+    wanted = set(NODES) if how is signal.SIGINT else {"fusion", "calibration"}
+    assert graph_up.until(lambda: set(graph_up.nodes()) >= wanted, timeout=30.0), graph_up.text()
+    if how is signal.SIGINT:
+        assert graph_up.until(lambda: graph_up.received, timeout=30.0), graph_up.text()
+    nodes = graph_up.nodes().values()
+    graph_up.process.send_signal(how)
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=30.0)
+    assert graph_up.process.returncode == (0 if how is not signal.SIGKILL else -9)
+    _, alive = psutil.wait_procs(list(nodes), timeout=5.0)
+    assert not alive
+    if how is signal.SIGINT:
+        with BagReader(tmp_path / "recording") as reader:
+            assert reader.whole
+
+
+# --- what is refused before anything starts
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert cli.main(["up", *map(str, arguments)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_a_bag_that_is_none_or_has_no_skeletons(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "nowhere" in refusal(capsys, "--bag", tmp_path / "nowhere")
+    with BagWriter(tmp_path / "other") as writer:
+        writer.add_topic("/fused/skeleton", "std_msgs/msg/String")
+        writer.write_message("/fused/skeleton", BAG_MESSAGES.make("std_msgs/msg/String", data=""), 1)
+    assert "no topic /<sensor>/skeleton; it has /fused/skeleton" in refusal(capsys, "--bag", tmp_path / "other")
+    assert "no topic /kinect7/skeleton; its sensors are kinect1, kinect2" in refusal(
+        capsys, "--bag", BAG, "--sensors", "kinect1,kinect7"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("fusion: {ros__parameters: {silense: 1.0}}", "/fusion: unknown parameter 'silense'; did you mean 'silence'?"),
+        ("fusion: {ros__parameters: {silence: 99}}", "/fusion: parameter 'silence': 99, expected 0.02 to 5"),
+        ("/**: {ros__parameters: {filtre: x}}", "/**: unknown parameter 'filtre'"),
+        ("fusoin: {ros__parameters: {silence: 1.0}}", "/fusoin: no such node"),
+        ("fusion: {silence: 1.0}", "holds no ros__parameters"),
+        ("fusion: [", "is not YAML"),
+    ],
+)
+def test_a_parameters_file_with_a_mistake(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, content: str, said: str
+) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(content)
+    line = refusal(capsys, "--bag", BAG, "--params-file", file)
+    assert str(file) in line
+    assert said in line
+
+
+def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "there").write_text("")
+    assert "exists already" in refusal(capsys, "--bag", BAG, "--record", tmp_path / "there")
+    assert "--rate 0" in refusal(capsys, "--bag", BAG, "--rate", "0")
+    assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
+    assert "reserved" in refusal(capsys, "--sensors", "fused")
+    assert "twice" in refusal(capsys, "--sensors", "a,a")
+
+
+# --- parameters
+
+
+def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {world_frame: map, gate: 5}}\n"
+        "fusion: {ros__parameters: {gate: 4}}\n"
+        "skeleton_filter: {ros__parameters: {filter: lkf_constant_velocity, predict_for: 1}}\n"
+        "calibration: {ros__parameters: {calibration_file: mine.yaml}}\n"
+        "bag_recorder: {ros__parameters: {chunk_seconds: 2.0}}\n"  # not started, but part of a graph
+    )
+    options = GraphOptions(filter_name="lkf_zero_velocity")
+    defaults = {"calibration": {"calibration_file": "default.yaml"}}
+    found = parameters_for(graph.nodes_for(options), file, defaults, graph.all_nodes_for(options))
+    assert found["fusion"]["world_frame"] == found["calibration"]["world_frame"] == "map"
+    assert "world_frame" not in found["joint_angles"]
+    assert found["fusion"]["gate"] == 4.0
+    assert found["skeleton_filter"]["filter"] == "lkf_zero_velocity"
+    assert found["skeleton_filter"]["predict_for"] == 1.0
+    assert found["calibration"]["calibration_file"] == "mine.yaml"
+    with pytest.raises(ParameterError, match="no such node"):
+        parameters_for(graph.nodes_for(options), file, defaults)
