@@ -195,7 +195,8 @@ def _start(folder: Path, poses: dict[str, SensorPose]) -> list[subprocess.Popen[
         values = {name: to_ros(value) for name, value in spec.parameters.items()}
         parameters = folder / f"{spec.name}.parameters.yaml"
         parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
-        commands.append(["-m", "body_tracking.nodes", spec.executable, "--ros-args", "--params-file", str(parameters)])
+        arguments = ["--ros-args", "--log-level", "WARN", "--params-file", str(parameters)]
+        commands.append(["-m", "body_tracking.nodes", spec.executable, *arguments])
     commands += [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))]
     return [
         subprocess.Popen([sys.executable, *command], env=environment, start_new_session=True) for command in commands

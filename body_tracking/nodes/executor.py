@@ -11,6 +11,7 @@ shutdown.)
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
 
 from rclpy.exceptions import InvalidHandle
@@ -65,8 +66,13 @@ class LeanExecutor(SingleThreadedExecutor):
         count = NumberOfEntities(len(subscriptions), len(guards), len(timers), len(clients), len(services))
         for waitable in waitables:
             count += waitable.get_num_entities()
-        context: Any = self._context.handle
-        with context:
+        with ExitStack() as used:  # what somebody destroys meanwhile stays until it is no longer waited for
+            context: Any = self._context.handle
+            used.enter_context(context)
+            for entity in (*subscriptions, *timers, *clients, *services, *guards):
+                used.enter_context(entity.handle)
+            for waitable in waitables:
+                used.enter_context(waitable)
             wait_set = _rclpy.WaitSet(
                 count.num_subscriptions,
                 count.num_guard_conditions,
@@ -76,26 +82,26 @@ class LeanExecutor(SingleThreadedExecutor):
                 count.num_events,
                 context,
             )
-        while not self._changed:
-            wait_set.clear_entities()
-            for subscription in subscriptions:
-                wait_set.add_subscription(subscription.handle)
-            for timer in timers:
-                wait_set.add_timer(timer.handle)
-            for client in clients:
-                wait_set.add_client(client.handle)
-            for service in services:
-                wait_set.add_service(service.handle)
-            for guard in guards:
-                wait_set.add_guard_condition(guard.handle)
-            for waitable in waitables:
-                waitable.add_to_wait_set(wait_set)
-            wait_set.wait(-1)
-            if not self._context.ok():
-                return
-            executed = _execute_timers(timers, wait_set) + _execute_subscriptions(subscriptions, wait_set)
-            if not executed and not self._changed:
-                self._spin_once_impl(0)
+            while not self._changed:
+                wait_set.clear_entities()
+                for subscription in subscriptions:
+                    wait_set.add_subscription(subscription.handle)
+                for timer in timers:
+                    wait_set.add_timer(timer.handle)
+                for client in clients:
+                    wait_set.add_client(client.handle)
+                for service in services:
+                    wait_set.add_service(service.handle)
+                for guard in guards:
+                    wait_set.add_guard_condition(guard.handle)
+                for waitable in waitables:
+                    waitable.add_to_wait_set(wait_set)
+                wait_set.wait(-1)
+                if not self._context.ok():
+                    return
+                executed = _execute_timers(timers, wait_set) + _execute_subscriptions(subscriptions, wait_set)
+                if not executed and not self._changed:
+                    self._spin_once_impl(0)
 
 
 def _execute_subscriptions(subscriptions: list[Any], wait_set: Any) -> int:
@@ -111,8 +117,7 @@ def _execute_subscriptions(subscriptions: list[Any], wait_set: Any) -> int:
         if handle.pointer not in ready:
             continue
         executed += 1
-        with handle:
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
+        taken = handle.take_message(subscription.msg_type, subscription.raw)
         if taken is not None:
             arrived.append((taken[1]["source_timestamp"], index, taken))
     arrived.sort(key=lambda each: each[:2])
@@ -129,7 +134,6 @@ def _execute_timers(timers: list[Timer], wait_set: Any) -> int:
         # A timer that was cancelled meanwhile is still among those that woke us.
         if timer.handle.pointer in ready and timer.handle.is_timer_ready():
             executed += 1
-            with timer.handle:
-                timer.handle.call_timer()
+            timer.handle.call_timer()
             timer.callback()
     return executed

@@ -1,0 +1,122 @@
+"""The lean executor runs what rclpy's would: messages, timers, services, and entities that come and go."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from body_tracking.nodes.common import STEADY  # noqa: E402
+from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init(domain_id=random.randint(1, 100))
+    yield rclpy.create_node("lean")
+    rclpy.try_shutdown()
+
+
+class Spinning:
+    """The executor in a thread."""
+
+    def __init__(self, node: rclpy.node.Node) -> None:
+        self.thread = threading.Thread(target=self.spin, args=(LeanExecutor(node),), daemon=True)
+        self.ended: type[BaseException] | None = None
+        self.thread.start()
+
+    def spin(self, executor: LeanExecutor) -> None:
+        try:
+            executor.spin()
+        except BaseException as error:
+            self.ended = type(error)
+
+
+def until(condition: object, timeout: float = 10.0) -> bool:
+    end = time.monotonic() + timeout
+    while not condition():  # type: ignore[operator]
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def test_messages_timers_and_services_are_served_while_others_come_and_go(node: rclpy.node.Node) -> None:
+    texts: list[str] = []
+    later: list[str] = []
+    ticks: list[int] = []
+    publisher = node.create_publisher(String, "text", 10)
+    node.create_subscription(String, "text", lambda message: texts.append(message.data), 10)
+
+    def tick() -> None:
+        ticks.append(1)
+        publisher.publish(String(data=str(len(ticks))))
+        if len(ticks) == 3:  # an entity that appears while others are waited for
+            node.create_subscription(String, "text", lambda message: later.append(message.data), 10)
+
+    timer = node.create_timer(0.02, tick, clock=STEADY)
+    node.create_service(Trigger, "ask", lambda _, response: Trigger.Response(success=True, message="here"))
+    spinning = Spinning(node)
+    assert until(lambda: len(texts) >= 10 and len(later) >= 3)
+    assert texts == [str(number + 1) for number in range(len(texts))]
+
+    other = rclpy.Context()
+    rclpy.init(context=other, domain_id=node.context.get_domain_id())
+    caller = rclpy.create_node("caller", context=other)
+    executor = SingleThreadedExecutor(context=other)
+    executor.add_node(caller)
+    client = caller.create_client(Trigger, "ask")
+    assert client.wait_for_service(10.0)
+    future = client.call_async(Trigger.Request())
+    executor.spin_until_future_complete(future, timeout_sec=10.0)
+    assert future.result().message == "here"
+    rclpy.try_shutdown(context=other)
+
+    node.destroy_timer(timer)
+    time.sleep(0.1)
+    count = len(ticks)
+    time.sleep(0.2)
+    assert len(ticks) == count
+    rclpy.shutdown()
+    spinning.thread.join(10.0)
+    assert spinning.ended is ExternalShutdownException
+
+
+def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
+    spinning = Spinning(node)
+    time.sleep(0.3)
+    before = time.process_time()
+    time.sleep(1.0)
+    assert time.process_time() - before < 0.5
+    rclpy.shutdown()
+    spinning.thread.join(10.0)
+    assert not spinning.thread.is_alive()
+
+
+def test_a_timer_that_is_set_anew_fires_once_each_time(node: rclpy.node.Node) -> None:
+    fired: list[float] = []
+
+    def fire() -> None:
+        timer.cancel()
+        fired.append(time.monotonic())
+        if len(fired) < 5:
+            timer.timer_period_ns = 20_000_000
+            timer.reset()
+
+    timer = node.create_timer(0.02, fire, clock=STEADY)
+    spinning = Spinning(node)
+    assert until(lambda: len(fired) == 5)
+    time.sleep(0.1)
+    assert len(fired) == 5
+    rclpy.shutdown()
+    spinning.thread.join(10.0)

@@ -1,0 +1,71 @@
+"""The ``body_tracking`` command: help, version, and one line for everything that is wrong outside the program."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from body_tracking import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "show", "make-bags")
+
+
+def test_the_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert all(command.split()[0] in text for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*command.split(), "--help"])
+    assert ended.value.code == 0
+    assert f"usage: body_tracking {command}" in capsys.readouterr().out
+
+
+def test_the_version_is_the_manifests(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    version = ElementTree.parse(ROOT / "package.xml").getroot().findtext("version")
+    assert capsys.readouterr().out.strip() == f"body_tracking {version}"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["import", "nowhere.csv", "-o", "bag"],
+        ["bag", "info", "nowhere"],
+        ["replay", "nowhere", "-o", "out"],
+        ["calibrate", "nowhere"],
+        ["show", "nowhere"],
+    ],
+)
+def test_what_is_not_there_is_said_in_one_line(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert len(captured.err.strip().splitlines()) == 1
+    assert captured.err.startswith("body_tracking: ")
+    assert "nowhere" in captured.err
+    assert not captured.out
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_who_leaves_is_no_error() -> None:
+    command = [sys.executable, "-m", "body_tracking.cli", "bag", "info", "--json", str(ROOT / "bags" / "tpose_wave")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.wait(30.0) in (0, 141)
+        assert process.stderr.read() == b""

@@ -1,0 +1,126 @@
+"""The table of the graph holds together, and everyone who starts the graph uses it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import yaml
+
+from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
+from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
+from body_tracking.recording.rosbag2 import is_known
+
+ROOT = Path(__file__).resolve().parent.parent
+LAUNCH = ROOT / "launch" / "two_kinects.launch.py"
+
+VARIANTS = [
+    GraphOptions(),
+    GraphOptions(sensors=("a", "b", "c"), record="somewhere"),
+    GraphOptions(bag="bag", filter_name="lkf_zero_velocity", calibration_file="c.yaml", reliable=True),
+    GraphOptions(bag="bag", record="somewhere", rate=2.0),
+]
+
+
+def named(specs: Sequence[NodeSpec]) -> dict[str, NodeSpec]:
+    return {spec.name: spec for spec in specs}
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+def test_every_parameter_in_the_table_is_one_of_its_node(options: GraphOptions) -> None:
+    pytest.importorskip("rclpy", reason="ROS is not installed")
+    for spec in nodes_for(options):
+        known = {parameter.name: parameter for parameter in graph.parameters_of(spec.executable)}
+        for name, value in {**spec.defaults, **spec.parameters}.items():
+            if name != "use_sim_time":
+                assert known[name].check(value) == value
+
+
+def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
+    live, played = named(nodes_for(GraphOptions())), named(nodes_for(GraphOptions(bag="bag", record="r")))
+    assert {"kinect1_skeleton", "kinect2_skeleton"} <= set(live)
+    assert "bag_player" not in live
+    assert not any(name.endswith("t1_skeleton") for name in played)
+    assert played["bag_player"].parameters["topics"] == ("/kinect1/skeleton", "/kinect2/skeleton")
+    assert not any(spec.parameters.get("use_sim_time") for spec in live.values())
+    assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
+    # Calibration, fusion and recorder listen to the sensors.
+    assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
+    specs = nodes_for(options)
+    assert len(named(specs)) == len(specs)
+    assert {spec.executable for spec in specs} <= set(EXECUTABLES)
+    assert specs[-1].executable in ("bag_player", "kinect_skeleton")
+    assert set(named(specs)) <= set(named(all_nodes_for(options)))
+
+
+@pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
+def test_sensors_that_cannot_be(sensors: tuple[str, ...]) -> None:
+    with pytest.raises(BodyTrackingError):
+        nodes_for(GraphOptions(sensors=sensors))
+
+
+def test_sensors_are_found_among_topics() -> None:
+    topics = ["/b/skeleton", "/a/skeleton", "/fused/skeleton", "/ground_truth/skeleton", "/a/b/skeleton", "/skeleton"]
+    assert graph.sensors_among(topics) == ("a", "b")
+
+
+def test_topics_have_known_types_and_publishers() -> None:
+    assert len({topic.name for topic in TOPICS}) == len(TOPICS)
+    for topic in TOPICS:
+        assert is_known(topic.type_name) or topic.name == graph.TF_STATIC
+        assert topic.publisher in (*EXECUTABLES, "every node")
+
+
+def test_the_parameters_file_is_as_the_code_has_it() -> None:
+    pytest.importorskip("rclpy", reason="ROS is not installed")
+    text = (ROOT / "config" / "body_tracking.yaml").read_text(encoding="utf-8")
+    assert text == graph.config_text(), "run `make docs`"
+    assert set(yaml.safe_load(text)) == set(named(all_nodes_for(GraphOptions())))
+
+
+# `launch` is not on PyPI: that the launch file runs is checked on a ROS install; here, that it compiles, that what it
+# takes from us is there, and that it repeats nothing of the table.
+
+
+def test_the_launch_file_takes_its_nodes_from_the_table() -> None:
+    source = LAUNCH.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    compile(tree, LAUNCH.name, "exec")
+    assert any(isinstance(node, ast.FunctionDef) and node.name == "generate_launch_description" for node in tree.body)
+    imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    ours = {
+        node.module: [alias.name for alias in node.names] for node in imported if "body_tracking" in str(node.module)
+    }
+    assert "nodes_for" in ours["body_tracking.graph"]
+    for module, names in ours.items():
+        found = __import__(str(module), fromlist=names)
+        assert all(hasattr(found, name) for name in names)
+    (node,) = [
+        call
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Node"
+    ]
+    given = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+    assert {name: given[name] for name in ("executable", "name", "namespace")} == {
+        "executable": "spec.executable",
+        "name": "spec.name",
+        "namespace": "spec.namespace",
+    }
+    strings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    assert not strings & {topic.name for topic in TOPICS}
+
+
+def test_the_rviz_view_shows_topics_of_the_graph() -> None:
+    view = yaml.safe_load((ROOT / "rviz" / "body_tracking.rviz").read_text(encoding="utf-8"))
+    displays = view["Visualization Manager"]["Displays"]
+    shown = {display["Topic"]["Value"] for display in displays if "Topic" in display}
+    sensors = {graph.skeleton_topic(sensor) for sensor in graph.DEFAULT_SENSORS}
+    assert shown == sensors | {graph.FUSED, graph.FILTERED}
+    assert view["Visualization Manager"]["Global Options"]["Fixed Frame"] == "world"

@@ -1,0 +1,139 @@
+"""Parameters as data: types, ranges, files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from body_tracking.parameters import (
+    Parameter,
+    ParameterError,
+    as_yaml,
+    check_all,
+    fields_of,
+    matches,
+    parameters_from,
+    read_file,
+    to_ros,
+)
+
+TABLE = (
+    Parameter("gain", 1.0, "how much", unit="m", min=0.0, max=2.0),
+    Parameter("count", 3, "how many", min=1, max=9),
+    Parameter("mode", "fast", "how", choices=("fast", "slow")),
+    Parameter("active", True, "whether"),
+    Parameter("names", (), "who"),
+)
+
+
+def test_what_is_given_is_taken_and_the_rest_is_default() -> None:
+    values = check_all(TABLE, {"gain": 2, "names": ["a", "", "b"]})
+    assert values == {"gain": 2.0, "count": 3, "mode": "fast", "active": True, "names": ("a", "b")}
+    assert type(values["gain"]) is float
+
+
+@pytest.mark.parametrize(
+    ("given_values", "said"),
+    [
+        ({"gian": 1.0}, "unknown parameter 'gian'; did you mean 'gain'?"),
+        ({"gain": 2.1}, "'gain': 2.1, expected 0 to 2"),
+        ({"gain": float("nan")}, "'gain': nan, expected 0 to 2"),
+        ({"gain": "1"}, "'gain': '1', expected a number"),
+        ({"gain": True}, "'gain': True, expected a number"),
+        ({"count": 1.0}, "'count': 1.0, expected a whole number"),
+        ({"count": 0}, "'count': 0, expected 1 to 9"),
+        ({"mode": "medium"}, "'mode': 'medium', expected one of fast, slow"),
+        ({"active": 1}, "'active': 1, expected true or false"),
+        ({"names": "a"}, "'names': 'a', expected a list of strings"),
+        ({"names": ["a", 1]}, "expected a list of strings"),
+        ({"gain": None}, "'gain': None, expected a number"),
+    ],
+)
+def test_what_is_not_allowed_is_said_in_one_line(given_values: dict[str, object], said: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        check_all(TABLE, given_values)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.floats(allow_nan=True, allow_infinity=True))
+def test_a_number_is_taken_exactly_when_it_lies_in_its_range(value: float) -> None:
+    parameter = TABLE[0]
+    if 0.0 <= value <= 2.0:
+        assert parameter.check(value) == value
+    else:
+        with pytest.raises(ParameterError):
+            parameter.check(value)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """As the library's parameter classes are written."""
+
+    speed: float = field(default=0.5, metadata={"doc": "how fast", "unit": "m/s", "min": 0.0, "max": 9.0})
+    method: str = field(default="a", metadata={"doc": "how", "choices": ("a", "b")})
+    plain: bool = False
+
+
+def test_a_dataclass_becomes_parameters_and_back() -> None:
+    table = parameters_from(Settings, live=True)
+    assert table == (
+        Parameter("speed", 0.5, "how fast", "m/s", 0.0, 9.0, live=True),
+        Parameter("method", "a", "how", choices=("a", "b"), live=True),
+        Parameter("plain", False, "", live=True),
+    )
+    values = check_all((*table, *TABLE), {"speed": 2})
+    assert Settings(**fields_of(Settings, values)) == Settings(speed=2.0)
+
+
+def test_the_written_file_reads_as_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(as_yaml({"node": TABLE, "other": TABLE[:1]}))
+    sections = read_file(file)
+    assert set(sections) == {"/node", "/other"}
+    assert check_all(TABLE, sections["/node"]) == check_all(TABLE, {})
+    for parameter in TABLE:
+        assert parameter.doc in file.read_text()
+
+
+def test_namespaces_and_dotted_names_may_be_nested(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    content = {"a": {"b": {"ros__parameters": {"x": {"y": 1}, "z": 2}}}, "/a/c": {"ros__parameters": {"z": 3}}}
+    file.write_text(yaml.safe_dump(content))
+    assert read_file(file) == {"/a/b": {"x.y": 1, "z": 2}, "/a/c": {"z": 3}}
+
+
+@pytest.mark.parametrize("content", ["[1, 2]", "a: 1", "a: {ros__parameters: 1}", "a: [", "\x00"])
+def test_a_file_that_is_none(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text(content)
+    with pytest.raises(ParameterError, match=r"parameters\.yaml"):
+        read_file(file)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "node", "match"),
+    [
+        ("/**", "/fusion", True),
+        ("/**", "/a/b/fusion", True),
+        ("/*", "/fusion", True),
+        ("/*", "/a/fusion", False),
+        ("/**/fusion", "/fusion", True),
+        ("/a/*", "/a/fusion", True),
+        ("fusion", "/fusion", True),
+        ("/fusion", "/fusion2", False),
+    ],
+)
+def test_sections_are_about_nodes_as_in_ros(pattern: str, node: str, match: bool) -> None:
+    assert matches(pattern, node) is match
+
+
+def test_an_empty_list_has_a_type_in_ros() -> None:
+    assert to_ros(()) == [""]
+    assert to_ros(("a",)) == ["a"]
+    assert TABLE[4].check(to_ros(())) == ()
