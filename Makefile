@@ -61,8 +61,10 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(STAMP) ## measure the delay from capture to angle
+bench: $(STAMP) ## measure the delay from capture to angle, and the calibration on real recordings
 	$(BIN)/python benchmarks/latency.py
+	@if [ -d "$${BODY_TRACKING_DATA:-../shared/data}/kinect_pairs" ]; then $(BIN)/python benchmarks/real_pairs.py; \
+	else echo "no real recordings here (BODY_TRACKING_DATA names their folder): benchmarks/real_pairs.py is left out"; fi
 
 docs: $(STAMP) ## rewrite what the code defines: tables of README.md, config/
 	$(BIN)/python docs/update.py
