@@ -3,8 +3,8 @@
 Two sensors of 30 Hz that run apart, as two Kinects do (every phase between them occurs), feed the graph's own
 calibration, fusion, filter and angle nodes. Beside them, in the same run and half a frame later each time, the same
 skeleton goes through as many processes that do nothing but publish a ready message of the same type and size for each
-that comes: what a chain of rclpy nodes costs by itself. Delays are from just before a frame is published until its angles are
-received, by one clock, in one process.
+that comes: what a chain of rclpy nodes costs by itself. Delays are from just before a frame is published until its
+angles are received, by one clock, in one process.
 """
 
 from __future__ import annotations
@@ -273,15 +273,12 @@ def main() -> int:
     if args.json:
         print(json.dumps(result, indent=2))
         return 0
-    print(
-        f"capture to joint angles, {len(SENSORS)} sensors at 30 Hz, {len(CHAIN)} processes in series, {args.seconds:g} s"
-    )
+    print(f"capture to joint angles, {len(SENSORS)} sensors at 30 Hz, {len(CHAIN)} processes, {args.seconds:g} s")
     for chain, text in (("graph", "the graph"), ("relay", "bare relays")):
         row = result[chain]
         lost = f", {row['lost']} lost" if row["lost"] else ""
-        print(
-            f"  {text:12} median {row['median_ms']:7.2f} ms   99 % {row['p99_ms']:7.2f} ms   ({row['frames']} frames{lost})"
-        )
+        figures = f"median {row['median_ms']:7.2f} ms   99 % {row['p99_ms']:7.2f} ms"
+        print(f"  {text:12} {figures}   ({row['frames']} frames{lost})")
     ratio = result["ratio"]
     met = all(ratio[key] <= target for key, target in TARGETS.items())
     print(

@@ -3,6 +3,7 @@
 ros2 launch body_tracking two_kinects.launch.py bag:=/path/to/bag record:=/path/to/new/bag filter:=lkf_zero_velocity
 """
 
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, RegisterEventHandler, Shutdown
 from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
@@ -10,7 +11,6 @@ from launch_ros.actions import Node
 
 from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for
 from body_tracking.parameters import to_ros
-from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
 ARGUMENTS = {
     "sensors": (",".join(DEFAULT_SENSORS), "names of the sensors, the reference first"),

@@ -15,7 +15,7 @@ def seen(offset: float, drift: float, seconds: float, seed: int, noise: float = 
     """Stamps in a clock and noisy positions in some frame, of the same walk."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, seconds, 1 / 30) + rng.uniform(0.0, 1 / 30)
-    rotation = Rotation.random(rng=rng).as_matrix()
+    rotation = Rotation.random(None, rng).as_matrix()
     positions = walk(times, still=1.0) @ rotation.T + rng.normal(size=3)
     return times * (1.0 + drift) + offset, positions + rng.normal(scale=noise, size=positions.shape)
 

@@ -18,7 +18,7 @@ from body_tracking.calibration.storage import load, save
 
 def example(seed: int = 0) -> CalibrationResult:
     rng = np.random.default_rng(seed)
-    pose = SensorPose("kinect2", rng.normal(size=3), Rotation.random(rng=rng).as_quat())
+    pose = SensorPose("kinect2", rng.normal(size=3), Rotation.random(None, rng).as_quat())
     return CalibrationResult(
         "kinect1",
         {"kinect1": level_pose("kinect1", 0.9), "kinect2": pose},
