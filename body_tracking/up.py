@@ -54,6 +54,9 @@ BACKOFFS = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 SETTLED = 10.0
 """A node that has run for this long, seconds, is started again at once."""
 
+IN_FLIGHT = 0.3
+"""Angles that come sooner after the start of a node were on their way when its predecessor died, seconds."""
+
 LISTENERS_TIMEOUT = 10.0
 """A source starts after this time even if somebody who should listen does not, seconds."""
 
@@ -217,6 +220,7 @@ class Child:
         started: steady time of its last start, seconds.
         restarts: how often it was started again.
         deaths: how often in a row it died soon after its start.
+        died: steady time of its last death, seconds, while nobody has said that angles come again; else None.
         due: steady time of the next start; None while it runs, or when it is not to run any more.
         done: it has ended on purpose.
     """
@@ -227,6 +231,7 @@ class Child:
     started: float = 0.0
     restarts: int = 0
     deaths: int = 0
+    died: float | None = None
     due: float | None = field(default_factory=time.monotonic)
     done: bool = False
     reader: threading.Thread | None = None
@@ -338,6 +343,9 @@ class Supervisor:
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
                 self._ended(child, now, monitor)
+            if child.died is not None and child.process is not None and monitor.last_angles > child.started + IN_FLIGHT:
+                self.console.line(f"{child.spec.name} is back: angles {monitor.last_angles - child.died:.1f} s later")
+                child.died = None
             if child.due is not None and now >= child.due and self._may_start(child, now, monitor):
                 self._start(child)
 
@@ -391,6 +399,7 @@ class Supervisor:
         child.deaths = 1 if now - child.started > SETTLED else child.deaths + 1
         child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
         child.restarts += 1
+        child.died = now
         if playing and monitor.clock_ns:
             child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
         how = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
