@@ -167,6 +167,9 @@ SERVICES: tuple[tuple[str, str, str], ...] = (
     (RESET_SERVICE, "calibration", "forget the calibration"),
     ("recorder/start", "bag_recorder", "record, into a new file of the same bag"),
     ("recorder/stop", "bag_recorder", "stop recording and close the bag"),
+    ("bag_player/pause", "bag_player", "stand still"),
+    ("bag_player/resume", "bag_player", "go on"),
+    ("bag_player/toggle_paused", "bag_player", "the one or the other"),
 )
 """(name, executable, what it does) of each ``std_srvs/srv/Trigger`` service."""
 

@@ -47,6 +47,9 @@ REPAIR_CLOCK = 0.004
 CLOCK_WINDOW_NS = 5 * NANOSECONDS
 """Length of the windows of motion that each tell the offset of the clock."""
 
+MOVED_SIGMAS = 5.0
+"""A sensor has been moved when its pose is this many standard deviations from the saved one."""
+
 CLOCK_STEP = 1.0
 """A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
 
@@ -366,7 +369,7 @@ class OnlineCalibration:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
                 self._follow_clock(other, horizon)
-            self._estimate(other)
+            self._estimate(name, other)
 
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
         if min(len(self._track.delays), len(other.track.delays)) < GUESS_FRAMES:
@@ -515,7 +518,7 @@ class OnlineCalibration:
                 other.paired_clock = other.clock
         self._changed = True
 
-    def _estimate(self, other: _Sensor) -> None:
+    def _estimate(self, name: str, other: _Sensor) -> None:
         if other.started is None or len(other.pairs) < 20:
             return
         pairs = other.pairs.pairs()
@@ -525,12 +528,27 @@ class OnlineCalibration:
         other.started = best.rotation, best.translation
         other.turned = best.turned
         if not other.estimated and best.rotation_stddev > other.quality.rotation_stddev:
-            return  # a calibration that was loaded is better than what this session knows so far
+            # A calibration that was loaded is better than what this session knows so far, unless they contradict.
+            if not other.clock_locked or not self._contradicts(best, other):
+                return
+            self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
         other.estimated = True
         other.quality = SensorQuality(
             best.residual, best.rotation_stddev, best.translation_stddev, other.clock_stddev, len(pairs)
         )
         self._aim(other, best.rotation, best.translation, best.centre)
+
+    @staticmethod
+    def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
+        """Whether the published pose is farther from an estimate than both are uncertain."""
+        assert other.rotation is not None
+        apart = Rotation.from_matrix(found.rotation @ other.rotation.T).magnitude()
+        place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
+        shift = np.linalg.norm(place - found.centre)
+        return bool(
+            apart > MOVED_SIGMAS * np.hypot(found.rotation_stddev, other.quality.rotation_stddev)
+            or shift > 0.05 + MOVED_SIGMAS * np.hypot(found.translation_stddev, other.quality.translation_stddev)
+        )
 
     def _remembers_all(self, other: _Sensor) -> bool:
         """Whether the raw frames still reach back to the oldest pair."""
@@ -618,7 +636,7 @@ class OnlineCalibration:
     def finish(self) -> CalibrationResult:
         """The best estimate from everything that was pushed, up to the last frame; for recordings."""
         if self._now is not None and self._anchor is not None and self.parameters.method == "robust":
-            for other in self._sensors.values():
+            for name, other in self._sensors.items():
                 if not other.clock_guessed:
                     continue
                 if other.clock_locked and self._track.stamps[0] <= self._anchor:
@@ -629,7 +647,7 @@ class OnlineCalibration:
                     if self._remembers_all(other):
                         self._pair_anew(other, self._now)
                 self._pair(other, self._now)
-                self._estimate(other)
+                self._estimate(name, other)
         return self.result()
 
     def load(self, result: CalibrationResult) -> None:

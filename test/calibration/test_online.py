@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -230,6 +231,19 @@ def test_a_saved_clock_of_another_session_is_not_believed() -> None:
     for sensor, skeleton, received in stream(20.0, offset=-30.0):
         calibration.push(sensor, skeleton, received)
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
+
+
+def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    saved = run(stream(20.0))[0].result()
+    pose = saved.poses["kinect2"]
+    turned = Rotation.from_euler("z", 20, degrees=True) * Rotation.from_quat(pose.quat_xyzw)
+    saved.poses["kinect2"] = replace(pose, quat_xyzw=turned.as_quat())
+    calibration.load(saved)
+    for sensor, skeleton, received in stream(20.0):
+        calibration.push(sensor, skeleton, received)
+    assert any("does not stand where" in event for event in calibration.events)
+    assert yaw_error(calibration.finish()) < 1.0
 
 
 def test_a_calibration_of_another_reference_is_refused() -> None:
