@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
@@ -34,8 +33,10 @@ class ClockModel:
 
     def to_reference(self, sensor_ns: int) -> int:
         """The sensor's time to reference time; the inverse of :meth:`to_sensor` to a nanosecond."""
-        elapsed = (sensor_ns - self.offset_ns - self.anchor_ns) / (1.0 + self.drift_ppm * 1e-6)
-        return self.anchor_ns + round(elapsed)
+        # In integers but for the drift's small share: stamps since an epoch have no room for nanoseconds in a float.
+        elapsed = sensor_ns - self.offset_ns - self.anchor_ns
+        drift = self.drift_ppm * 1e-6
+        return self.anchor_ns + elapsed - round(elapsed * (drift / (1.0 + drift)))
 
     @property
     def offset(self) -> float:
@@ -62,6 +63,9 @@ class SensorPose:
     @cached_property
     def rotation(self) -> FloatArray:
         """(3, 3) rotation matrix, optical to world."""
+        # Imported here because it takes a third of a second, and most nodes only pass poses on or have none.
+        from scipy.spatial.transform import Rotation
+
         matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()
         return matrix
 
@@ -79,6 +83,8 @@ def level_pose(sensor: str, height: float = 0.0, pitch: float = 0.0, roll: float
         pitch: radians by which it looks down.
         roll: radians by which it is turned clockwise about its view, seen from behind it.
     """
+    from scipy.spatial.transform import Rotation
+
     optical_to_level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     tilt = Rotation.from_euler("YX", [pitch, roll])
     rotation = tilt * Rotation.from_matrix(optical_to_level)

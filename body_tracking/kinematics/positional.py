@@ -44,8 +44,9 @@ without measurements; so the second is taken, with the densities of human moveme
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.stats import chi2
 
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.motion import joint_densities
@@ -164,7 +165,7 @@ _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
 _MAX_STDDEV: FloatArray = np.where(np.arange(_N_ANGLES) < _N_BETWEEN, np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0))
 """(13,) radians from which an angle is unknown: the standard deviation of a uniform one, over 180 or 360 deg."""
-_SIGNIFICANT = float(np.sqrt(chi2.ppf(0.999, 2)))
+_SIGNIFICANT = math.sqrt(-2.0 * math.log(1.0 - 0.999))  # sqrt of the chi-square quantile for 2 degrees of freedom
 """Standard deviations that a deflection must be long to show a direction."""
 
 

@@ -122,7 +122,8 @@ class CalibrationNode(GraphNode):
         if self.file is None or not self.unsaved:
             return
         try:
-            save(self.calibration.result(), self.file)
+            # What is published, not the estimate that it still moves toward: a restart must not jump.
+            save(self.calibration.current_update().result, self.file)
             self.unsaved = False
         except BodyTrackingError as error:
             self.log_seldom("save", str(error), period_s=60.0)

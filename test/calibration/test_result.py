@@ -24,6 +24,11 @@ def test_a_clock_converts_back_and_forth_to_a_nanosecond(anchor: int, offset: in
     assert abs(clock.to_reference(clock.to_sensor(anchor + elapsed)) - (anchor + elapsed)) <= 1
 
 
+@given(STAMPS, st.integers(-2_000_000_000, 2_000_000_000))
+def test_without_drift_not_a_nanosecond_is_lost_even_since_an_epoch(stamp: int, offset: int) -> None:
+    assert ClockModel(offset, 0.0, 0).to_reference(stamp + offset) == stamp
+
+
 def test_a_fast_clock_runs_ahead() -> None:
     clock = ClockModel(2 * NANOSECONDS, 100.0, 0)
     assert clock.to_sensor(10 * NANOSECONDS) == 12 * NANOSECONDS + 1_000_000
