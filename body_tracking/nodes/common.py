@@ -6,9 +6,12 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import gc
 import signal
+import socket
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -31,6 +34,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
@@ -360,31 +364,71 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 # --- main
 
 
+class _Ending:
+    """Waits for SIGINT and SIGTERM in a thread of its own, and then stops the executor.
+
+    rclpy's own handler shuts the context down at once, from another thread; the main thread may then be destroying the
+    node, and the process crashes now and then. Here everything ends in its order, and a second Ctrl-C waits until a
+    recording is closed.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._asked = False
+        self._executor: LeanExecutor | None = None
+        # Python runs its handlers only between two steps of the main thread, which mostly waits below Python; the byte
+        # that it writes for each signal comes through at once.
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)
+        threading.Thread(target=self._wait, daemon=True).start()
+
+    def _wait(self) -> None:
+        while self._reader.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+            pass
+        with self._lock:
+            self._asked = True
+            if self._executor is not None:
+                self._executor.stop()
+
+    def watch(self, executor: LeanExecutor) -> LeanExecutor:
+        """Stop this executor; at once, if a signal has come already."""
+        with self._lock:
+            self._executor = executor
+            if self._asked:
+                executor.stop()
+        return executor
+
+
 def run(node_class: type[GraphNode]) -> None:
     """``main`` of every node: exit code 0 at its end or on Ctrl-C, 2 with one line when it cannot start."""
     code, node = 0, None
+    faulthandler.enable()  # a crash below Python says where it was
+    ending = _Ending()
     try:
         for file in _parameter_files():
             read_file(file)  # rcl's own complaint takes several lines
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
         # What is there now stays: the collector need not look at it again while frames wait.
         gc.collect()
         gc.freeze()
-        LeanExecutor(node).spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
+        ending.watch(LeanExecutor(node)).spin()
+    except ExternalShutdownException:
         pass
     except BodyTrackingError as error:
         print(f"{node_class.NAME}: {error}", file=sys.stderr)
         code = 2
     except RCLError as error:
-        if node is not None:
+        if node is None:
+            print(f"{node_class.NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+            code = 2
+        elif node.context.ok():
             raise
-        print(f"{node_class.NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-        code = 2
+        # else the node shut itself down between two steps of the executor: the end, like any other
     finally:
-        # A second Ctrl-C must not interrupt the ending: a recording is being closed.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.close()
             with contextlib.suppress(InvalidHandle):

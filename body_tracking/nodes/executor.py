@@ -35,6 +35,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._changed = True
+        self._stopped = False
         self.add_node(node)
         self._node = node
 
@@ -43,13 +44,20 @@ class LeanExecutor(SingleThreadedExecutor):
         self._changed = True
         super().wake()
 
+    def stop(self) -> None:
+        """Make :meth:`spin` return; from any thread."""
+        self._stopped = True
+        self.wake()
+
     def spin(self) -> None:
-        """Execute callbacks until shutdown.
+        """Execute callbacks until :meth:`stop`.
 
         Raises:
             ExternalShutdownException: the context was shut down.
         """
         while self._context.ok():
+            if self._stopped:
+                return
             try:
                 self._spin_same_entities()
             except InvalidHandle:

@@ -318,7 +318,13 @@ def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     with Running(tmp_path) as running:
         running.start("calibration", reliable=True, calibration_file=file)
-        running.start("bag_player", bag=BAG, rate=8.0, reliable=True, wait_for_subscribers='["/kinect1/skeleton"]')
+        running.start(
+            "bag_player",
+            bag=BAG,
+            rate=8.0,
+            reliable=True,
+            wait_for_subscribers='["/kinect1/skeleton", "/kinect2/skeleton"]',
+        )
         assert running.until(lambda: running.processes["bag_player"].poll() is not None, timeout=30.0)
         assert stop(running.processes["calibration"]) == 0
     result = load(file)
