@@ -39,10 +39,13 @@ from body_tracking.calibration.storage import save
 from body_tracking.graph import GraphOptions, nodes_for
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages import (
+    TIME_REFERENCE,
+    TRANSFORM,
     RosMessages,
     angles_to_joint_states,
     cloud_to_skeletons,
     skeletons_to_cloud,
+    time_reference_to_clock,
     to_nanoseconds,
     to_time,
     transform_to_pose,
@@ -56,6 +59,7 @@ from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "tpose_wave"
+TRUE_POSES, TRUE_CLOCKS = "/ground_truth/calibration", "/ground_truth/calibration/clock"
 ROS = RosMessages()
 SENSORS = ("kinect1", "kinect2")
 CHAIN = ("fusion", "skeleton_filter", "joint_angles")
@@ -112,7 +116,7 @@ def _sample(stage: int) -> Skeleton:
 class Bench:
     """Publishes both streams and takes the time of what comes back."""
 
-    def __init__(self, frames: dict[str, list[Skeleton]], seconds: float, warm_up: float) -> None:
+    def __init__(self, frames: dict[str, Stream], seconds: float, warm_up: float) -> None:
         self.frames, self.seconds, self.warm_up = frames, seconds, warm_up
         self.sent: dict[str, dict[int, int]] = {"graph": {}, "relay": {}}
         self.received: dict[str, dict[int, int]] = {"graph": {}, "relay": {}}
@@ -149,8 +153,7 @@ class Bench:
         events += [((k + 0.5) * PERIODS[0], "relay") for k in range(round(end / PERIODS[0]))]
         for at, name in sorted(events):
             due = start + round(at * NANOSECONDS)
-            stream = self.frames[name if name in SENSORS else SENSORS[0]]
-            skeleton = stream[int(at / PERIODS[0]) % len(stream)]
+            skeleton = self.frames[name if name in SENSORS else SENSORS[0]].at(at)
             cloud = skeletons_to_cloud([skeleton], ROS)
             cloud.header.stamp = to_time(due, ROS)
             time.sleep(max(0, due - time.perf_counter_ns()) / NANOSECONDS)
@@ -166,19 +169,35 @@ class Bench:
         return np.array(delays) / 1e6, len(sent) - len(delays)
 
 
-def _recorded() -> tuple[dict[str, list[Skeleton]], dict[str, SensorPose]]:
+class Stream:
+    """What one sensor saw, by time: the frames that were lost must not put two sensors out of step."""
+
+    def __init__(self, skeletons: list[Skeleton], clock: ClockModel) -> None:
+        self._skeletons = skeletons
+        self._times = np.array([clock.to_reference(each.stamp_ns) for each in skeletons])
+
+    def at(self, seconds: float) -> Skeleton:
+        """The frame nearest to a time since the recording's start, which begins anew at its end."""
+        first, last = int(self._times[0]), int(self._times[-1])
+        wanted = first + round(seconds * NANOSECONDS) % (last - first)
+        return self._skeletons[int(np.abs(self._times - wanted).argmin())]
+
+
+def _recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
     """Skeletons of a shipped recording, and where its sensors really stood."""
     frames: dict[str, list[Skeleton]] = {name: [] for name in SENSORS}
     poses: dict[str, SensorPose] = {}
+    clocks = {name: ClockModel() for name in SENSORS}
     with BagReader(BAG) as reader:
         for message in reader.messages([graph.skeleton_topic(name) for name in SENSORS]):
             skeleton = cloud_to_skeletons(deserialize(reader.topics[message.topic].type_name, message.cdr))[0]
             frames[message.topic.split("/")[1]].append(skeleton)
-        truth = "/ground_truth/calibration"
-        for message in reader.messages([truth]):
-            pose = transform_to_pose(deserialize(reader.topics[truth].type_name, message.cdr))
+        for message in reader.messages([TRUE_POSES]):
+            pose = transform_to_pose(deserialize(TRANSFORM, message.cdr))
             poses[pose.sensor] = pose
-    return frames, poses
+        for message in reader.messages([TRUE_CLOCKS]):
+            sensor, _, clocks[sensor] = time_reference_to_clock(deserialize(TIME_REFERENCE, message.cdr))
+    return {name: Stream(skeletons, clocks[name]) for name, skeletons in frames.items()}, poses
 
 
 def _start(folder: Path, poses: dict[str, SensorPose]) -> list[subprocess.Popen[bytes]]:
