@@ -31,6 +31,9 @@ CLOCK_JUMP = 1.0
 DUE_MARGIN = 0.002
 """A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
 
+PATIENCE = 5
+"""A sensor whose due frame came too late for this many outputs in a row is not waited for until one comes in time."""
+
 FASTEST = 8.0
 """No joint moves faster than this along an axis, metres per second."""
 
@@ -151,6 +154,7 @@ class _Sensor:
     def clear(self) -> None:
         self.frames: deque[_Frame] = deque(maxlen=8)
         self._steps: deque[float] = deque(maxlen=7)
+        self.in_vain = 0  # outputs in a row for which its frame was due and did not come in time
 
     def remember(self, frame: _Frame, step: float | None) -> None:
         """Keep a frame, and how long after the one before it came, if it is of one run with that."""
@@ -342,8 +346,11 @@ class Fusion:
             if other and stamp - self._beat(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
                 del self._pending[0]
                 continue
-            if now_ns < deadline and self._waits(stamp):
+            due = self._due(stamp)
+            if now_ns < deadline and any(source.in_vain < PATIENCE for source in due):
                 break
+            for source in self._sensors.values():
+                source.in_vain = source.in_vain + 1 if source in due else 0
             del self._pending[0]
             skeleton = self._fuse(stamp)
             if skeleton is not None:
@@ -356,15 +363,16 @@ class Fusion:
             return self._last_ns
         return min((source.frames[0].since_ns for source in self._sensors.values() if source.frames), default=stamp)
 
-    def _waits(self, stamp: int) -> bool:
-        """Whether a calibrated sensor's frame captured up to a time is due and has not arrived."""
+    def _due(self, stamp: int) -> list[_Sensor]:
+        """The calibrated sensors whose frame captured up to a time should be here and is not."""
+        due = []
         for source in self._sensors.values():
             if not source.frames or source.pose(stamp) is None:
                 continue
             age = (stamp - source.to_reference(source.frames[-1].stamp_ns)) / NANOSECONDS
             if 0.0 < age < self.parameters.silence and age > source.period - DUE_MARGIN:
-                return True
-        return False
+                due.append(source)
+        return due
 
     @property
     def deadline_ns(self) -> int | None:

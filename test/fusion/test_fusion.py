@@ -163,6 +163,17 @@ def test_a_frame_waits_only_for_one_that_is_due() -> None:
     assert len(made.poll(now + 10_000_000)) == 1
 
 
+def test_a_sensor_that_is_always_late_is_not_waited_for_every_time() -> None:
+    made = fusion(max_wait=0.05)
+    late = [(s, k, now + (75_000_000 if s == "kinect2" else 0)) for s, k, now in frames(4.0)]
+    waited = []
+    for sensor, skeleton, now in sorted(late, key=lambda each: each[2]):
+        made.push(sensor, skeleton, now)
+        waited.append(made.deadline_ns is not None)
+    assert any(waited[:40])
+    assert not any(waited[60:])
+
+
 def test_the_order_of_the_sensors_does_not_matter() -> None:
     there = run(fusion(), frames(4.0, 0.01))
     back = Fusion(("kinect2", "kinect1"), FusionParameters(fade_in=0.0), reference="kinect1")
