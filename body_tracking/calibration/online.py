@@ -238,7 +238,6 @@ class _Sensor:
         self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
         self.clock = ClockModel()
         self.quality = SensorQuality()
-        self.t_pose = False
         self.turned = 0.0
         self.forget()
 
@@ -424,8 +423,7 @@ class OnlineCalibration:
                 rotation, translation, residual = still_pose_registration(own[1:], theirs[1:])
             except CalibrationError:
                 return
-            other.t_pose = is_t_pose(np.nanmean(own[1], axis=0))
-            pose = "T-pose" if other.t_pose else "still pose"
+            pose = "T-pose" if is_t_pose(np.nanmean(own[1], axis=0)) else "still pose"
             self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
