@@ -1,0 +1,373 @@
+"""The default model: an upper body on a free base, in anatomical joint order (DESIGN 5).
+
+Pelvis, lower and upper trunk, head, and per side clavicle, upper arm, forearm and hand. All segment frames are aligned
+with the world (x forward, y left, z up) in the neutral-zero pose of clinical goniometry: upright, arms hanging, elbows
+straight, palms inwards and thumbs forward. Every angle is zero there, and positive in the direction of its name:
+
+=====================  =========================================================================================
+lumbar, thoracic       flexion (forward), lateral (leans to the right), axial (turns to the left), in this order
+neck                   flexion, lateral
+clavicle               protraction (shoulder forward), elevation (shoulder up)
+shoulder               a ball joint; its tangent is (x, y, z) of the upper arm's own frame
+elbow, forearm         flexion, then pronation (the thumb turns inwards)
+wrist                  flexion (towards the palm), deviation (towards the thumb)
+=====================  =========================================================================================
+
+The lumbar joint lies at SpineBase, the thoracic one at SpineMid, both clavicles at SpineShoulder, the neck at Neck.
+With all 19 points seen, two directions of the tangent space move none of them: turning the lower trunk about its own
+axis and the upper trunk back, and turning the upper trunk about its axis while both shoulders keep their place (one
+clavicle protracts, the other retracts). They touch four angles, :data:`UNOBSERVED`; where the trunk is bent, a little of
+its other angles too. A straight elbow adds the humerus turning against pronation on that side. ``test_upper_body.py``
+computes all of this.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.model import Linearisation, ModelError, Posture
+from body_tracking.skeleton import FloatArray, IntArray, Joint
+
+_X, _Y, _Z = np.eye(3)
+
+SEGMENTS: tuple[str, ...] = (
+    "pelvis",
+    "lower_trunk",
+    "upper_trunk",
+    "head",
+    "clavicle_left",
+    "clavicle_right",
+    "upper_arm_left",
+    "upper_arm_right",
+    "forearm_left",
+    "forearm_right",
+    "hand_left",
+    "hand_right",
+)
+"""Parents before children."""
+
+PARENTS: Final = (-1, 0, 1, 2, 2, 2, 4, 5, 6, 7, 8, 9)
+"""Index of each segment's parent; -1 for the base."""
+
+# segment: the axes of the joint that connects it to its parent, one after the other; None for a ball joint
+_AXES: tuple[tuple[tuple[str, FloatArray], ...] | None, ...] = (
+    None,
+    (("lumbar_flexion", _Y), ("lumbar_lateral", _X), ("lumbar_axial", _Z)),
+    (("thoracic_flexion", _Y), ("thoracic_lateral", _X), ("thoracic_axial", _Z)),
+    (("neck_flexion", _Y), ("neck_lateral", _X)),
+    (("clavicle_protraction_left", -_Z), ("clavicle_elevation_left", _X)),
+    (("clavicle_protraction_right", _Z), ("clavicle_elevation_right", -_X)),
+    None,
+    None,
+    (("elbow_flexion_left", -_Y), ("forearm_pronation_left", -_Z)),
+    (("elbow_flexion_right", -_Y), ("forearm_pronation_right", _Z)),
+    (("wrist_flexion_left", -_X), ("wrist_deviation_left", -_Y)),
+    (("wrist_flexion_right", _X), ("wrist_deviation_right", -_Y)),
+)
+
+SHOULDER_AXES: Final = {"left": (-_Y, _X, -_Z), "right": (-_Y, -_X, _Z)}
+"""Axes of flexion, abduction and inward rotation, intrinsic in this order, where the ball joint is told as angles."""
+
+UNOBSERVED: tuple[str, ...] = (
+    "lumbar_axial",
+    "thoracic_axial",
+    "clavicle_protraction_left",
+    "clavicle_protraction_right",
+)
+"""Angles that all 19 points together leave undetermined; only ranges of motion bound them."""
+
+# length: fraction of the stature. Trunk, arms and hands by Drillis and Contini (1966) in Winter (2009), figure 4.1,
+# with the widths between the joint centres that a Kinect v2 shows; thumb and hand points as that sensor places them.
+_LENGTHS: dict[str, float] = {
+    "lower_trunk": 0.140,
+    "upper_trunk": 0.148,
+    "neck": 0.040,
+    "head": 0.075,
+    "clavicle_left": 0.103,
+    "clavicle_right": 0.103,
+    "upper_arm_left": 0.172,
+    "upper_arm_right": 0.172,
+    "forearm_left": 0.146,
+    "forearm_right": 0.146,
+    "hand_left": 0.050,
+    "hand_right": 0.050,
+    "hand_tip_left": 0.045,
+    "hand_tip_right": 0.045,
+    "thumb_along_left": 0.050,
+    "thumb_along_right": 0.050,
+    "thumb_out_left": 0.027,
+    "thumb_out_right": 0.027,
+    "hip_width_left": 0.046,
+    "hip_width_right": 0.046,
+    "hip_drop": 0.018,
+}
+LENGTHS: tuple[str, ...] = tuple(_LENGTHS)
+
+# point: segment that carries it, and its place there as a sum of lengths along directions
+_POINTS: tuple[tuple[Joint, str, tuple[tuple[str, FloatArray], ...]], ...] = (
+    (Joint.SPINE_BASE, "pelvis", ()),
+    (Joint.HIP_LEFT, "pelvis", (("hip_width_left", _Y), ("hip_drop", -_Z))),
+    (Joint.HIP_RIGHT, "pelvis", (("hip_width_right", -_Y), ("hip_drop", -_Z))),
+    (Joint.SPINE_MID, "lower_trunk", (("lower_trunk", _Z),)),
+    (Joint.SPINE_SHOULDER, "upper_trunk", (("upper_trunk", _Z),)),
+    (Joint.NECK, "upper_trunk", (("upper_trunk", _Z), ("neck", _Z))),
+    (Joint.HEAD, "head", (("head", _Z),)),
+    (Joint.SHOULDER_LEFT, "clavicle_left", (("clavicle_left", _Y),)),
+    (Joint.SHOULDER_RIGHT, "clavicle_right", (("clavicle_right", -_Y),)),
+    (Joint.ELBOW_LEFT, "upper_arm_left", (("upper_arm_left", -_Z),)),
+    (Joint.ELBOW_RIGHT, "upper_arm_right", (("upper_arm_right", -_Z),)),
+    (Joint.WRIST_LEFT, "forearm_left", (("forearm_left", -_Z),)),
+    (Joint.WRIST_RIGHT, "forearm_right", (("forearm_right", -_Z),)),
+    (Joint.HAND_LEFT, "hand_left", (("hand_left", -_Z),)),
+    (Joint.HAND_RIGHT, "hand_right", (("hand_right", -_Z),)),
+    (Joint.HAND_TIP_LEFT, "hand_left", (("hand_left", -_Z), ("hand_tip_left", -_Z))),
+    (Joint.HAND_TIP_RIGHT, "hand_right", (("hand_right", -_Z), ("hand_tip_right", -_Z))),
+    (Joint.THUMB_LEFT, "hand_left", (("thumb_along_left", -_Z), ("thumb_out_left", _X))),
+    (Joint.THUMB_RIGHT, "hand_right", (("thumb_along_right", -_Z), ("thumb_out_right", _X))),
+)
+
+# where each segment's frame stands: at a point of its parent
+_ORIGINS: tuple[Joint, ...] = (
+    Joint.SPINE_BASE,
+    Joint.SPINE_BASE,
+    Joint.SPINE_MID,
+    Joint.NECK,
+    Joint.SPINE_SHOULDER,
+    Joint.SPINE_SHOULDER,
+    Joint.SHOULDER_LEFT,
+    Joint.SHOULDER_RIGHT,
+    Joint.ELBOW_LEFT,
+    Joint.ELBOW_RIGHT,
+    Joint.WRIST_LEFT,
+    Joint.WRIST_RIGHT,
+)
+
+_BASE = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
+
+
+class UpperBody:
+    """The model ``upper_body``: 26 joint angles on a free base, 19 points, 12 segments, 21 lengths.
+
+    Configuration (35): base position, base quaternion xyzw, then joint by joint in the order of ``coordinate_names``,
+    with a quaternion xyzw for each shoulder. Tangent (32): base position in world, base rotation in the pelvis' own
+    frame, then joint by joint, with three numbers in the upper arm's own frame for each shoulder.
+
+    Attributes:
+        name, joints, segment_names, coordinate_names, length_names, nq, nv: see ``model.BodyModel``.
+        parents: index of each segment's parent, -1 for the base.
+        segment_coordinates: (12,) for each segment the slice of the tangent that turns it against its parent.
+    """
+
+    name = "upper_body"
+    segment_names = SEGMENTS
+    parents = PARENTS
+    length_names = LENGTHS
+
+    def __init__(self) -> None:
+        names = list(_BASE)
+        self.segment_coordinates: list[slice] = [slice(3, 6)]
+        q_scalar: list[int] = []
+        v_scalar: list[int] = []
+        q_ball: list[int] = [3]
+        v_ball: list[int] = [3]
+        ball_segments: list[int] = [0]
+        scalar_segments: list[int] = []
+        axes = np.zeros((len(SEGMENTS), 3, 3))
+        v_of_axis: list[int] = []
+        nq = 7
+        for segment, joint in enumerate(_AXES):
+            if segment == 0:
+                continue
+            start = len(names)
+            if joint is None:
+                side = "left" if SEGMENTS[segment].endswith("left") else "right"
+                names += [f"shoulder_{axis}_{side}" for axis in "xyz"]
+                q_ball.append(nq)
+                v_ball.append(start)
+                ball_segments.append(segment)
+                nq += 4
+            else:
+                scalar_segments.append(segment)
+                for number, (name, axis) in enumerate(joint):
+                    axes[segment, number] = axis
+                    q_scalar.append(nq + number)
+                    v_scalar.append(start + number)
+                    v_of_axis.append(3 * (len(scalar_segments) - 1) + number)
+                    names.append(name)
+                nq += len(joint)
+            self.segment_coordinates.append(slice(start, len(names)))
+        self.coordinate_names: tuple[str, ...] = tuple(names)
+        self.nq, self.nv = nq, len(names)
+        self.joints: IntArray = np.array([point[0] for point in _POINTS], dtype=np.intp)
+
+        self._quaternion_of = {
+            SEGMENTS[s]: slice(start, start + 4) for s, start in zip(ball_segments, q_ball, strict=True)
+        }
+        # configuration and tangent
+        self.scalar_q: IntArray = np.array(q_scalar, dtype=np.intp)
+        self.scalar_v: IntArray = np.array(v_scalar, dtype=np.intp)
+        self._quat_q: IntArray = (np.array(q_ball)[:, None] + np.arange(4)).astype(np.intp)
+        self._quat_v: IntArray = (np.array(v_ball)[:, None] + np.arange(3)).astype(np.intp)
+
+        # rotations of the joints: exp(angle [axis]x) = 1 + sin [axis]x + (1 - cos) [axis]x^2
+        self._scalar_segments = np.array(scalar_segments, dtype=np.intp)
+        self._ball_segments = np.array(ball_segments, dtype=np.intp)
+        self._axis = axes[scalar_segments]
+        self._axis_slot: IntArray = np.array(v_of_axis, dtype=np.intp)
+        self._generator = so3.skew(self._axis)
+        self._generator_squared = self._generator @ self._generator
+
+        # the tree: levels of segments that can be computed at once
+        depth = [0] * len(SEGMENTS)
+        for segment, parent in enumerate(PARENTS[1:], start=1):
+            depth[segment] = depth[parent] + 1
+        self._levels = [
+            (
+                np.array([s for s in range(len(SEGMENTS)) if depth[s] == level], dtype=np.intp),
+                np.array([PARENTS[s] for s in range(len(SEGMENTS)) if depth[s] == level], dtype=np.intp),
+            )
+            for level in range(1, max(depth) + 1)
+        ]
+        point_of = {joint: number for number, (joint, _, _) in enumerate(_POINTS)}
+        segment_of = [SEGMENTS.index(name) for _, name, _ in _POINTS]
+        self._point_segment: IntArray = np.array(segment_of, dtype=np.intp)
+        self._origin_point: IntArray = np.array([point_of[joint] for joint in _ORIGINS], dtype=np.intp)
+        self._path = np.zeros((len(_POINTS), len(_POINTS)))
+        for point, segment in enumerate(segment_of):
+            self._path[point, point] = 1.0
+            while segment > 0:
+                self._path[point, self._origin_point[segment]] = 1.0
+                # the origin is a point of the parent, and hangs on the parent's own origin
+                segment = PARENTS[segment]
+        self._offsets = np.zeros((len(_POINTS), 3, len(LENGTHS)))
+        for point, (_, _, parts) in enumerate(_POINTS):
+            for name, direction in parts:
+                self._offsets[point, :, LENGTHS.index(name)] = direction
+
+        # which coordinates turn which segment, and move which point
+        turns = np.zeros((len(SEGMENTS), self.nv))
+        for segment, parent in enumerate(PARENTS):
+            if parent >= 0:
+                turns[segment] = turns[parent]
+            turns[segment, self.segment_coordinates[segment]] = 1.0
+        self._turns = turns[:, 3:]
+        self._moves = self._turns[segment_of][:, None, :]
+        self._coordinate_segment: IntArray = np.array(
+            [
+                next(s for s, c in enumerate(self.segment_coordinates) if c.start <= v < c.stop)
+                for v in range(3, self.nv)
+            ],
+            dtype=np.intp,
+        )
+        self._scalar_columns = self.scalar_v - 3
+        self._ball_columns = (self._quat_v - 3).reshape(-1)
+        self._scalar_parent: IntArray = np.array([PARENTS[s] for s in scalar_segments], dtype=np.intp)
+
+    def neutral(self) -> FloatArray:
+        """(35,) the neutral-zero pose at the world's origin, facing x."""
+        q = np.zeros(self.nq)
+        q[self._quat_q[:, 3]] = 1.0
+        return q
+
+    def default_lengths(self, stature: float = 1.75) -> FloatArray:
+        """(21,) metres, of a person of average proportions (Drillis and Contini 1966)."""
+        return stature * np.array(list(_LENGTHS.values()))
+
+    def quaternion_of(self, segment: str) -> slice:
+        """Where a configuration holds the quaternion xyzw of a segment against its parent: pelvis, upper arms."""
+        return self._quaternion_of[segment]
+
+    def integrate(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """(..., 35) the configuration (..., 35) moved by the tangent vector (..., 32)."""
+        leading = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
+        moved = np.empty((*leading, self.nq))
+        moved[..., :3] = q[..., :3] + v[..., :3]
+        moved[..., self.scalar_q] = q[..., self.scalar_q] + v[..., self.scalar_v]
+        turned = so3.quat_multiply(q[..., self._quat_q], so3.exp(v[..., self._quat_v]))
+        # products of unit quaternions leave the unit sphere by a rounding error each
+        moved[..., self._quat_q] = turned / np.sqrt((turned * turned).sum(axis=-1, keepdims=True))
+        return moved
+
+    def difference(self, q0: FloatArray, q1: FloatArray) -> FloatArray:
+        """(..., 32) the shortest ``v`` with ``integrate(q0, v) == q1``."""
+        leading = np.broadcast_shapes(q0.shape[:-1], q1.shape[:-1])
+        v = np.empty((*leading, self.nv))
+        v[..., :3] = q1[..., :3] - q0[..., :3]
+        v[..., self.scalar_v] = q1[..., self.scalar_q] - q0[..., self.scalar_q]
+        relative = so3.quat_multiply(so3.quat_inverse(q0[..., self._quat_q]), q1[..., self._quat_q])
+        v[..., self._quat_v] = so3.log(relative)
+        return v
+
+    def forward(self, q: FloatArray, lengths: FloatArray) -> Posture:
+        """Forward kinematics.
+
+        Args:
+            q: (..., 35) configurations.
+            lengths: (..., 21) metres.
+
+        Raises:
+            ModelError: the last dimension of an argument is another.
+        """
+        _, rotations = self._rotations(q)
+        return self._place(q, lengths, rotations)[1]
+
+    def linearise(self, q: FloatArray, lengths: FloatArray) -> Linearisation:
+        """Forward kinematics and its derivatives; arguments and errors as of :meth:`forward`."""
+        axes, rotations = self._rotations(q)
+        by_lengths, posture = self._place(q, lengths, rotations)
+        # a segment turns with the axes of all joints up to it, and a point moves by axis x (point - origin)
+        generators = (axes @ so3.SKEW).reshape(*axes.shape[:-1], 3, 3)
+        centres = posture.origins[..., self._coordinate_segment, :]
+        arms = np.moveaxis(generators, -3, -2)  # (..., 3, 29, 3)
+        swept = (arms * centres[..., None, :, :]).sum(axis=-1)
+        shape = arms.shape[:-3]
+        flat = arms.reshape(*shape, -1, 3)
+        moved = (posture.positions @ flat.swapaxes(-1, -2)).reshape(*shape, -1, 3, self.nv - 3)
+        jacobian = np.empty((*shape, len(self.joints), 3, self.nv))
+        jacobian[..., :3] = np.eye(3)
+        jacobian[..., 3:] = (moved - swept[..., None, :, :]) * self._moves
+        turning = np.zeros((*shape, len(SEGMENTS), 3, self.nv))
+        turning[..., 3:] = axes.swapaxes(-1, -2)[..., None, :, :] * self._turns[:, None, :]
+        return Linearisation(posture, jacobian, by_lengths, turning)
+
+    def _rotations(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(..., 29, 3) axes of the rotational coordinates, and (..., 12, 3, 3) rotations of the segments, in world."""
+        if q.shape[-1] != self.nq:
+            raise ModelError(f"upper_body: a configuration of {q.shape[-1]} numbers, expected {self.nq}")
+        leading = q.shape[:-1]
+        angles = np.zeros((*leading, 3 * len(self._scalar_segments)))
+        angles[..., self._axis_slot] = q[..., self.scalar_q]
+        angles = angles.reshape(*leading, -1, 3, 1, 1)
+        steps = np.eye(3) + np.sin(angles) * self._generator + (1.0 - np.cos(angles)) * self._generator_squared
+        two = steps[..., 0, :, :] @ steps[..., 1, :, :]
+        local = np.empty((*leading, len(SEGMENTS), 3, 3))
+        local[..., self._scalar_segments, :, :] = two @ steps[..., 2, :, :]
+        local[..., self._ball_segments, :, :] = so3.quat_to_matrix(q[..., self._quat_q])
+
+        world = local  # the base has its own already; the others are turned in place, parents first
+        for segments, parents in self._levels:
+            world[..., segments, :, :] = world[..., parents, :, :] @ local[..., segments, :, :]
+
+        in_parent = np.empty((*leading, len(self._scalar_segments), 3, 3))
+        in_parent[..., 0] = self._axis[:, 0]
+        in_parent[..., 1] = (steps[..., 0, :, :] @ self._axis[:, 1, :, None])[..., 0]
+        in_parent[..., 2] = (two @ self._axis[:, 2, :, None])[..., 0]
+        in_world = (world[..., self._scalar_parent, :, :] @ in_parent).swapaxes(-1, -2)
+        axes = np.empty((*leading, self.nv - 3, 3))
+        axes[..., self._scalar_columns, :] = in_world.reshape(*leading, -1, 3)[..., self._axis_slot, :]
+        balls = world[..., self._ball_segments, :, :].swapaxes(-1, -2)
+        axes[..., self._ball_columns, :] = balls.reshape(*leading, -1, 3)
+        return axes, world
+
+    def _place(self, q: FloatArray, lengths: FloatArray, rotations: FloatArray) -> tuple[FloatArray, Posture]:
+        """(..., 19, 3, 21) derivatives of the points by the lengths, in which they are linear, and the posture."""
+        if lengths.shape[-1] != len(LENGTHS):
+            raise ModelError(f"upper_body: {lengths.shape[-1]} segment lengths, expected {len(LENGTHS)}")
+        own = rotations[..., self._point_segment, :, :] @ self._offsets
+        shape = own.shape
+        by_lengths = (self._path @ own.reshape(*shape[:-2], -1)).reshape(shape)
+        positions = q[..., None, :3] + (by_lengths @ lengths[..., None, :, None])[..., 0]
+        return by_lengths, Posture(positions, positions[..., self._origin_point, :], rotations)
