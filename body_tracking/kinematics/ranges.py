@@ -1,0 +1,129 @@
+"""Ranges of motion: soft limits of the angles of ``upper_body``, and what is known of an angle that nothing observes.
+
+A range is no wall: people differ, and the frames of a sensor's skeleton are not those of a goniometer. Limits push back
+softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one with the
+range's centre and standard deviation (that of a uniform distribution over the range).
+
+Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
+motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
+(1990), table 2-5, summed over T12-S1 (lumbar) and T1-T12 (thoracic); Ludewig et al., J. Bone Joint Surg. Am. 91 (2009)
+378, for the clavicle against the thorax, with the elevation lowered because a Kinect's shoulder points hang low; the
+cone of the shoulder by Engin and Tumer, J. Biomech. Eng. 111 (1989) 113. The bounds are theirs rounded outwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import FloatArray, IntArray
+
+RANGES: dict[str, tuple[float, float]] = {
+    "lumbar_flexion": (-35.0, 65.0),
+    "lumbar_lateral": (-30.0, 30.0),
+    "lumbar_axial": (-15.0, 15.0),
+    "thoracic_flexion": (-25.0, 45.0),
+    "thoracic_lateral": (-30.0, 30.0),
+    "thoracic_axial": (-40.0, 40.0),
+    "neck_flexion": (-60.0, 60.0),
+    "neck_lateral": (-45.0, 45.0),
+    "clavicle_protraction": (-25.0, 30.0),
+    "clavicle_elevation": (-25.0, 40.0),
+    "elbow_flexion": (-5.0, 150.0),
+    "forearm_pronation": (-90.0, 90.0),
+    "wrist_flexion": (-75.0, 80.0),
+    "wrist_deviation": (-40.0, 30.0),
+}
+"""Degrees: (least, greatest) of each joint angle, of either side; a Kinect's hand point makes the wrist's wider."""
+
+SHOULDER_SWING = 130.0
+"""Degrees by which an upper arm may point away from the centre of its reach."""
+SHOULDER_TWIST = 110.0
+"""Degrees by which it may be turned about itself against the shortest way there, to either side."""
+TWIST_SHARING_STDDEV = 12.0
+"""Degrees, at unit share: how far lumbar and thoracic axial rotation depart from sharing a twist by their ranges."""
+
+_REACH = {"left": np.array([np.sin(np.pi / 4), np.cos(np.pi / 4), 0.0])}
+_REACH["right"] = _REACH["left"] * [1.0, -1.0, 1.0]
+"""Where the centre of the reach is, in the clavicle's frame: horizontally, half forward and half to the side."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SoftCoordinates:
+    """The quantities that ranges are about, at one configuration.
+
+    Attributes:
+        values: (..., 26) radians: the tangent's coordinates after the base; for a shoulder the rotation vector from the
+            centre of its reach.
+        gradients: (..., 26, 26) by the same tangent coordinates; the identity but for the shoulders.
+    """
+
+    values: FloatArray
+    gradients: FloatArray
+
+
+class Ranges:
+    """The ranges of ``upper_body``.
+
+    Attributes:
+        low, high: (26,) radians, of :class:`SoftCoordinates`.
+        centre, stddev: (26,) radians: what is known of a coordinate by its range.
+        coordinates: the slice of the tangent vector that they are about.
+    """
+
+    def __init__(self, model: UpperBody) -> None:
+        self._model = model
+        names = model.coordinate_names
+        self.coordinates = slice(6, model.nv)
+        low, high = np.empty(model.nv - 6), np.empty(model.nv - 6)
+        for number, name in enumerate(names[6:]):
+            kind = name.removesuffix("_left").removesuffix("_right")
+            if kind.startswith("shoulder"):
+                bound = SHOULDER_TWIST if kind.endswith("_z") else SHOULDER_SWING
+                low[number], high[number] = -bound, bound
+            else:
+                low[number], high[number] = RANGES[kind]
+        self.low: FloatArray = np.radians(low)
+        self.high: FloatArray = np.radians(high)
+        self.centre: FloatArray = 0.5 * (self.low + self.high)
+        self.stddev: FloatArray = (self.high - self.low) / np.sqrt(12.0)
+        self._scalar_soft = model.scalar_v - 6
+        starts = [names.index(f"shoulder_x_{side}") for side in _REACH]
+        self._soft: IntArray = (np.array(starts)[:, None] - 6 + np.arange(3)).astype(np.intp)
+        self._quaternions: IntArray = np.array(
+            [[model.quaternion_of(f"upper_arm_{side}").start + k for k in range(4)] for side in _REACH], dtype=np.intp
+        )
+        hanging = np.array([0.0, 0.0, -1.0])
+        self._to_centre: FloatArray = so3.quat_inverse(
+            so3.exp(np.array([0.5 * np.pi * np.cross(hanging, reach) for reach in _REACH.values()]))
+        )
+
+    def soft_coordinates(self, q: FloatArray) -> SoftCoordinates:
+        """The bounded quantities of configurations (..., nq)."""
+        values = np.empty((*q.shape[:-1], len(self.low)))
+        values[..., self._scalar_soft] = q[..., self._model.scalar_q]
+        turned = so3.log(so3.quat_multiply(self._to_centre, q[..., self._quaternions]))
+        values[..., self._soft] = turned
+        gradients = np.zeros((*values.shape, len(self.low)))
+        gradients[...] = np.eye(len(self.low))
+        jacobian = so3.right_jacobian_inverse(turned)
+        for side, rows in enumerate(self._soft):
+            gradients[..., rows[:, None], rows] = jacobian[..., side, :, :]
+        return SoftCoordinates(values, gradients)
+
+    def excess(self, q: FloatArray) -> FloatArray:
+        """(..., 26) radians by which configurations (..., nq) leave the ranges; 0 inside.
+
+        The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
+        """
+        values = self.soft_coordinates(q).values
+        excess = np.maximum(values - self.high, 0.0) + np.minimum(values - self.low, 0.0)
+        for rows in self._soft:
+            swing = values[..., rows[:2]]
+            size = np.sqrt((swing * swing).sum(axis=-1, keepdims=True))
+            over = np.maximum(size - np.radians(SHOULDER_SWING), 0.0)
+            excess[..., rows[:2]] = swing * (over / np.maximum(size, 1e-12))
+        return excess
