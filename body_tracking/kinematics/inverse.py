@@ -1,0 +1,287 @@
+"""Inverse kinematics of ``upper_body``: from the points of one frame to a configuration.
+
+A closed form finds the pose from the directions between the points, whatever it is; damped least squares (Levenberg
+1944, Marquardt 1963) then fit the points by their noise, with the ranges of motion as priors. The filter starts from it
+and comes back to it after a loss; offline it is a method of its own, frame by frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import BoolArray, FloatArray, Joint
+
+_J = Joint
+_TINY = 1e-9
+_STRAIGHT = 0.15
+"""Sine of the elbow's flexion below which the forearm does not show how the upper arm is turned about itself."""
+_LIMIT_STDDEV = np.radians(4.0)
+"""How softly the ranges of motion push back."""
+_HUBER = 2.5
+"""Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The pose that fits one frame.
+
+    Attributes:
+        q: (nq,) configuration.
+        covariance: (nv, nv) of the tangent at ``q``, by the noise of the points and the ranges of motion.
+        residuals: (m, 3) metres, measured minus fitted; NaN where a point was not measured.
+        cost: half the sum of the squared, normalised (and bounded) residuals and priors.
+        iterations: of the least squares.
+    """
+
+    q: FloatArray
+    covariance: FloatArray
+    residuals: FloatArray
+    cost: float
+    iterations: int
+
+
+class InverseKinematics:
+    """Fits ``upper_body`` to points."""
+
+    def __init__(self, model: UpperBody, ranges: Ranges | None = None) -> None:
+        self.model = model
+        self.ranges = ranges or Ranges(model)
+        self._point = {Joint(joint): number for number, joint in enumerate(model.joints)}
+        names = model.coordinate_names
+        self._column = {name: number for number, name in enumerate(names)}
+        scalars = [names[v] for v in model.scalar_v]
+        self._scalar = {name: int(model.scalar_q[number]) for number, name in enumerate(scalars)}
+        self._twist = np.zeros(model.nv)
+        lumbar, thoracic = (self._column[f"{part}_axial"] for part in ("lumbar", "thoracic"))
+        # each takes of the twist what its range allows
+        self._twist[lumbar] = 1.0 / self.ranges.high[lumbar - 6]
+        self._twist[thoracic] = -1.0 / self.ranges.high[thoracic - 6]
+        self._twist /= np.abs(self._twist).max()
+
+    def start(self, positions: FloatArray) -> FloatArray:
+        """A configuration in closed form, from the directions between the points; no lengths are needed.
+
+        What missing points leave open is neutral.
+
+        Args:
+            positions: (19, 3) metres, in world; NaN where a point is not measured.
+
+        Returns:
+            (35,) configuration.
+
+        Raises:
+            ModelError: SpineBase, SpineMid and SpineShoulder show no trunk at all.
+        """
+        point = {joint: positions[number] for joint, number in self._point.items()}
+        base, mid, top = (point[joint] for joint in (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER))
+        hips = point[_J.HIP_LEFT] - point[_J.HIP_RIGHT]
+        shoulders = point[_J.SHOULDER_LEFT] - point[_J.SHOULDER_RIGHT]
+        lower, upper = mid - base, top - mid
+        lower, upper = _first(lower, top - base, upper), _first(upper, top - base, lower)
+        if not np.isfinite(lower).all():
+            raise ModelError("inverse kinematics: no two of SpineBase, SpineMid, SpineShoulder are seen")
+        hips, shoulders = _first(hips, shoulders, _perpendicular(lower)), _first(shoulders, hips, _perpendicular(upper))
+
+        q = self.model.neutral()
+        pelvis = _frame(lower, hips)
+        lower_trunk = _frame(lower, _unit(hips) + _unit(shoulders))
+        upper_trunk = _frame(upper, shoulders)
+        origin = _first(base, mid - 0.25 * _unit(lower), top - 0.5 * _unit(lower))
+        q[:3] = origin
+        q[self.model.quaternion_of("pelvis")] = so3.matrix_to_quat(pelvis)
+        self._set_trunk(q, "lumbar", pelvis.T @ lower_trunk)
+        self._set_trunk(q, "thoracic", lower_trunk.T @ upper_trunk)
+        head = upper_trunk.T @ _unit(point[_J.HEAD] - _first(point[_J.NECK], top))
+        if np.isfinite(head).all():
+            q[self._scalar["neck_flexion"]] = np.arctan2(head[0], head[2])
+            q[self._scalar["neck_lateral"]] = -np.arcsin(np.clip(head[1], -1.0, 1.0))
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            self._start_arm(q, point, upper_trunk, top, side, sign)
+        # a damaged or far-fetched direction must not start outside of what a body can do
+        scalar = self.model.scalar_q
+        rows = self.model.scalar_v - 6
+        q[scalar] = np.clip(q[scalar], self.ranges.low[rows], self.ranges.high[rows])
+        return q
+
+    def solve(
+        self,
+        positions: FloatArray,
+        stddev: FloatArray,
+        lengths: FloatArray,
+        q: FloatArray | None = None,
+        *,
+        max_iterations: int = 15,
+        tolerance: float = 1e-4,
+    ) -> Fit:
+        """Damped least squares on the points, with the ranges of motion as priors.
+
+        Args:
+            positions: (19, 3) metres, in world; NaN where a point is not measured.
+            stddev: (19,) metres, of each point, the same in all directions.
+            lengths: (21,) metres.
+            q: (35,) where to start; the closed form where None.
+            max_iterations: at most so many steps.
+            tolerance: of the last step's tangent, radians and metres.
+
+        Raises:
+            ModelError: no trunk is seen, and no start was given.
+        """
+        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        if q is None:
+            q = self.start(np.where(measured[:, None], positions, np.nan))
+        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
+        target = np.where(measured[:, None], positions, 0.0)
+        damping, iteration = 1e-3, 0
+        normal, gradient, cost = self._normal_equations(q, target, weights, lengths)
+        for iteration in range(1, max_iterations + 1):
+            step = np.linalg.solve(normal + damping * np.diag(normal.diagonal()), gradient)
+            moved = self.model.integrate(q, step)
+            new_normal, new_gradient, new_cost = self._normal_equations(moved, target, weights, lengths)
+            if new_cost < cost:
+                done = bool(np.abs(step).max() < tolerance)
+                q, normal, gradient, cost = moved, new_normal, new_gradient, new_cost
+                damping = max(0.1 * damping, 1e-7)
+                if done:
+                    break
+            else:
+                damping *= 10.0
+                if damping > 1e8:
+                    break
+        fitted = self.model.forward(q, lengths).positions
+        residuals = np.where(measured[:, None], positions - fitted, np.nan)
+        return Fit(q, np.linalg.inv(normal), residuals, cost, iteration)
+
+    def _normal_equations(
+        self, q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """(nv, nv) and (nv,) of one Gauss-Newton step, and the cost at ``q``."""
+        lines = self.model.linearise(q, lengths)
+        residual = (target - lines.posture.positions) * weights[:, None]
+        size = np.sqrt((residual * residual).sum(axis=1))
+        bounded = np.minimum(1.0, _HUBER / np.maximum(size, _TINY))
+        jacobian = (lines.jacobian * (weights * np.sqrt(bounded))[:, None, None]).reshape(-1, self.model.nv)
+        error = (residual * np.sqrt(bounded)[:, None]).reshape(-1)
+        normal = jacobian.T @ jacobian
+        gradient = jacobian.T @ error
+        cost = float(np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum())
+
+        soft = self.ranges.soft_coordinates(q)
+        off = soft.values - self.ranges.centre
+        over = self.ranges.excess(q)
+        prior = 1.0 / self.ranges.stddev**2
+        limit = np.where(over != 0.0, 1.0 / _LIMIT_STDDEV**2, 0.0)
+        inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)
+        normal[6:, 6:] += inner
+        gradient[6:] -= soft.gradients.T @ (prior * off + limit * over)
+        twist = float(self._twist[6:] @ soft.values)
+        sharing = 1.0 / np.radians(TWIST_SHARING_STDDEV) ** 2
+        normal += sharing * np.outer(self._twist, self._twist)
+        gradient -= sharing * twist * self._twist
+        # the base is anywhere; with too few points it still must be somewhere
+        normal[np.arange(6), np.arange(6)] += 1e-4
+        cost += 0.5 * float((prior * off**2 + limit * over**2).sum() + sharing * twist**2)
+        return normal, gradient, cost
+
+    def _set_trunk(self, q: FloatArray, part: str, rotation: FloatArray) -> None:
+        """Flexion, lateral and axial angle of an intrinsic y-x-z rotation."""
+        q[self._scalar[f"{part}_flexion"]] = np.arctan2(rotation[0, 2], rotation[2, 2])
+        q[self._scalar[f"{part}_lateral"]] = -np.arcsin(np.clip(rotation[1, 2], -1.0, 1.0))
+        q[self._scalar[f"{part}_axial"]] = np.arctan2(rotation[1, 0], rotation[1, 1])
+
+    def _start_arm(
+        self,
+        q: FloatArray,
+        point: dict[Joint, FloatArray],
+        upper_trunk: FloatArray,
+        top: FloatArray,
+        side: str,
+        sign: float,
+    ) -> None:
+        """From the clavicle to the wrist, as far as points are seen."""
+        shoulder, elbow, wrist, hand, tip, thumb = (
+            point[Joint[f"{name}_{side.upper()}"]] for name in ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
+        )
+        outward = upper_trunk.T @ _unit(shoulder - top)
+        if np.isfinite(outward).all():
+            q[self._scalar[f"clavicle_elevation_{side}"]] = np.arcsin(np.clip(outward[2], -1.0, 1.0))
+            q[self._scalar[f"clavicle_protraction_{side}"]] = np.arctan2(outward[0], sign * outward[1])
+        clavicle = self._rotation(q, f"clavicle_{side}")
+        upper = elbow - shoulder
+        if not np.isfinite(upper).all():
+            return
+        z = -_unit(upper)
+        forearm = _unit(wrist - elbow)
+        x = forearm + z * float(-forearm @ z)
+        # without a bent elbow the arm is turned as by the shortest way from where the reach has its centre
+        if not np.sqrt(x @ x) > _STRAIGHT:
+            reach = np.array([np.sqrt(0.5), sign * np.sqrt(0.5), 0.0])
+            hanging = np.array([0.0, 0.0, -1.0])
+            centre = _shortest(hanging, reach)
+            x = clavicle @ _shortest(reach, clavicle.T @ -z) @ centre[:, 0]
+        arm = np.stack([_unit(x - z * float(x @ z)), np.zeros(3), z], axis=1)
+        arm[:, 1] = np.cross(arm[:, 2], arm[:, 0])
+        q[self.model.quaternion_of(f"upper_arm_{side}")] = so3.matrix_to_quat(clavicle.T @ arm)
+        if not np.isfinite(forearm).all():
+            return
+        q[self._scalar[f"elbow_flexion_{side}"]] = np.arctan2(float(forearm @ arm[:, 0]), float(-forearm @ arm[:, 2]))
+        lower = self._rotation(q, f"forearm_{side}")
+        out = thumb - _first(hand, wrist)
+        out = lower.T @ (out - forearm * float(out @ forearm))
+        if np.isfinite(out).all():
+            q[self._scalar[f"forearm_pronation_{side}"]] = np.arctan2(-sign * out[1], out[0])
+            lower = self._rotation(q, f"forearm_{side}")
+        along = lower.T @ _unit(_first(tip, hand) - wrist)
+        if np.isfinite(along).all():
+            q[self._scalar[f"wrist_deviation_{side}"]] = np.arcsin(np.clip(along[0], -1.0, 1.0))
+            q[self._scalar[f"wrist_flexion_{side}"]] = np.arctan2(-sign * along[1], -along[2])
+
+    def _rotation(self, q: FloatArray, segment: str) -> FloatArray:
+        posture = self.model.forward(q, self.model.default_lengths())
+        rotation: FloatArray = posture.rotations[self.model.segment_names.index(segment)]
+        return rotation
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    """The direction of a vector; NaN where it has none."""
+    size = np.sqrt(v @ v)
+    direction: FloatArray = v / size if size > _TINY else np.full(3, np.nan)
+    return direction
+
+
+def _first(*candidates: FloatArray) -> FloatArray:
+    """The first that is known; the last if none is."""
+    known: BoolArray = np.array([bool(np.isfinite(v).all()) for v in candidates])
+    return candidates[int(known.argmax()) if known.any() else -1]
+
+
+def _perpendicular(v: FloatArray) -> FloatArray:
+    """Some direction across ``v``: horizontal for one that stands."""
+    across = np.cross(v, [1.0, 0.0, 0.0])
+    if across @ across < 1e-4 * (v @ v):
+        across = np.cross(v, [0.0, -1.0, 0.0])
+    return across
+
+
+def _frame(z: FloatArray, y: FloatArray) -> FloatArray:
+    """(3, 3) the frame whose z axis is ``z`` and whose y axis is as near to ``y`` as can be."""
+    z = _unit(z)
+    y = _unit(y - z * float(y @ z))
+    if not np.isfinite(y).all():
+        y = _unit(_perpendicular(z))
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def _shortest(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(3, 3) the shortest rotation that turns direction ``a`` to ``b``."""
+    axis = np.cross(a, b)
+    size = np.sqrt(axis @ axis)
+    if size < _TINY:
+        axis, size = _perpendicular(a), 1.0
+        axis /= np.sqrt(axis @ axis)
+    return so3.quat_to_matrix(so3.exp(axis / size * np.arctan2(np.sqrt(np.cross(a, b) @ np.cross(a, b)), a @ b)))
