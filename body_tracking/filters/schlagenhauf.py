@@ -1,0 +1,329 @@
+"""The thesis's extended Kalman filter, for comparison (Schlagenhauf 2017, chapter 5.5, algorithm 2).
+
+As published: the state is 26 angles and 26 rates (eq. 5.13), the model one of constant angular velocity with a fixed
+time step (eq. 5.16), process and measurement noise are constant, the subject starts in the T-pose, which is theta = 0,
+and the base of the spine stands still where it was then. Segment lengths come from the calibration in the T-pose; a
+missing joint has neither innovation nor gain (eq. 5.21-5.22). The one thing corrected in the filter is line 8: the
+innovation is ``z - h(s)``, not ``z - H s``. (The other errors of DESIGN 4, 1-3, are calibration's and fusion's.)
+
+Its weaknesses are part of it: eight of 26 angles are not observed in the T-pose, six never, and wander; it gates
+nothing; time that passes without a frame does not pass for it. It reports what it believes, covariances that are
+singular along the segments included. ``filters`` has better ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
+from body_tracking.measurement import left_right_axes
+from body_tracking.skeleton import (
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
+
+SCHLAGENHAUF_EKF = "schlagenhauf_ekf"
+
+_STARTS: IntArray = np.array(
+    [Joint.SPINE_BASE, Joint.SPINE_MID]
+    + [Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT, Joint.WRIST_LEFT]
+    + [Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT],
+    dtype=np.intp,
+)
+"""(10,) where the segments of L1 to L10 start (table 3.3); they end at the model's joints."""
+_OTHER_SIDE: IntArray = np.array([0, 1, 6, 7, 8, 9, 2, 3, 4, 5], dtype=np.intp)
+_NARROWEST = 0.05
+"""Metres of shoulders and hips, seen from above, below which they show no heading."""
+
+
+@dataclass(frozen=True, slots=True)
+class SchlagenhaufParameters:
+    """The settings; each field's metadata says what it is, its unit and its range.
+
+    The thesis states Q (figure 5.11, not for what) but neither R nor P(0|0). R is the one with the least position error
+    on simulated people in her three motions (with white noise of 5 and 20 mm and with the errors of simulated sensors),
+    so that the comparison does her no wrong: 4 to 7 mm do as well, 10 mm costs up to 6 mm of position error, 30 mm up to
+    25. P(0|0) is how well a person holds a T-pose; a tenth or three times as much change less than 1 mm.
+
+    Raises:
+        FilterError: a value out of its range.
+    """
+
+    process_noise: float = field(
+        default=1e-4,
+        metadata={
+            "doc": "Q: variance added in every frame to each angle (rad2) and to each rate (rad2/s2); figure 5.11",
+            "unit": "",
+            "min": 1e-12,
+            "max": 1e4,
+        },
+    )
+    measurement_stddev: float = field(
+        default=0.005,
+        metadata={
+            "doc": "square root of R: standard deviation of each coordinate of each measured joint",
+            "unit": "m",
+            "min": 1e-4,
+            "max": 10.0,
+        },
+    )
+    initial_angle_stddev: float = field(
+        default=0.1,
+        metadata={"doc": "square root of P(0|0) of the angles", "unit": "rad", "min": 1e-6, "max": 10.0},
+    )
+    initial_rate_stddev: float = field(
+        default=0.1,
+        metadata={"doc": "square root of P(0|0) of the rates", "unit": "rad/s", "min": 1e-6, "max": 100.0},
+    )
+    time_step: float = field(
+        default=1.0 / 30.0,
+        metadata={
+            "doc": "what passes from frame to frame, whatever their stamps say",
+            "unit": "s",
+            "min": 1e-3,
+            "max": 1.0,
+        },
+    )
+    calibration_frames: int = field(
+        default=50,
+        metadata={
+            "doc": "frames in the T-pose at the start, of which the medians give segment lengths, place and heading; "
+            "section 5.3.1",
+            "unit": "",
+            "min": 1,
+            "max": 10_000,
+        },
+    )
+    reset_gap: float = field(
+        default=1.0,
+        metadata={
+            "doc": "a gap between frames longer than this is counted; it is one step like any other, for a new start "
+            "would need the T-pose",
+            "unit": "s",
+            "min": 0.01,
+            "max": 600.0,
+        },
+    )
+    reorder_window: float = field(
+        default=0.1,
+        metadata={
+            "doc": "a frame older than the last one by no more than this came late and is ignored; an older one is a "
+            "backward jump of time, which starts with a new T-pose",
+            "unit": "s",
+            "min": 0.0,
+            "max": 10.0,
+        },
+    )
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
+            whole = isinstance(item.default, int)
+            kind = int if whole else int | float
+            if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
+                expected = f"a {'whole ' if whole else ''}number from {low} to {high}"
+                raise FilterError(f"filter parameter {item.name}: {value!r}, expected {expected}")
+
+
+class SchlagenhaufKalmanFilter:
+    """Her filter on her model, one step of ``filterpy.kalman.ExtendedKalmanFilter`` a frame.
+
+    Attributes:
+        parameters: the settings.
+        model: her model, placed where the subject stood; at the origin until calibrated.
+        lengths: (10,) metres, L1 to L10; NaN until calibrated.
+        innovations: (10, 3) metres, z - h(s) of the last frame, in the order of the model's joints; NaN where a joint
+            was missing.
+        counters: what happened since the construction, for diagnostics; measured and predicted joints are counted one
+            by one.
+    """
+
+    def __init__(self, parameters: SchlagenhaufParameters | None = None) -> None:
+        """Set up, waiting for the T-pose; the default parameters where None."""
+        self.parameters = parameters or SchlagenhaufParameters()
+        self.counters: dict[str, int] = dict.fromkeys(
+            (
+                "frames",
+                "calibrating",
+                "measured",
+                "predicted",
+                "diverged",
+                "repeated_stamps",
+                "late_frames",
+                "backward_jumps",
+                "gaps",
+                "frame_changes",
+            ),
+            0,
+        )
+        self.reset()
+
+    @property
+    def q(self) -> FloatArray:
+        """(26,) radians: the estimated angles."""
+        return np.array(self._kalman.x[: self.model.nq])
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(26,) radians per second: the estimated rates."""
+        return np.array(self._kalman.x[self.model.nq :])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(52, 52) of angles and rates, P(k|k)."""
+        return np.array(self._kalman.P)
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the T-pose has been seen, and the filter runs."""
+        return bool(np.isfinite(self.lengths).all())
+
+    def reset(self) -> None:
+        """Forget the subject and wait for a T-pose; the counters stay."""
+        self.model = Schlagenhauf26()
+        self.lengths: FloatArray = np.full(len(self.model.length_names), np.nan)
+        self.innovations: FloatArray = np.full((len(self.model.joints), 3), np.nan)
+        self._frame_id: str | None = None
+        self._stamp_ns = 0
+        self._t_pose: deque[FloatArray] = deque(maxlen=self.parameters.calibration_frames)
+        self._start()
+
+    def _start(self) -> None:
+        """s(0|0) is the T-pose at rest."""
+        p, n = self.parameters, self.model.nq
+        kalman = ExtendedKalmanFilter(dim_x=2 * n, dim_z=3 * len(self.model.joints))
+        kalman.x = np.zeros(2 * n)
+        kalman.P = np.diag(np.repeat([p.initial_angle_stddev**2, p.initial_rate_stddev**2], n))
+        kalman.F = np.eye(2 * n) + p.time_step * np.eye(2 * n, k=n)  # eq. 5.16
+        kalman.Q = p.process_noise * np.eye(2 * n)
+        kalman.R = p.measurement_stddev**2 * np.eye(kalman.dim_z)
+        self._kalman = kalman
+
+    def update(self, skeleton: Skeleton) -> Skeleton | None:
+        """One step of algorithm 2.
+
+        Args:
+            skeleton: in a fixed frame with z up, usually ``/fused/skeleton``.
+
+        Returns:
+            The same body at the same stamp: her ten joints with covariance and velocity, and SpineBase where it was in
+            the T-pose, which she takes for exact. The state is the measurement's where it was used, INFERRED where the
+            joint is predicted or fixed; joints that her model does not have are NOT_TRACKED, NaN, with an infinite
+            covariance. None until the frames of the T-pose are complete and show every length, and where the stamp
+            repeats the last one or is a little older.
+        """
+        if not self._takes(skeleton):
+            return None
+        positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
+        if not self.calibrated:
+            self.counters["calibrating"] += 1
+            self._t_pose.append(positions)
+            if len(self._t_pose) == self._t_pose.maxlen:
+                self._calibrate(np.array(self._t_pose))
+            return None
+        measured = skeleton.valid[self.model.joints]
+        self._filter(positions[self.model.joints], measured)
+        return self._output(skeleton, measured)
+
+    def _takes(self, skeleton: Skeleton) -> bool:
+        """Whether a frame is new; forgets the subject where time or place jumped."""
+        p = self.parameters
+        elapsed_ns = skeleton.stamp_ns - self._stamp_ns
+        if self._frame_id is not None:
+            if skeleton.frame_id != self._frame_id:
+                self.counters["frame_changes"] += 1
+                self.reset()
+            elif elapsed_ns == 0:
+                self.counters["repeated_stamps"] += 1
+                return False
+            elif -p.reorder_window * NANOSECONDS <= elapsed_ns < 0:
+                self.counters["late_frames"] += 1
+                return False
+            elif elapsed_ns < 0:
+                self.counters["backward_jumps"] += 1
+                self.reset()
+            elif elapsed_ns > p.reset_gap * NANOSECONDS:
+                self.counters["gaps"] += 1
+        self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
+        self.counters["frames"] += 1
+        return True
+
+    def _calibrate(self, positions: FloatArray) -> None:
+        """Lengths, place and heading from (n, 25, 3) metres in the T-pose; nothing where they show no place or heading.
+
+        A length that is never seen is the other side's, or that of a person of average proportions.
+        """
+        base = _median(positions[:, Joint.SPINE_BASE])
+        axes = _median(left_right_axes(positions))[:, :2]  # of shoulders and hips, seen from above
+        left = axes[np.isfinite(axes).all(axis=1)].sum(axis=0)
+        if not np.isfinite(base).all() or np.hypot(*left) < _NARROWEST:
+            return
+        x, y = left / np.hypot(*left)
+        self.model = Schlagenhauf26(base, np.array([[y, x, 0.0], [-x, y, 0.0], [0.0, 0.0, 1.0]]))
+
+        spans = positions[:, self.model.joints] - positions[:, _STARTS]
+        lengths = _median(np.sqrt((spans * spans).sum(axis=2)))
+        lengths = np.where(np.isfinite(lengths), lengths, lengths[_OTHER_SIDE])
+        average = self.model.default_lengths()
+        known = np.isfinite(lengths)
+        scale = float(np.median(lengths[known] / average[known])) if known.any() else 1.0
+        self.lengths = np.where(known, lengths, scale * average)
+        self._t_pose.clear()
+
+    def _filter(self, positions: FloatArray, measured: BoolArray) -> None:
+        """Predict (lines 2-3) and update (lines 5-9) with (10, 3) metres, of which (10,) are measured."""
+        kalman, n = self._kalman, self.model.nq
+        kalman.predict()
+        here = self.model.linearise(kalman.x[:n], self.lengths)
+        expected = here.posture.positions
+        seen = np.where(measured[:, None], positions, expected)  # no innovation where nothing is seen (eq. 5.21)
+        observation = np.zeros((kalman.dim_z, 2 * n))
+        # rows of zeros give no gain (eq. 5.22)
+        observation[:, :n] = (here.jacobian * measured[:, None, None]).reshape(kalman.dim_z, n)
+        try:
+            kalman.update(seen.ravel(), lambda _: observation, lambda _: expected.ravel())
+            sound = bool(np.isfinite(kalman.x).all() and np.isfinite(kalman.P).all())
+        except (ValueError, np.linalg.LinAlgError):  # S is singular, or holds a NaN or an infinity
+            sound = False
+        self.innovations = np.where(measured[:, None], seen - expected, np.nan)
+        self.counters["measured"] += int(measured.sum())
+        self.counters["predicted"] += int((~measured).sum())
+        if not sound:
+            self.counters["diverged"] += 1
+            self._start()
+
+    def _output(self, skeleton: Skeleton, measured: BoolArray) -> Skeleton:
+        """h(s(k|k)) (line 10) with what P(k|k) says of it."""
+        n, joints = self.model.nq, self.model.joints
+        here = self.model.linearise(self._kalman.x[:n], self.lengths)
+        positions, velocities = np.full((N_JOINTS, 3), np.nan), np.full((N_JOINTS, 3), np.nan)
+        covariances = np.tile(np.diag([np.inf] * 3), (N_JOINTS, 1, 1))
+        states = np.full(N_JOINTS, TrackingState.NOT_TRACKED, dtype=np.uint8)
+        positions[joints] = here.posture.positions
+        velocities[joints] = here.jacobian @ self._kalman.x[n:]
+        covariances[joints] = here.jacobian @ self._kalman.P[:n, :n] @ here.jacobian.swapaxes(1, 2)
+        states[joints] = np.where(measured, skeleton.states[joints], TrackingState.INFERRED)
+        positions[Joint.SPINE_BASE] = self.model.base_position
+        velocities[Joint.SPINE_BASE] = 0.0
+        covariances[Joint.SPINE_BASE] = 0.0
+        states[Joint.SPINE_BASE] = TrackingState.INFERRED
+        return Skeleton(skeleton.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """The median over the first axis of what is not NaN; NaN where all is."""
+    known = np.isfinite(values).any(axis=0)
+    result = np.full(values.shape[1:], np.nan)
+    result[known] = np.nanmedian(values[:, known], axis=0)
+    return result
