@@ -6,9 +6,9 @@ and the base of the spine stands still where it was then. Segment lengths come f
 missing joint has neither innovation nor gain (eq. 5.21-5.22). The one thing corrected in the filter is line 8: the
 innovation is ``z - h(s)``, not ``z - H s``. (The other errors of DESIGN 4, 1-3, are calibration's and fusion's.)
 
-Its weaknesses are part of it: eight of 26 angles are not observed in the T-pose, six never, and wander; it gates
-nothing; time that passes without a frame does not pass for it. It reports what it believes, covariances that are
-singular along the segments included. ``filters`` has better ones.
+Its weaknesses are part of it: of 26 directions in the space of angles six are never observed, eight not in the T-pose,
+and the angles wander along them; it gates nothing; time that passes without a frame does not pass for it. It reports
+what it believes, covariances that are singular along the segments included. ``filters`` has better ones.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class SchlagenhaufParameters:
 
     The thesis states Q (figure 5.11, not for what) but neither R nor P(0|0). R is the one with the least position error
     on simulated people in her three motions (with white noise of 5 and 20 mm and with the errors of simulated sensors),
-    so that the comparison does her no wrong: 4 to 7 mm do as well, 10 mm costs up to 6 mm of position error, 30 mm up to
-    25. P(0|0) is how well a person holds a T-pose; a tenth or three times as much change less than 1 mm.
+    so that the comparison does her no wrong: 4 to 7 mm do as well, 10 mm costs up to 6 mm of position error, 30 mm up
+    to 25. P(0|0) is how well a person holds a T-pose; a tenth of it or three times as much change less than 1 mm.
 
     Raises:
         FilterError: a value out of its range.
