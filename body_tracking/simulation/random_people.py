@@ -1,0 +1,603 @@
+"""Random people who move at random, the truth about them, and white-noise measurements of them.
+
+What the filters of the body model are tested with: everything is drawn from the model's own world (``upper_body`` with
+its ranges of motion), so that whatever a filter gets wrong is the filter's. All chance comes from a generator that the
+caller seeds. A motion is a closed function of time: a whole-body timetable of rests and activity, in which trunk, neck,
+arms and base make minimum-jerk moves (Flash and Hogan 1985) between random postures, with slow waves (0.05 to 0.8 Hz)
+on top. Every angle stays inside its range at every instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import (
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
+
+MODEL: Final = UpperBody()
+"""The body that all random people have."""
+_RANGES: Final = Ranges(MODEL)
+_NAMES: Final = MODEL.coordinate_names[6:]
+
+START_NS = 1_000 * NANOSECONDS
+"""Stamp of time 0."""
+
+STATURES = (1.5, 2.0)
+"""Metres: least and greatest."""
+_PROPORTION_STDDEV = 0.06
+_ASYMMETRY = (0.01, 0.02)
+"""By how much left and right differ, as a share of the length."""
+
+TEMPI = (0.4, 1.6)
+"""Calm and brisk: greatest angular rates of a move are those below times this, shortest durations divided by it."""
+_TRUNK_RATE, _NECK_RATE, _ARM_RATE = np.radians([100.0, 150.0, 200.0])
+_PEAK_OF_MEAN = 1.875
+"""Peak over mean velocity of a minimum-jerk move."""
+_SHORTEST_MOVE = np.radians(90.0)
+"""Shortest duration of a move, seconds, times its greatest rate: 0.9 s of the trunk, 0.45 s of an arm."""
+
+_WAVES = 3
+_WAVE_BAND = (0.05, 0.8)
+"""Hertz."""
+_WAVE_SHARE = 0.25
+"""Amplitude of the waves as a share of half the range, in its middle; at its ends there are none."""
+_RESTLESSNESS = 0.04
+"""What remains of the waves in a rest."""
+
+_SWAY = np.array([0.006, 0.006, 0.002, *np.radians([1.0, 1.0, 1.5])])
+"""Amplitude of a standing person's base: metres, then radians about its own axes."""
+_PELVIS = np.radians([4.0, 6.0, 0.0])
+"""Amplitude by which an active person's pelvis tilts besides."""
+
+POSTURES = ("arms_up", "arms_down", "arms_forward", "t_pose")
+"""Special postures: straight arms, upright trunk."""
+_DIRECTIONS = {
+    "arms_up": (0.0, 0.0, 1.0),
+    "arms_down": (0.0, 0.0, -1.0),
+    "arms_forward": (1.0, 0.0, 0.0),
+    "t_pose": (0.0, 1.0, 0.0),
+}
+"""Of the left arm; the right one mirrored."""
+
+
+class RandomPeopleError(BodyTrackingError):
+    """Something was asked for that no random person can do."""
+
+
+def _half_ranges() -> tuple[FloatArray, FloatArray]:
+    """(26,) centres and half widths of the ranges; postures are drawn as shares u, coordinate = centre + half u."""
+    return _RANGES.centre, 0.5 * (_RANGES.high - _RANGES.low)
+
+
+_CENTRE, _HALF = _half_ranges()
+
+
+def _indices(*starts: str, end: str = "") -> IntArray:
+    return np.array(
+        [k for k, name in enumerate(_NAMES) if name.startswith(starts) and name.endswith(end)], dtype=np.intp
+    )
+
+
+_TRUNK = _indices("lumbar", "thoracic")
+_TWIST = np.array([_NAMES.index("lumbar_axial"), _NAMES.index("thoracic_axial")], dtype=np.intp)
+_NECK = _indices("neck")
+_ARMS = tuple(_indices("clavicle", "shoulder", "elbow", "forearm", "wrist", end=side) for side in ("_left", "_right"))
+"""Per side: clavicle (2), shoulder (3), elbow, forearm, wrist (2)."""
+_SHOULDERS = np.stack([_indices("shoulder", end=side) for side in ("_left", "_right")])
+_SHOULDER_QUATERNIONS = np.array(
+    [[MODEL.quaternion_of(f"upper_arm_{side}").start + k for k in range(4)] for side in ("left", "right")],
+    dtype=np.intp,
+)
+_PELVIS_QUATERNION = MODEL.quaternion_of("pelvis")
+_HANGING: Final = _RANGES.soft_coordinates(MODEL.neutral()).values[_SHOULDERS]
+"""(2, 3) rotation vectors of hanging arms from the centres of their reach."""
+_FROM_CENTRE: Final = so3.quat_inverse(so3.exp(_HANGING))
+"""(2, 4) the upper arms at the centres of their reach, in the clavicles' frames."""
+_MIRROR_ARM = np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+"""A left arm's shares to the right arm's: only the rotation vector of the shoulder changes signs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RandomPerson:
+    """A body.
+
+    Attributes:
+        stature: metres.
+        lengths: (21,) metres, as ``UpperBody.length_names``.
+    """
+
+    stature: float
+    lengths: FloatArray
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> RandomPerson:
+        """A person of 1.5 to 2.0 m whose proportions are 6 % off the average, and left and right 1 to 2 % apart."""
+        stature = rng.uniform(*STATURES)
+        lengths = MODEL.default_lengths(stature)
+        kinds = [name.removesuffix("_left").removesuffix("_right") for name in MODEL.length_names]
+        factors = {kind: 1.0 + _PROPORTION_STDDEV * np.clip(rng.normal(), -2.5, 2.5) for kind in dict.fromkeys(kinds)}
+        apart = {kind: rng.choice([-0.5, 0.5]) * rng.uniform(*_ASYMMETRY) for kind in factors}
+        for number, (name, kind) in enumerate(zip(MODEL.length_names, kinds, strict=True)):
+            side = 1.0 if name.endswith("_left") else -1.0 if name.endswith("_right") else 0.0
+            lengths[number] *= factors[kind] * (1.0 + side * apart[kind])
+        return cls(stature, lengths)
+
+
+def minimum_jerk(share: FloatArray) -> FloatArray:
+    """0 before 0, 1 after 1, minimum-jerk between (Flash and Hogan 1985)."""
+    x = np.clip(share, 0.0, 1.0)
+    result: FloatArray = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    return result
+
+
+class _Course:
+    """Minimum-jerk moves one after the other, with rests between; always between two of its targets.
+
+    ``half`` (d,) makes radians of its shares, ``rate`` is the greatest of its moves in radians per second.
+    """
+
+    def __init__(self, start: FloatArray, half: FloatArray | float = 1.0, rate: float = 1.0) -> None:
+        self.half, self.rate = half, rate
+        self._begins: list[float] = []
+        self._durations: list[float] = []
+        self._targets = [start]
+
+    @property
+    def target(self) -> FloatArray:
+        """Where it is after the last move."""
+        return self._targets[-1]
+
+    @property
+    def end(self) -> float:
+        """When the last move ends."""
+        return self._begins[-1] + self._durations[-1] if self._begins else -np.inf
+
+    def move(self, begin: float, duration: float, target: FloatArray) -> None:
+        """Append a move; no sooner than the last one ends."""
+        self._begins.append(max(begin, self.end))
+        self._durations.append(duration)
+        self._targets.append(target)
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """(n, d) at (n,) seconds."""
+        result: FloatArray = np.tile(self._targets[0], (len(times), 1))
+        if self._begins:
+            share = minimum_jerk((times[:, None] - np.array(self._begins)) / np.array(self._durations))
+            result += share @ np.diff(np.array(self._targets), axis=0)
+        return result
+
+
+class _Waves:
+    """(d,) sums of sinusoids that stay between -1 and 1."""
+
+    def __init__(self, rng: np.random.Generator, size: int, fastest: float) -> None:
+        low, high = _WAVE_BAND[0], max(fastest, 2.0 * _WAVE_BAND[0])
+        self._rates = 2.0 * np.pi * low * (high / low) ** rng.random((size, _WAVES))
+        self._phases = rng.uniform(0.0, 2.0 * np.pi, (size, _WAVES))
+        amplitudes = rng.uniform(0.2, 1.0, (size, _WAVES))
+        self._amplitudes = amplitudes / amplitudes.sum(axis=1, keepdims=True)
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """(n, d) at (n,) seconds."""
+        waves = np.sin(times[:, None, None] * self._rates + self._phases)
+        result: FloatArray = (self._amplitudes * waves).sum(axis=2)
+        return result
+
+
+def _share(degrees: FloatArray, where: IntArray) -> FloatArray:
+    """Angles to shares of the half ranges, not beyond 95 % of them."""
+    result: FloatArray = np.clip((np.radians(degrees) - _CENTRE[where]) / _HALF[where], -0.95, 0.95)
+    return result
+
+
+def _draw_trunk(rng: np.random.Generator) -> FloatArray:
+    """(6,) shares: often upright; lumbar and thoracic axial rotation share the twist roughly by their ranges."""
+    if rng.random() < 0.4:
+        shares, twist = _share(rng.normal(scale=4.0, size=len(_TRUNK)), _TRUNK), 0.1 * rng.normal()
+    else:
+        shares, twist = 0.45 * rng.uniform(-1.0, 1.0, (2, len(_TRUNK))).sum(axis=0), 0.7 * rng.uniform(-1.0, 1.0)
+    shares[np.isin(_TRUNK, _TWIST)] = np.clip(twist, -0.7, 0.7) + 0.25 * rng.uniform(-1.0, 1.0, 2)
+    return shares
+
+
+def _draw_neck(rng: np.random.Generator) -> FloatArray:
+    if rng.random() < 0.4:
+        return _share(rng.normal(scale=5.0, size=len(_NECK)), _NECK)
+    shares: FloatArray = 0.8 * rng.uniform(-1.0, 1.0, len(_NECK))
+    return shares
+
+
+def _draw_arm(rng: np.random.Generator) -> FloatArray:
+    """(9,) shares of a left arm: hanging, or anywhere in its reach."""
+    arm = _ARMS[0]
+    if rng.random() < 0.25:
+        shares = _share(
+            np.array([*rng.normal(scale=3.0, size=2), 0, 0, 0, rng.uniform(5, 25), *rng.normal(scale=10.0, size=3)]),
+            arm,
+        )
+        shares[2:5] = (_HANGING[0] + np.radians(rng.normal(scale=6.0, size=3))) / _HALF[_SHOULDERS[0]]
+        return shares
+    shares = 0.8 * rng.uniform(-1.0, 1.0, len(arm))
+    direction, size = rng.uniform(0.0, 2.0 * np.pi), 0.8 * np.sqrt(rng.random())
+    shares[2:4] = size * np.cos(direction), size * np.sin(direction)
+    return shares
+
+
+def _draw_posture(rng: np.random.Generator, name: str) -> FloatArray:
+    """(26,) shares of a special posture: upright to 2 degrees, elbows straight to 3."""
+    if name not in POSTURES:
+        raise RandomPeopleError(f"unknown posture {name!r}, expected one of {', '.join(POSTURES)}")
+    shares = _share(rng.normal(scale=2.0, size=len(_NAMES)), np.arange(len(_NAMES), dtype=np.intp))
+    for side, arm in enumerate(_ARMS):
+        direction = np.array(_DIRECTIONS[name]) * [1.0, 1.0 if side == 0 else -1.0, 1.0]
+        centre = so3.quat_to_matrix(_FROM_CENTRE[side])
+        # the shortest way from the centre of the reach, as a rotation vector in the upper arm's frame there
+        wanted = centre.T @ direction
+        axis = np.cross([0.0, 0.0, -1.0], wanted)
+        swing = np.arctan2(np.linalg.norm(axis), -wanted[2]) * axis / np.linalg.norm(axis)
+        shares[arm[2:5]] = (swing + np.radians([0.0, 0.0, rng.normal(scale=15.0)])) / _HALF[arm[2:5]]
+        shares[arm[5]] = _share(np.array([rng.uniform(0.0, 3.0)]), arm[5:6])[0]
+    return shares
+
+
+class RandomMotion:
+    """How somebody moves, as a function of time.
+
+    Args:
+        rng: where all chance comes from.
+        duration: seconds that are choreographed; afterwards the person rests.
+        tempo: 0.4 calm to 1.6 brisk; drawn (log-uniformly) where it is None.
+        postures: special postures (:data:`POSTURES`) to take, in this order, each held for 1 to 2 s.
+        full_turns: how many full turns of the body to make at least.
+
+    Attributes:
+        tempo: see above.
+
+    Raises:
+        RandomPeopleError: an unknown posture, a duration that is not positive.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        duration: float,
+        tempo: float | None = None,
+        postures: Sequence[str] = (),
+        full_turns: int = 0,
+    ) -> None:
+        if not duration > 0.0:
+            raise RandomPeopleError(f"a motion of {duration} s")
+        low, high = TEMPI
+        self.tempo = low * (high / low) ** rng.random() if tempo is None else tempo
+        fastest = _WAVE_BAND[1] * min(self.tempo, 1.0)
+        self._waves = _Waves(rng, len(_NAMES), fastest)
+        self._pelvis = _Waves(rng, 3, fastest)
+        self._sway = _Waves(rng, 6, 0.5)
+        self._trunk = _Course(_draw_trunk(rng), _HALF[_TRUNK], _TRUNK_RATE)
+        self._neck = _Course(_draw_neck(rng), _HALF[_NECK], _NECK_RATE)
+        left, right = _draw_arm(rng), _draw_arm(rng) * _MIRROR_ARM
+        self._arms = (_Course(left, _HALF[_ARMS[0]], _ARM_RATE), _Course(right, _HALF[_ARMS[1]], _ARM_RATE))
+        self._activity = _Course(np.zeros(1))
+        self._base = _Course(np.array([*self._draw_place(rng), 0.0, rng.uniform(-np.pi, np.pi)]))
+        self._choreograph(rng, duration, list(postures), full_turns)
+
+    def configuration(self, times: FloatArray) -> FloatArray:
+        """(n, 35) configurations of ``UpperBody`` at (n,) seconds."""
+        goal = np.empty((len(times), len(_NAMES)))
+        goal[:, _TRUNK] = self._trunk.at(times)
+        goal[:, _NECK] = self._neck.at(times)
+        for course, arm in zip(self._arms, _ARMS, strict=True):
+            goal[:, arm] = course.at(times)
+        activity = _RESTLESSNESS + (1.0 - _RESTLESSNESS) * self._activity.at(times)
+        waves = self._waves.at(times)
+        waves[:, _TWIST[0]] = 0.7 * waves[:, _TWIST[1]] + 0.3 * waves[:, _TWIST[0]]
+        swing = _SHOULDERS[:, :2]
+        waves[:, swing] /= np.sqrt(2.0)
+        # |u| + a (1 - u^2) <= 1 for |u| <= 1 and a <= 1/2, so that nothing leaves its range; a swing is one quantity
+        room = 1.0 - goal**2
+        room[:, swing] = 1.0 - (goal[:, swing] ** 2).sum(axis=-1, keepdims=True)
+        soft = _CENTRE + _HALF * (goal + _WAVE_SHARE * activity * waves * room)
+
+        q = np.tile(MODEL.neutral(), (len(times), 1))
+        q[:, MODEL.scalar_q] = soft[:, MODEL.scalar_v - 6]
+        q[:, _SHOULDER_QUATERNIONS] = so3.quat_multiply(_FROM_CENTRE, so3.exp(soft[:, _SHOULDERS]))
+        base, sway = self._base.at(times), _SWAY * self._sway.at(times)
+        q[:, :3] = base[:, :3] + sway[:, :3]
+        yaw = np.zeros((len(times), 3))
+        yaw[:, 2] = base[:, 3]
+        tilt = sway[:, 3:] + _PELVIS * activity * self._pelvis.at(times)
+        q[:, _PELVIS_QUATERNION] = so3.quat_multiply(so3.exp(yaw), so3.exp(tilt))
+        return q
+
+    def velocity(self, times: FloatArray) -> FloatArray:
+        """(n, 32) tangent velocities at (n,) seconds; central differences of the closed form, good to 1e-5."""
+        step = 1e-4
+        after, before = self.configuration(times + step), self.configuration(times - step)
+        result: FloatArray = MODEL.difference(before, after) / (2.0 * step)
+        return result
+
+    @staticmethod
+    def _draw_place(rng: np.random.Generator) -> FloatArray:
+        """(2,) metres on the floor: about 2 m in front of the reference sensor."""
+        radius, direction = 0.6 * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
+        return np.array([2.0 + radius * np.cos(direction), radius * np.sin(direction)])
+
+    def _reach(self, course: _Course, begin: float, target: FloatArray, slower: float) -> None:
+        """A move as fast as the tempo allows, or slower by a factor."""
+        way = float(np.abs((target - course.target) * course.half).max())
+        course.move(begin, slower * max(_PEAK_OF_MEAN * way, _SHORTEST_MOVE) / (course.rate * self.tempo), target)
+
+    def _choreograph(self, rng: np.random.Generator, duration: float, postures: list[str], full_turns: int) -> None:
+        time = rng.uniform(0.2, 1.0)
+        while time < duration:
+            if full_turns:
+                full_turns -= 1
+                end = self._turn(rng, time, full=True)
+                time = self._act(rng, time, end) if rng.random() < 0.5 else end
+            if postures:
+                time = self._pose(rng, time, postures.pop(0)) + rng.uniform(1.0, 2.0)
+            if rng.random() < 0.3:
+                self._turn(rng, time, full=rng.random() < 0.25)
+            elif rng.random() < 0.4:
+                self._walk(rng, time)
+            time = self._act(rng, time, time + rng.uniform(1.5, 3.5))
+            time = max(time, self._base.end) + rng.uniform(0.4, 1.6)
+
+    def _act(self, rng: np.random.Generator, begin: float, end: float) -> float:
+        """Trunk, neck and arms move between two instants; when all are done."""
+        ramp = 0.5 / self.tempo
+        self._activity.move(begin, ramp, np.ones(1))
+        together = rng.random() < 0.35
+        left, right = self._arms
+        parts: tuple[tuple[_Course, float, Callable[[np.random.Generator], FloatArray]], ...] = (
+            (self._trunk, 0.7, _draw_trunk),
+            (self._neck, 0.6, _draw_neck),
+            (left, 0.85, _draw_arm),
+            (right, 0.85, lambda rng: _draw_arm(rng) * _MIRROR_ARM),
+        )
+        for course, probability, draw in parts:
+            if rng.random() > probability or (together and course is right):
+                continue
+            time = begin + rng.uniform(0.0, 0.5)
+            while time < end:
+                target, slower = draw(rng), rng.uniform(1.0, 2.0)
+                self._reach(course, time, target, slower)
+                if together and course is left:
+                    self._reach(right, time, target * _MIRROR_ARM, slower)
+                time = course.end + rng.uniform(0.0, 0.6)
+        done = max(end, self._trunk.end, self._neck.end, *(arm.end for arm in self._arms))
+        self._activity.move(done - ramp, ramp, np.zeros(1))
+        return self._activity.end
+
+    def _pose(self, rng: np.random.Generator, begin: float, name: str) -> float:
+        """Take a special posture; when it is reached."""
+        shares = _draw_posture(rng, name)
+        slower = rng.uniform(1.0, 1.5)
+        for course, where in ((self._trunk, _TRUNK), (self._neck, _NECK), *zip(self._arms, _ARMS, strict=True)):
+            self._reach(course, begin, shares[where], slower)
+        return max(self._trunk.end, self._neck.end, *(arm.end for arm in self._arms))
+
+    def _turn(self, rng: np.random.Generator, begin: float, full: bool) -> float:
+        """Turn on the spot; when it is done."""
+        angle = 2.0 * np.pi if full else np.radians(rng.uniform(30.0, 180.0))
+        slowest = 3.5 if full else 0.8
+        duration = max(slowest, angle / np.radians(120.0)) * rng.uniform(0.8, 1.4) / np.sqrt(self.tempo)
+        self._base.move(begin, duration, self._base.target + [0.0, 0.0, 0.0, rng.choice([-1.0, 1.0]) * angle])
+        return self._base.end
+
+    def _walk(self, rng: np.random.Generator, begin: float) -> None:
+        """One to three steps of 0.2 to 0.6 m, towards some place, the knees giving a little."""
+        for _ in range(rng.integers(1, 4)):
+            way = self._draw_place(rng) - self._base.target[:2]
+            way *= min(1.0, rng.uniform(0.2, 0.6) / float(np.linalg.norm(way)))
+            place = self._base.target.copy()
+            place[:2] += way
+            place[2] = rng.uniform(-0.04, 0.01)
+            place[3] += np.radians(rng.normal(scale=10.0))
+            self._base.move(begin, rng.uniform(0.5, 0.8) / np.sqrt(self.tempo), place)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What is true of a person at n instants.
+
+    Attributes:
+        times: (n,) seconds.
+        q: (n, 35) configurations of ``UpperBody``.
+        velocity: (n, 32) tangent velocities, per second.
+        lengths: (21,) metres.
+        positions: (n, 19, 3) metres, ``UpperBody.joints`` in world.
+        speeds: (n, 19) metres per second of these points.
+    """
+
+    times: FloatArray
+    q: FloatArray
+    velocity: FloatArray
+    lengths: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+
+
+def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0, jitter: float = 0.001) -> FloatArray:
+    """(n,) seconds at which a sensor takes its frames: in its rate, with a jitter of this standard deviation."""
+    times = np.arange(0.0, duration, 1.0 / rate)
+    # a stamp has whole nanoseconds, and no frame comes before the one ahead of it
+    moved = times + np.clip(rng.normal(scale=jitter, size=len(times)), -0.3 / rate, 0.3 / rate)
+    result: FloatArray = np.round(moved * NANOSECONDS) / NANOSECONDS
+    return result
+
+
+def truth_of(person: RandomPerson, motion: RandomMotion, times: FloatArray) -> Truth:
+    """What is true of a person who moves like this, at (n,) seconds."""
+    q, velocity = motion.configuration(times), motion.velocity(times)
+    linear = MODEL.linearise(q, person.lengths)
+    speeds = np.linalg.norm((linear.jacobian @ velocity[:, None, :, None])[..., 0], axis=-1)
+    return Truth(times, q, velocity, person.lengths, linear.posture.positions, speeds)
+
+
+ARMS: Final[dict[str, tuple[Joint, ...]]] = {
+    side: tuple(Joint[f"{part}_{side}"] for part in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB"))
+    for side in ("LEFT", "RIGHT")
+}
+"""The joints of an arm without the shoulder."""
+EVERYTHING: Final = tuple(Joint)
+_LOSABLE: Final = (
+    ARMS["LEFT"],
+    ARMS["RIGHT"],
+    (Joint.SHOULDER_LEFT, *ARMS["LEFT"]),
+    (Joint.SHOULDER_RIGHT, *ARMS["RIGHT"]),
+    ARMS["LEFT"][1:],
+    ARMS["RIGHT"][1:],
+    (*ARMS["LEFT"], *ARMS["RIGHT"]),
+    (Joint.HEAD, Joint.NECK),
+    (Joint.SPINE_BASE, Joint.HIP_LEFT, Joint.HIP_RIGHT),
+    (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Dropout:
+    """Joints that are not tracked for a time.
+
+    Attributes:
+        begin, end: seconds.
+        joints: which.
+    """
+
+    begin: float
+    end: float
+    joints: tuple[Joint, ...]
+
+
+def draw_dropouts(
+    rng: np.random.Generator,
+    count: int,
+    between: tuple[float, float],
+    longest: float = 1.0,
+    everything: float = 0.0,
+) -> tuple[Dropout, ...]:
+    """Dropouts of a limb, of the head, of a part of the trunk, or of a few joints.
+
+    Args:
+        rng: where all chance comes from.
+        count: how many.
+        between: seconds within which they lie.
+        longest: seconds; the shortest is 0.1 s.
+        everything: probability that a dropout is one of all joints.
+    """
+    dropouts = []
+    for _ in range(count):
+        length = min(rng.uniform(0.1, longest), between[1] - between[0])
+        begin = rng.uniform(between[0], between[1] - length)
+        if rng.random() < everything:
+            joints = EVERYTHING
+        elif rng.random() < 0.8:
+            joints = _LOSABLE[rng.integers(len(_LOSABLE))]
+        else:
+            some = rng.choice(MODEL.joints, size=int(rng.integers(1, 7)), replace=False)
+            joints = tuple(Joint(joint) for joint in some)
+        dropouts.append(Dropout(begin, begin + length, joints))
+    return tuple(dropouts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementErrors:
+    """How the truth is measured.
+
+    Attributes:
+        noise: metres, standard deviation per axis of the white Gaussian noise.
+        factors: (25,) of the noise per joint, or None for 1.
+        dropouts: joints that are not tracked for a time.
+        gaps: (begin, end) seconds of which no frame arrives at all.
+        outliers: share of the joint samples that are displaced in a random direction.
+        outlier_size: metres, greatest displacement; uniform from 0.
+        outliers_between: seconds within which there are outliers.
+
+    Raises:
+        RandomPeopleError: a negative noise, a share that is none.
+    """
+
+    noise: float
+    factors: FloatArray | None = None
+    dropouts: tuple[Dropout, ...] = ()
+    gaps: tuple[tuple[float, float], ...] = ()
+    outliers: float = 0.0
+    outlier_size: float = 1.0
+    outliers_between: tuple[float, float] = (-np.inf, np.inf)
+
+    def __post_init__(self) -> None:
+        if not self.noise >= 0.0:
+            raise RandomPeopleError(f"measurement noise of {self.noise} m")
+        if not 0.0 <= self.outliers <= 1.0:
+            raise RandomPeopleError(f"a share of outliers of {self.outliers}")
+        if self.factors is not None and self.factors.shape != (N_JOINTS,):
+            raise RandomPeopleError(f"noise factors: shape {self.factors.shape}, expected {(N_JOINTS,)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What was measured of n instants.
+
+    Attributes:
+        skeletons: of the frames that arrived, in frame ``world``.
+        frames: for each of them, which instant of the truth it is.
+        seen: (n, 19) which points of the model were measured; none in a gap.
+        outlier: (n, 19) which of them are outliers.
+    """
+
+    skeletons: tuple[Skeleton, ...]
+    frames: IntArray
+    seen: BoolArray
+    outlier: BoolArray
+
+
+def observe(truth: Truth, errors: MeasurementErrors, rng: np.random.Generator) -> Observation:
+    """Skeletons as a fusion would hand them out that knows nothing of their noise (no covariances).
+
+    The joints of the legs, which the model does not have, are NOT_TRACKED.
+    """
+    times, points = truth.times, MODEL.joints
+    shape = (len(times), len(points))
+    seen: BoolArray = np.ones(shape, dtype=np.bool_)
+    for dropout in errors.dropouts:
+        during = (times >= dropout.begin) & (times < dropout.end)
+        seen &= ~(during[:, None] & np.isin(points, dropout.joints))
+    arrived: BoolArray = np.ones(len(times), dtype=np.bool_)
+    for begin, end in errors.gaps:
+        arrived &= (times < begin) | (times >= end)
+    seen &= arrived[:, None]
+
+    scale = errors.noise * (np.ones(len(points)) if errors.factors is None else errors.factors[points])
+    measured = truth.positions + scale[:, None] * rng.normal(size=(*shape, 3))
+    begin, end = errors.outliers_between
+    during = (times >= begin) & (times < end)
+    outlier: BoolArray = (rng.random(shape) < errors.outliers) & during[:, None] & seen
+    direction = rng.normal(size=(*shape, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    measured += (outlier * rng.uniform(0.0, errors.outlier_size, shape))[..., None] * direction
+
+    positions = np.full((len(times), N_JOINTS, 3), np.nan)
+    positions[:, points] = np.where(seen[..., None], measured, np.nan)
+    states = np.full((len(times), N_JOINTS), TrackingState.NOT_TRACKED, dtype=np.uint8)
+    states[:, points] = np.where(seen, TrackingState.TRACKED, TrackingState.NOT_TRACKED)
+    frames = np.flatnonzero(arrived)
+    skeletons = tuple(
+        Skeleton(START_NS + round(times[k] * NANOSECONDS), "world", positions[k], states[k]) for k in frames
+    )
+    return Observation(skeletons, frames, seen, outlier)
