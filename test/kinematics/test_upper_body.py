@@ -1,0 +1,319 @@
+"""The default body model: laws of its kinematics and what its points observe."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.model import BodyModel, ModelError
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import PARENTS, SEGMENTS, SHOULDER_AXES, UNOBSERVED, UpperBody
+from body_tracking.skeleton import FloatArray, Joint
+
+MODEL = UpperBody()
+LENGTHS = MODEL.default_lengths()
+STEP = 1e-5
+
+
+def _poses(count: int, seed: int = 3) -> FloatArray:
+    """(count, 35) anywhere within the ranges of motion, bases anywhere."""
+    rng = np.random.default_rng(seed)
+    ranges = Ranges(MODEL)
+    v = np.empty((count, MODEL.nv))
+    v[:, :6] = rng.normal(size=(count, 6))
+    v[:, 6:] = rng.uniform(ranges.low, ranges.high, size=(count, MODEL.nv - 6))
+    return MODEL.integrate(MODEL.neutral(), v)
+
+
+def _lengths(count: int, seed: int = 4) -> FloatArray:
+    return LENGTHS * np.random.default_rng(seed).uniform(0.7, 1.3, size=(count, len(LENGTHS)))
+
+
+def _point(joint: Joint) -> int:
+    return int(np.flatnonzero(MODEL.joints == joint)[0])
+
+
+def _moved(name: str, angle: float) -> FloatArray:
+    v = np.zeros(MODEL.nv)
+    v[MODEL.coordinate_names.index(name)] = angle
+    return MODEL.integrate(MODEL.neutral(), v)
+
+
+def _place(q: FloatArray, joint: Joint) -> FloatArray:
+    place: FloatArray = MODEL.forward(q, LENGTHS).positions[_point(joint)]
+    return place
+
+
+def _null_space(q: FloatArray) -> FloatArray:
+    """(k, 32) orthonormal directions that move none of the 19 points."""
+    jacobian = MODEL.linearise(q, LENGTHS).jacobian.reshape(-1, MODEL.nv)
+    _, values, directions = np.linalg.svd(jacobian)
+    null: FloatArray = directions[int((values > 1e-9 * values[0]).sum()) :]
+    return null
+
+
+def test_it_is_a_body_model() -> None:
+    model: BodyModel = MODEL
+    assert (model.nq, model.nv, len(model.joints), len(model.segment_names), len(model.length_names)) == (
+        35,
+        32,
+        19,
+        12,
+        21,
+    )
+    assert len(set(model.coordinate_names)) == model.nv
+    assert len(set(model.joints.tolist())) == 19
+
+
+def test_neutral_is_a_person_who_stands_upright_and_faces_x() -> None:
+    posture = MODEL.forward(MODEL.neutral(), LENGTHS)
+    np.testing.assert_array_equal(posture.rotations, np.broadcast_to(np.eye(3), (12, 3, 3)))
+    length = dict(zip(MODEL.length_names, LENGTHS, strict=True))
+    trunk = length["lower_trunk"] + length["upper_trunk"]
+    places = dict(zip(MODEL.joints.tolist(), posture.positions, strict=True))
+    np.testing.assert_allclose(places[Joint.SPINE_SHOULDER], [0, 0, trunk], atol=1e-15)
+    np.testing.assert_allclose(places[Joint.HEAD], [0, 0, trunk + length["neck"] + length["head"]], atol=1e-15)
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        y = side * length[f"clavicle_{name}"]
+        wrist = trunk - length[f"upper_arm_{name}"] - length[f"forearm_{name}"]
+        np.testing.assert_allclose(places[Joint[f"SHOULDER_{name.upper()}"]], [0, y, trunk], atol=1e-15)
+        np.testing.assert_allclose(places[Joint[f"WRIST_{name.upper()}"]], [0, y, wrist], atol=1e-15)
+        assert places[Joint[f"THUMB_{name.upper()}"]][0] > 0.0  # thumbs forward
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "direction"),
+    [
+        ("lumbar_flexion", Joint.SPINE_SHOULDER, (1, 0, 0)),
+        ("lumbar_lateral", Joint.SPINE_SHOULDER, (0, -1, 0)),
+        ("lumbar_axial", Joint.SHOULDER_RIGHT, (1, 0, 0)),
+        ("thoracic_flexion", Joint.SPINE_SHOULDER, (1, 0, 0)),
+        ("thoracic_lateral", Joint.SPINE_SHOULDER, (0, -1, 0)),
+        ("thoracic_axial", Joint.SHOULDER_RIGHT, (1, 0, 0)),
+        ("neck_flexion", Joint.HEAD, (1, 0, 0)),
+        ("neck_lateral", Joint.HEAD, (0, -1, 0)),
+        ("clavicle_protraction_left", Joint.SHOULDER_LEFT, (1, 0, 0)),
+        ("clavicle_protraction_right", Joint.SHOULDER_RIGHT, (1, 0, 0)),
+        ("clavicle_elevation_left", Joint.SHOULDER_LEFT, (0, 0, 1)),
+        ("clavicle_elevation_right", Joint.SHOULDER_RIGHT, (0, 0, 1)),
+        ("elbow_flexion_left", Joint.WRIST_LEFT, (1, 0, 0)),
+        ("elbow_flexion_right", Joint.WRIST_RIGHT, (1, 0, 0)),
+        ("forearm_pronation_left", Joint.THUMB_LEFT, (0, -1, 0)),
+        ("forearm_pronation_right", Joint.THUMB_RIGHT, (0, 1, 0)),
+        ("wrist_flexion_left", Joint.HAND_TIP_LEFT, (0, -1, 0)),
+        ("wrist_flexion_right", Joint.HAND_TIP_RIGHT, (0, 1, 0)),
+        ("wrist_deviation_left", Joint.HAND_TIP_LEFT, (1, 0, 0)),
+        ("wrist_deviation_right", Joint.HAND_TIP_RIGHT, (1, 0, 0)),
+    ],
+)
+def test_an_angle_is_positive_in_the_direction_of_its_name(name: str, joint: Joint, direction: tuple[int, ...]) -> None:
+    step = _place(_moved(name, 0.01), joint) - _place(MODEL.neutral(), joint)
+    assert step @ np.array(direction) / np.linalg.norm(step) > 0.99
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_shoulder_axes_flex_abduct_and_turn_inwards(side: str) -> None:
+    elbow, wrist = Joint[f"ELBOW_{side.upper()}"], Joint[f"WRIST_{side.upper()}"]
+    outwards = 1.0 if side == "left" else -1.0
+    slots = [MODEL.coordinate_names.index(f"shoulder_{axis}_{side}") for axis in "xyz"]
+    bent = MODEL.coordinate_names.index(f"elbow_flexion_{side}")
+    steps = []
+    for axis in SHOULDER_AXES[side]:
+        v = np.zeros(MODEL.nv)
+        v[slots] = 0.01 * axis
+        v[bent] = np.pi / 2
+        q0 = MODEL.integrate(MODEL.neutral(), v * (np.arange(MODEL.nv) == bent))
+        q1 = MODEL.integrate(MODEL.neutral(), v)
+        steps.append((_place(q1, elbow) - _place(q0, elbow), _place(q1, wrist) - _place(q0, wrist)))
+    assert steps[0][0][0] > 0.002  # flexion: the elbow goes forwards
+    assert outwards * steps[1][0][1] > 0.002  # abduction: outwards
+    np.testing.assert_allclose(steps[2][0], 0.0, atol=1e-12)  # rotation leaves the elbow
+    assert outwards * steps[2][1][1] < -0.002  # and brings the bent forearm inwards
+
+
+def test_mirrored_angles_are_the_mirrored_person() -> None:
+    rng = np.random.default_rng(8)
+    v = np.zeros(MODEL.nv)
+    v[6:] = rng.uniform(-0.6, 0.6, MODEL.nv - 6)
+    mirrored = np.zeros(MODEL.nv)
+    names = MODEL.coordinate_names
+    for number, name in enumerate(names[6:], start=6):
+        other = name.replace("left", "*").replace("right", "left").replace("*", "right")
+        # about x and z a mirrored rotation has the other sense; the named angles say so already, but the trunk's do not
+        flips = name.startswith(("shoulder_x", "shoulder_z")) or name.endswith(("lateral", "axial"))
+        mirrored[names.index(other)] = -v[number] if flips else v[number]
+    one = MODEL.forward(MODEL.integrate(MODEL.neutral(), v), LENGTHS).positions
+    two = MODEL.forward(MODEL.integrate(MODEL.neutral(), mirrored), LENGTHS).positions
+    order = [
+        _point(Joint[Joint(j).name.replace("LEFT", "*").replace("RIGHT", "LEFT").replace("*", "RIGHT")])
+        for j in MODEL.joints
+    ]
+    np.testing.assert_allclose(two[order], one * [1.0, -1.0, 1.0], atol=1e-14)
+
+
+def test_jacobian_of_the_positions_against_differences() -> None:
+    q, lengths = _poses(20), _lengths(20)
+    analytic = MODEL.linearise(q, lengths).jacobian
+    step = STEP * np.eye(MODEL.nv)
+    plus = MODEL.forward(MODEL.integrate(q[:, None], step), lengths[:, None]).positions
+    minus = MODEL.forward(MODEL.integrate(q[:, None], -step), lengths[:, None]).positions
+    numeric = np.moveaxis((plus - minus) / (2.0 * STEP), 1, -1)
+    np.testing.assert_allclose(analytic, numeric, rtol=0, atol=1e-7)
+
+
+def test_jacobian_of_the_rotations_against_differences() -> None:
+    q, lengths = _poses(20), _lengths(20)
+    analytic = MODEL.linearise(q, lengths).rotation_jacobian
+    step = STEP * np.eye(MODEL.nv)
+    plus = MODEL.forward(MODEL.integrate(q[:, None], step), lengths[:, None]).rotations
+    minus = MODEL.forward(MODEL.integrate(q[:, None], -step), lengths[:, None]).rotations
+    turned = so3.log(so3.matrix_to_quat(plus @ minus.swapaxes(-1, -2))) / (2.0 * STEP)
+    np.testing.assert_allclose(analytic, np.moveaxis(turned, 1, -1), rtol=0, atol=1e-7)
+
+
+def test_positions_are_linear_in_the_lengths() -> None:
+    q, lengths = _poses(20), _lengths(20)
+    linear = MODEL.linearise(q, lengths)
+    from_lengths = (linear.length_jacobian @ lengths[:, None, :, None])[..., 0]
+    np.testing.assert_allclose(linear.posture.positions - q[:, None, :3], from_lengths, rtol=0, atol=1e-14)
+    step = 1e-3 * np.eye(len(LENGTHS))
+    plus = MODEL.forward(q[:, None], lengths[:, None] + step).positions
+    minus = MODEL.forward(q[:, None], lengths[:, None] - step).positions
+    numeric = np.moveaxis((plus - minus) / 2e-3, 1, -1)
+    np.testing.assert_allclose(linear.length_jacobian, numeric, rtol=0, atol=1e-11)
+
+
+def test_integrate_and_difference_are_inverse_to_each_other() -> None:
+    q0, q1 = _poses(200, seed=1), _poses(200, seed=2)
+    v = MODEL.difference(q0, q1)
+    back = MODEL.integrate(q0, v)
+    np.testing.assert_allclose(MODEL.difference(q1, back), 0.0, atol=1e-12)
+    small = np.random.default_rng(9).uniform(-1.5, 1.5, size=(200, MODEL.nv))
+    np.testing.assert_allclose(MODEL.difference(q0, MODEL.integrate(q0, small)), small, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(MODEL.integrate(q0, np.zeros(MODEL.nv)), q0, rtol=0, atol=1e-15)
+
+
+def test_configurations_keep_unit_quaternions() -> None:
+    q = MODEL.neutral()
+    rng = np.random.default_rng(12)
+    for _ in range(500):
+        q = MODEL.integrate(q, rng.normal(size=MODEL.nv))
+    for segment in ("pelvis", "upper_arm_left", "upper_arm_right"):
+        assert np.linalg.norm(q[MODEL.quaternion_of(segment)]) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_many_at_once_are_each_alone() -> None:
+    q, lengths = _poses(6).reshape(2, 3, -1), _lengths(6).reshape(2, 3, -1)
+    v = np.random.default_rng(1).normal(size=(2, 3, MODEL.nv))
+    together, moved, apart = MODEL.linearise(q, lengths), MODEL.integrate(q, v), MODEL.difference(q, q[::-1])
+    for index in np.ndindex(2, 3):
+        alone, forward = MODEL.linearise(q[index], lengths[index]), MODEL.forward(q[index], lengths[index])
+        for name in ("positions", "origins", "rotations"):
+            many = getattr(together.posture, name)[index]
+            np.testing.assert_allclose(many, getattr(alone.posture, name), rtol=0, atol=1e-14)
+            np.testing.assert_allclose(many, getattr(forward, name), rtol=0, atol=1e-14)
+        for name in ("jacobian", "length_jacobian", "rotation_jacobian"):
+            np.testing.assert_allclose(getattr(together, name)[index], getattr(alone, name), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(moved[index], MODEL.integrate(q[index], v[index]), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(apart[index], MODEL.difference(q[index], q[::-1][index]), rtol=0, atol=1e-14)
+
+
+def test_one_person_at_many_instants() -> None:
+    """Lengths without the dimension of time go with configurations that have it."""
+    q = _poses(5)
+    np.testing.assert_array_equal(
+        MODEL.forward(q, LENGTHS).positions, MODEL.forward(q, np.broadcast_to(LENGTHS, (5, 21))).positions
+    )
+    together = MODEL.linearise(q, LENGTHS)
+    np.testing.assert_allclose(together.jacobian[3], MODEL.linearise(q[3], LENGTHS).jacobian, rtol=0, atol=1e-14)
+
+
+def test_moving_and_turning_the_base_moves_everything_rigidly() -> None:
+    q = _poses(10)
+    turn, shift = so3.exp(np.array([0.3, -1.1, 2.0])), np.array([1.0, -2.0, 0.5])
+    rotation = so3.quat_to_matrix(turn)
+    moved = q.copy()
+    moved[:, :3] = q[:, :3] @ rotation.T + shift
+    base = MODEL.quaternion_of("pelvis")
+    moved[:, base] = so3.quat_multiply(turn, q[:, base])
+    before, after = MODEL.forward(q, LENGTHS), MODEL.forward(moved, LENGTHS)
+    np.testing.assert_allclose(after.positions, before.positions @ rotation.T + shift, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(after.rotations, rotation @ before.rotations, rtol=0, atol=1e-13)
+
+
+def test_segments_keep_their_lengths() -> None:
+    """Whatever the angles: the distance of two points on one segment is its length."""
+    positions = MODEL.forward(_poses(50), LENGTHS).positions
+    length = dict(zip(MODEL.length_names, LENGTHS, strict=True))
+    for one, two, name in (
+        (Joint.SPINE_BASE, Joint.SPINE_MID, "lower_trunk"),
+        (Joint.SPINE_MID, Joint.SPINE_SHOULDER, "upper_trunk"),
+        (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT, "upper_arm_left"),
+        (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT, "forearm_right"),
+        (Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, "hand_tip_left"),
+    ):
+        distance = np.linalg.norm(positions[:, _point(one)] - positions[:, _point(two)], axis=-1)
+        np.testing.assert_allclose(distance, length[name], rtol=0, atol=1e-13)
+
+
+def test_a_segment_stands_at_a_point_fixed_to_its_parent() -> None:
+    posture = MODEL.forward(_poses(5), LENGTHS)
+    for segment, parent in enumerate(PARENTS[1:], start=1):
+        reach = posture.origins[:, segment] - posture.origins[:, parent]
+        local = (posture.rotations[:, parent].swapaxes(-1, -2) @ reach[..., None])[..., 0]
+        np.testing.assert_allclose(local, np.broadcast_to(local[0], local.shape), atol=1e-13, err_msg=SEGMENTS[segment])
+
+
+def test_the_points_determine_30_of_32_directions() -> None:
+    jacobian = MODEL.linearise(_poses(100), LENGTHS).jacobian.reshape(100, 57, MODEL.nv)
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    assert (values[:, 29] > 1e-4).all()
+    assert (values[:, 30] < 1e-12).all()
+
+
+def _straightened(q: FloatArray, *starts: str) -> FloatArray:
+    """The same pose with flexion and lateral angles of these joints at zero."""
+    v = np.zeros(MODEL.nv)
+    for number, name in enumerate(MODEL.coordinate_names):
+        if name.startswith(starts) and name.endswith(("flexion", "lateral")):
+            v[number] = -MODEL.difference(MODEL.neutral(), q)[number]
+    return MODEL.integrate(q, v)
+
+
+def _touched(null: FloatArray) -> set[str]:
+    return {MODEL.coordinate_names[number] for number in np.flatnonzero(np.abs(null).max(axis=0) > 1e-9)}
+
+
+def test_with_a_straight_trunk_the_undetermined_directions_touch_exactly_the_unobserved_angles() -> None:
+    """Whatever the arms do and however the trunk is twisted."""
+    for q in _poses(20):
+        null = _null_space(_straightened(q, "lumbar", "thoracic", "neck"))
+        assert null.shape == (2, MODEL.nv)
+        assert _touched(null) == set(UNOBSERVED)
+
+
+def test_a_bent_neck_makes_its_angles_depend_on_the_unobserved_twist() -> None:
+    for q in _poses(20):
+        null = _null_space(_straightened(q, "lumbar", "thoracic"))
+        assert null.shape == (2, MODEL.nv)
+        assert _touched(null) == {*UNOBSERVED, "neck_flexion", "neck_lateral"}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_straight_elbow_adds_the_humerus_turning_against_pronation(side: str) -> None:
+    other = "right" if side == "left" else "left"
+    null = _null_space(_moved(f"elbow_flexion_{other}", np.pi / 2))
+    touched = _touched(null)
+    assert null.shape == (3, MODEL.nv)
+    assert f"forearm_pronation_{side}" in touched
+    assert f"shoulder_z_{side}" in touched
+    assert f"forearm_pronation_{other}" not in touched
+
+
+@pytest.mark.parametrize(("nq", "nl"), [(34, 21), (35, 20)])
+def test_what_is_no_configuration_is_refused(nq: int, nl: int) -> None:
+    with pytest.raises(ModelError, match=r"upper_body: .* expected"):
+        MODEL.forward(np.zeros(nq), np.zeros(nl))
+    with pytest.raises(ModelError, match=r"upper_body: .* expected"):
+        MODEL.linearise(np.zeros(nq), np.zeros(nl))
