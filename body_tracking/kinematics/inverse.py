@@ -137,10 +137,12 @@ class InverseKinematics:
             q = self.start(np.where(measured[:, None], positions, np.nan))
         weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
         target = np.where(measured[:, None], positions, 0.0)
-        damping, iteration = 1e-3, 0
+        damping, iterations = 1e-3, 0
         normal, gradient, cost = self._normal_equations(q, target, weights, lengths)
-        for iteration in range(1, max_iterations + 1):
-            step = np.linalg.solve(normal + damping * np.diag(normal.diagonal()), gradient)
+        while iterations < max_iterations:
+            iterations += 1
+            damped = normal + damping * np.diag(normal.diagonal())
+            step = np.linalg.solve(damped, gradient).astype(np.float64)
             moved = self.model.integrate(q, step)
             new_normal, new_gradient, new_cost = self._normal_equations(moved, target, weights, lengths)
             if new_cost < cost:
@@ -155,7 +157,14 @@ class InverseKinematics:
                     break
         fitted = self.model.forward(q, lengths).positions
         residuals = np.where(measured[:, None], positions - fitted, np.nan)
-        return Fit(q, np.linalg.inv(normal), residuals, cost, iteration)
+        covariance = np.linalg.inv(normal).astype(np.float64)
+        return Fit(q, covariance, residuals, cost, iterations)
+
+    def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> float:
+        """What :attr:`Fit.cost` would be at a given configuration; arguments as of :meth:`solve`."""
+        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
+        return self._normal_equations(q, np.where(measured[:, None], positions, 0.0), weights, lengths)[2]
 
     def _normal_equations(
         self, q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray
@@ -205,7 +214,8 @@ class InverseKinematics:
     ) -> None:
         """From the clavicle to the wrist, as far as points are seen."""
         shoulder, elbow, wrist, hand, tip, thumb = (
-            point[Joint[f"{name}_{side.upper()}"]] for name in ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
+            point[Joint[f"{name}_{side.upper()}"]]
+            for name in ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
         )
         outward = upper_trunk.T @ _unit(shoulder - top)
         if np.isfinite(outward).all():
@@ -280,8 +290,7 @@ def _frame(z: FloatArray, y: FloatArray) -> FloatArray:
 def _shortest(a: FloatArray, b: FloatArray) -> FloatArray:
     """(3, 3) the shortest rotation that turns direction ``a`` to ``b``."""
     axis = np.cross(a, b)
-    size = np.sqrt(axis @ axis)
-    if size < _TINY:
-        axis, size = _perpendicular(a), 1.0
-        axis /= np.sqrt(axis @ axis)
-    return so3.quat_to_matrix(so3.exp(axis / size * np.arctan2(np.sqrt(np.cross(a, b) @ np.cross(a, b)), a @ b)))
+    sine, cosine = float(np.sqrt(axis @ axis)), float(a @ b)
+    if sine < _TINY:
+        axis = _perpendicular(a)
+    return so3.quat_to_matrix(so3.exp(_unit(axis) * np.arctan2(sine, cosine)))

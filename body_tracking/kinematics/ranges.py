@@ -27,7 +27,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "lumbar_axial": (-15.0, 15.0),
     "thoracic_flexion": (-25.0, 45.0),
     "thoracic_lateral": (-30.0, 30.0),
-    "thoracic_axial": (-40.0, 40.0),
+    "thoracic_axial": (-35.0, 35.0),
     "neck_flexion": (-60.0, 60.0),
     "neck_lateral": (-45.0, 45.0),
     "clavicle_protraction": (-25.0, 30.0),
@@ -43,8 +43,8 @@ SHOULDER_SWING = 130.0
 """Degrees by which an upper arm may point away from the centre of its reach."""
 SHOULDER_TWIST = 110.0
 """Degrees by which it may be turned about itself against the shortest way there, to either side."""
-TWIST_SHARING_STDDEV = 12.0
-"""Degrees, at unit share: how far lumbar and thoracic axial rotation depart from sharing a twist by their ranges."""
+TWIST_SHARING_STDDEV = 30.0
+"""Degrees by which the lumbar part of a twist departs from its share by the ranges. Weak: nothing separates the two."""
 
 _REACH = {"left": np.array([np.sin(np.pi / 4), np.cos(np.pi / 4), 0.0])}
 _REACH["right"] = _REACH["left"] * [1.0, -1.0, 1.0]

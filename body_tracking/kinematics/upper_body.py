@@ -16,9 +16,9 @@ wrist                  flexion (towards the palm), deviation (towards the thumb)
 The lumbar joint lies at SpineBase, the thoracic one at SpineMid, both clavicles at SpineShoulder, the neck at Neck.
 With all 19 points seen, two directions of the tangent space move none of them: turning the lower trunk about its own
 axis and the upper trunk back, and turning the upper trunk about its axis while both shoulders keep their place (one
-clavicle protracts, the other retracts). They touch four angles, :data:`UNOBSERVED`; where the trunk is bent, a little of
-its other angles too. A straight elbow adds the humerus turning against pronation on that side. ``test_upper_body.py``
-computes all of this.
+clavicle protracts, the other retracts). They touch four angles, :data:`UNOBSERVED`; where the trunk is bent, a little
+of its other angles too. A straight elbow adds the humerus turning against pronation on that side.
+``test_upper_body.py`` computes all of this.
 """
 
 from __future__ import annotations
@@ -159,6 +159,8 @@ class UpperBody:
         name, joints, segment_names, coordinate_names, length_names, nq, nv: see ``model.BodyModel``.
         parents: index of each segment's parent, -1 for the base.
         segment_coordinates: (12,) for each segment the slice of the tangent that turns it against its parent.
+        scalar_q, scalar_v: (20,) where configuration and tangent hold the angles of the joints that turn about axes.
+        ball_v: (3, 3) where the tangent holds the rotations of the pelvis and of the two upper arms.
     """
 
     name = "upper_body"
@@ -210,7 +212,7 @@ class UpperBody:
         self.scalar_q: IntArray = np.array(q_scalar, dtype=np.intp)
         self.scalar_v: IntArray = np.array(v_scalar, dtype=np.intp)
         self._quat_q: IntArray = (np.array(q_ball)[:, None] + np.arange(4)).astype(np.intp)
-        self._quat_v: IntArray = (np.array(v_ball)[:, None] + np.arange(3)).astype(np.intp)
+        self.ball_v: IntArray = (np.array(v_ball)[:, None] + np.arange(3)).astype(np.intp)
 
         # rotations of the joints: exp(angle [axis]x) = 1 + sin [axis]x + (1 - cos) [axis]x^2
         self._scalar_segments = np.array(scalar_segments, dtype=np.intp)
@@ -263,7 +265,7 @@ class UpperBody:
             dtype=np.intp,
         )
         self._scalar_columns = self.scalar_v - 3
-        self._ball_columns = (self._quat_v - 3).reshape(-1)
+        self._ball_columns = (self.ball_v - 3).reshape(-1)
         self._scalar_parent: IntArray = np.array([PARENTS[s] for s in scalar_segments], dtype=np.intp)
 
     def neutral(self) -> FloatArray:
@@ -286,7 +288,7 @@ class UpperBody:
         moved = np.empty((*leading, self.nq))
         moved[..., :3] = q[..., :3] + v[..., :3]
         moved[..., self.scalar_q] = q[..., self.scalar_q] + v[..., self.scalar_v]
-        turned = so3.quat_multiply(q[..., self._quat_q], so3.exp(v[..., self._quat_v]))
+        turned = so3.quat_multiply(q[..., self._quat_q], so3.exp(v[..., self.ball_v]))
         # products of unit quaternions leave the unit sphere by a rounding error each
         moved[..., self._quat_q] = turned / np.sqrt((turned * turned).sum(axis=-1, keepdims=True))
         return moved
@@ -298,7 +300,7 @@ class UpperBody:
         v[..., :3] = q1[..., :3] - q0[..., :3]
         v[..., self.scalar_v] = q1[..., self.scalar_q] - q0[..., self.scalar_q]
         relative = so3.quat_multiply(so3.quat_inverse(q0[..., self._quat_q]), q1[..., self._quat_q])
-        v[..., self._quat_v] = so3.log(relative)
+        v[..., self.ball_v] = so3.log(relative)
         return v
 
     def forward(self, q: FloatArray, lengths: FloatArray) -> Posture:
