@@ -1,0 +1,897 @@
+"""The extended Kalman filter on a body model whose covariance is meant: ``ekf``.
+
+State: the model's configuration, its segment lengths and its tangent velocities. The error of the configuration lives
+in the tangent space (an error-state filter, Sola 2017), because base and shoulders turn freely; filterpy's
+ExtendedKalmanFilter, whose state is a plain vector and whose update inverts what is factored here, does not fit.
+
+- Motion: each velocity is an Ornstein-Uhlenbeck process (it fades with ``velocity_time``), driven by white noise whose
+  density each joint finds for itself: as long as it is right, the corrections of the velocities are white and as large
+  as the covariance says; where they lean to one side, the person moves more briskly than assumed.
+- Measurement noise: a sensor's white noise is read off the third differences of each point over time, in which smooth
+  motion all but cancels; no tuning for a sensor. What its points are wrong by for seconds (a joint placed beside the
+  anatomical one) is a state of its own that is considered but not estimated (Schmidt 1966), with the deviation of
+  ``body_tracking.measurement`` scaled until the innovations are as large as expected.
+- Lengths are estimated until they are known to some millimetres, and from then on only considered: they are constant,
+  and what is left of their uncertainty stays in the covariance.
+- Ranges of motion bound what nothing observes. They enter as rarely as they would be new information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.stats import chi2
+
+from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.inverse import InverseKinematics
+from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
+from body_tracking.skeleton import (
+    BONES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
+
+_DIMENSIONS = 3
+_FLOOR = 1e-3
+"""Metres: no sensor's white noise is taken for less."""
+_MAX_COORDINATE = 100.0
+_MAX_SLOW = 9.0
+"""Greatest scale of the slow variance; three times the deviation of the measurement model."""
+_THIRD_DIFFERENCE_SPAN = 0.25
+"""Seconds beyond which four frames in a row show motion, not noise."""
+_MEDIAN_OF_CHI2_3 = 0.7887
+"""Median of the mean of three squared normal deviates."""
+_NOISE_FRAMES = 120.0
+"""Frames over which the white noise of a point is averaged."""
+_POOL = 8.0
+"""Frames from which on a point's own noise counts alone."""
+_OUTLYING = 6.0
+"""A squared difference counts as at most so many times the variance."""
+_NEGLIGIBLE_SLOW = 1e-3
+_SLOW_MEMORY = 3.0
+"""Seconds over which the scale of the slow errors is averaged."""
+_WHITENESS_TIME = 0.25
+"""Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
+_UNTOUCHED = 0.02
+_RATIO_BOUND = 8.0
+_DENSITY_DOWN, _DENSITY_UP = 6.0, 4.0
+_PRIOR_PERIOD = 0.1
+"""Seconds between two looks at the ranges of motion."""
+_UNKNOWN = 0.6
+"""Share of the range's deviation from which an angle counts as unknown."""
+_LIMIT_STDDEV = 3.0
+"""Degrees: how softly limits push back, each time."""
+_MUCH_BETTER = 0.5
+_FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
+"""m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
+_STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
+"""Standard deviations by which lengths differ from the average: all alike, each kind, left from right."""
+_SHORTEST_SCALE = 0.08
+"""Metres: shorter lengths differ as if they were as long as this, because sensors place these points so."""
+
+
+def _parameter(default: float, doc: str, unit: str, low: float, high: float) -> float:
+    result: float = field(default=default, metadata={"doc": doc, "unit": unit, "min": low, "max": high})
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class EkfParameters:
+    """The settings of the extended filter; each field's metadata says what it is, its unit and its range.
+
+    Raises:
+        FilterError: a value out of its range.
+    """
+
+    velocity_time: float = _parameter(1.5, "time in which a velocity fades when nothing renews it", "s", 0.05, 100.0)
+    density_translation: float = _parameter(
+        1.0, "spectral density of the base's acceleration per axis, before it is learnt", "m2/s3", 1e-5, 1e3
+    )
+    density_trunk: float = _parameter(
+        2.0,
+        "spectral density of the angular acceleration of base, spine, neck, clavicles, at first",
+        "rad2/s3",
+        1e-4,
+        1e4,
+    )
+    density_limb: float = _parameter(
+        12.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
+    )
+    density_hand: float = _parameter(
+        12.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
+    )
+    density_rate: float = _parameter(
+        0.3, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
+    )
+    white_stddev: float = _parameter(
+        0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
+    )
+    slow_scale: float = _parameter(
+        0.05,
+        "variance of a sensor's slow errors before it is learnt, as a share of the measurement model's",
+        "1",
+        0.0,
+        9.0,
+    )
+    slow_time: float = _parameter(3.0, "time for which a sensor's slow errors persist", "s", 0.05, 1000.0)
+    gate_probability: float = _parameter(
+        0.9999,
+        "a point is rejected where its innovation lies beyond this chi-square quantile (3 degrees of freedom)",
+        "1",
+        0.5,
+        1.0,
+    )
+    reacquire_after: float = _parameter(
+        0.12,
+        "points rejected without a break for longer than this may start the pose anew, where it fits them",
+        "s",
+        0.0,
+        60.0,
+    )
+    settle_stddev: float = _parameter(
+        0.003, "lengths stay as they are from when they are known as well as this", "m", 1e-5, 1.0
+    )
+    settle_time: float = _parameter(30.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
+    late_window: float = _parameter(0.2, "frames that come late by no more than this still count", "s", 0.0, 2.0)
+    predict_for: float = _parameter(
+        2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
+    )
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                raise FilterError(f"filter parameter {item.name}: {value!r}, expected a number from {low} to {high}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measurement:
+    """One frame of one sensor, on the model's points.
+
+    Attributes:
+        sensor: who measured.
+        stamp_ns: capture time.
+        positions: (19, 3) metres in world; 0 where not measured.
+        measured: (19,) which are.
+        model_variance: (19,) square metres per axis by the measurement model, of white and slow errors together.
+        skeleton: where it comes from.
+    """
+
+    sensor: str
+    stamp_ns: int
+    positions: FloatArray
+    measured: BoolArray
+    model_variance: FloatArray
+    skeleton: Skeleton
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SensorState:
+    """What the filter has learnt of a sensor.
+
+    Attributes:
+        stamps: seconds of its last (at most 3) frames, relative to the newest.
+        positions: (k, 19, 3) their points, NaN where not used.
+        white: (19,) variance of the white noise per axis, square metres.
+        weight: (19,) how many differences stand behind it.
+        slow: scale of the slow variance.
+        slow_information: of its estimate.
+        cross: (85, 57) covariance of the state with the slow errors, these in units of their deviation; None for zero.
+    """
+
+    stamps: tuple[int, ...]
+    positions: FloatArray
+    white: FloatArray
+    weight: FloatArray
+    slow: float
+    slow_information: float
+    cross: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Everything that changes; never written into, so that an earlier one can be gone on from.
+
+    Attributes:
+        stamp_ns: of the state.
+        q, lengths, velocity: the estimate.
+        covariance: (85, 85) of the tangent, the lengths and the velocities.
+        log_density: (groups,) log of the spectral density of each group of coordinates.
+        moved: (32,) faded sum of the corrections of the velocities.
+        moved_variance: (32,) its variance, if all is right.
+        sensors: what is known of each.
+        rejected_for: (19,) seconds.
+        used_ns: (19,) stamp of the last accepted measurement of each point.
+        since_prior: seconds since ranges of motion were last brought in.
+        tracked: seconds since the start.
+        settled: the lengths stay.
+    """
+
+    stamp_ns: int
+    q: FloatArray
+    lengths: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    log_density: FloatArray
+    moved: FloatArray
+    moved_variance: FloatArray
+    sensors: dict[str, _SensorState]
+    rejected_for: FloatArray
+    used_ns: IntArray
+    since_prior: float
+    tracked: float
+    settled: bool
+
+
+class ExtendedKalmanFilter:
+    """The filter ``ekf``.
+
+    Attributes:
+        model: the body.
+        counters: what happened since the construction, for diagnostics.
+        innovation_distance: the last frame's normalised innovation squared over all its accepted points.
+        innovation_dimension: its expectation.
+    """
+
+    def __init__(self, parameters: EkfParameters | None = None, model: UpperBody | None = None) -> None:
+        self.parameters = p = parameters or EkfParameters()
+        self.model = model or UpperBody()
+        self.ranges = Ranges(self.model)
+        self.inverse = InverseKinematics(self.model, self.ranges)
+        self._points = len(self.model.joints)
+        self._nv, self._nl = self.model.nv, len(self.model.length_names)
+        self._observed = self._nv + self._nl
+        self._size = self._observed + self._nv
+        self._tangent = slice(0, self._nv)
+        self._lengths = slice(self._nv, self._observed)
+        self._velocities = slice(self._observed, self._size)
+        self._base_variance = BASE_STDDEV[self.model.joints] ** 2
+        self._gate = float(chi2.ppf(p.gate_probability, _DIMENSIONS))
+        self._group, self._first_log_density = self._groups()
+        self._group_sum = np.zeros((len(self._first_log_density), self._nv))
+        self._group_sum[self._group, np.arange(self._nv)] = 1.0
+        self._pose_prior()
+        self._lengths_prior()
+        self.counters: dict[str, int] = dict.fromkeys(
+            (
+                "frames",
+                "measured",
+                "rejected",
+                "restarts",
+                "repeated_stamps",
+                "late_frames",
+                "too_late",
+                "backward_jumps",
+                "gaps",
+                "frame_changes",
+                "no_trunk",
+            ),
+            0,
+        )
+        self.reset()
+
+    # --- what users call
+
+    def reset(self) -> None:
+        """Forget the person; the counters stay."""
+        self._state: _State | None = None
+        self._frame_id = ""
+        self._body = 0
+        self._history: list[tuple[_State, _Measurement]] = []
+        self._jacobian: FloatArray | None = None
+        self.innovation_distance = np.nan
+        self.innovation_dimension = 0
+
+    def start(
+        self, q: FloatArray, lengths: FloatArray | None = None, stamp_ns: int = 0, frame_id: str = "world"
+    ) -> None:
+        """Set the pose instead of finding it by inverse kinematics from the first frame.
+
+        Args:
+            q: (35,) configuration.
+            lengths: (21,) metres; those of an average person where None.
+            stamp_ns: when it is so.
+            frame_id: of the base.
+        """
+        self.reset()
+        lengths = self.model.default_lengths() if lengths is None else lengths
+        self._frame_id = frame_id
+        stddev = np.sqrt(self._base_variance)
+        self._state = self._new_state(stamp_ns, q, lengths, stddev, None)
+
+    def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
+        """Take one frame.
+
+        Args:
+            skeleton: in a fixed frame with z up; ``/fused/skeleton``, or one sensor's brought into ``world``.
+            sensor: whose it is, as each has its own noise.
+
+        Returns:
+            The modelled joints at its stamp with covariances and velocities; INFERRED where predicted, NOT_TRACKED
+            where not modelled. None where the frame is a repetition, came late, or shows no trunk yet.
+        """
+        measurement = self._measurement(skeleton, sensor)
+        state = self._state
+        if state is not None and not self._in_time(measurement, state):
+            return None
+        state = self._state  # a jump of time may have reset it
+        self.counters["frames"] += 1
+        if state is None:
+            self._state = self._first_state(measurement, None)
+            if self._state is None:
+                return None
+            self._frame_id, self._body = skeleton.frame_id, skeleton.body
+            return self._output(self._state, skeleton)
+        late = measurement.stamp_ns < state.stamp_ns
+        self._state = self._replay(measurement) if late else self._remember(state, measurement)
+        self._body = skeleton.body
+        return None if late else self._output(self._state, skeleton)
+
+    @property
+    def estimate(self) -> ModelEstimate | None:
+        """The state of the model after the last frame; None before a first."""
+        return None if self._state is None else self._estimate(self._state)
+
+    def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
+        """What is to be expected at a later time, without any change of the filter; None where the person is lost."""
+        state = self._state
+        if state is None or stamp_ns - int(state.used_ns.max()) > self.parameters.predict_for * NANOSECONDS:
+            return None
+        state = self._predicted(state, stamp_ns)
+        empty = Skeleton(
+            stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body
+        )
+        self._jacobian = None
+        return self._output(state, empty), self._estimate(state)
+
+    # --- input
+
+    def _measurement(self, skeleton: Skeleton, sensor: str) -> _Measurement:
+        joints = self.model.joints
+        measured = skeleton.valid[joints]
+        positions = np.where(measured[:, None], skeleton.positions[joints], 0.0)
+        states = skeleton.states[joints]
+        inferred = np.where(states == TrackingState.TRACKED, 1.0, INFERRED_FACTOR**2)
+        model = self._base_variance * inferred
+        if skeleton.covariances is not None:
+            given = skeleton.covariances[joints]
+            diagonal = given.diagonal(axis1=1, axis2=2)
+            # a sum is finite where all its numbers are
+            sound = (diagonal > 0.0).all(axis=1) & (np.abs(given).sum(axis=(1, 2)) < _MAX_COORDINATE**2)
+            model = np.where(sound, diagonal.mean(axis=1), model)
+        return _Measurement(sensor, skeleton.stamp_ns, positions, measured, model, skeleton)
+
+    def _in_time(self, measurement: _Measurement, state: _State) -> bool:
+        """Whether to take a frame; a jump of time, a gap or another frame of reference reset the filter."""
+        p = self.parameters
+        elapsed = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        last = state.sensors.get(measurement.sensor)
+        if measurement.skeleton.frame_id != self._frame_id:
+            self.counters["frame_changes"] += 1
+            self.reset()
+        elif elapsed > p.predict_for:
+            self.counters["gaps"] += 1
+            self._state = self._first_state(measurement, state)
+            self._history.clear()
+            return self._state is not None and self._state.stamp_ns != measurement.stamp_ns
+        elif last is not None and last.stamps and last.stamps[-1] == measurement.stamp_ns:
+            self.counters["repeated_stamps"] += 1
+            return False
+        elif elapsed < -p.late_window:
+            jump = elapsed < -max(1.0, 2.0 * p.late_window)
+            self.counters["backward_jumps" if jump else "too_late"] += 1
+            if jump:
+                self.reset()
+            return jump
+        return True
+
+    # --- time
+
+    def _remember(self, state: _State, measurement: _Measurement) -> _State:
+        """Take a frame in its order, and keep what a later, older one would have to be put before."""
+        horizon = measurement.stamp_ns - self.parameters.late_window * NANOSECONDS
+        self._history = [entry for entry in self._history if entry[1].stamp_ns >= horizon]
+        self._history.append((state, measurement))
+        return self._step(state, measurement)
+
+    def _replay(self, late: _Measurement) -> _State:
+        """Go back to before a late frame, and take it and all later ones again in their order."""
+        self.counters["late_frames"] += 1
+        first = next((k for k, (_, m) in enumerate(self._history) if m.stamp_ns > late.stamp_ns), len(self._history))
+        again = self._history[first:]
+        state = again[0][0] if again else self._state
+        assert state is not None
+        if state.stamp_ns > late.stamp_ns:  # it is older than all that is remembered
+            return self._state if self._state is not None else state
+        self._history = self._history[:first]
+        for measurement in (late, *(m for _, m in again)):
+            state = self._remember(state, measurement)
+        return state
+
+    def _step(self, state: _State, measurement: _Measurement) -> _State:
+        state = self._predicted(state, measurement.stamp_ns)
+        state = self._corrected(state, measurement)
+        if state.rejected_for.max() > self.parameters.reacquire_after:
+            state = self._reacquired(state, measurement)
+        return self._bounded(state)
+
+    def _predicted(self, state: _State, stamp_ns: int) -> _State:
+        """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
+        dt = (stamp_ns - state.stamp_ns) / NANOSECONDS
+        if dt <= 0.0:
+            return state
+        tau = self.parameters.velocity_time
+        fade = np.exp(-dt / tau)
+        reach = tau * (1.0 - fade)
+        density = np.exp(state.log_density)[self._group]
+        step = reach * state.velocity
+        q = self.model.integrate(state.q, step)
+
+        p = state.covariance.copy()
+        turn = self._turning_back(step)
+        t, v = self._tangent, self._velocities
+        p[t] = turn @ p[t] + reach * p[v]
+        p[v] *= fade
+        p[:, t] = p[:, t] @ turn.T + reach * p[:, v]
+        p[:, v] *= fade
+        # covariance of the integrals of white noise over dt
+        vv = 0.5 * tau * (1.0 - fade * fade)
+        tv = 0.5 * reach * reach
+        tt = tau * tau * (dt - 2.0 * reach + vv)
+        tangent, velocities = np.arange(self._nv), np.arange(self._observed, self._size)
+        p[tangent, tangent] += tt * density
+        p[velocities, velocities] += vv * density
+        p[tangent, velocities] += tv * density
+        p[velocities, tangent] += tv * density
+
+        slow_fade = np.exp(-dt / self.parameters.slow_time)
+        sensors = {}
+        for name, sensor in state.sensors.items():
+            cross = sensor.cross
+            if cross is not None:
+                cross = slow_fade * cross
+                cross[t] = turn @ cross[t] + reach * cross[v]
+                cross[v] *= fade
+            sensors[name] = replace(sensor, cross=cross)
+        fading = np.exp(-dt / _WHITENESS_TIME)
+        return replace(
+            state,
+            stamp_ns=stamp_ns,
+            q=q,
+            velocity=fade * state.velocity,
+            covariance=p,
+            moved=fading * state.moved,
+            moved_variance=fading * fading * state.moved_variance,
+            sensors=sensors,
+            since_prior=state.since_prior + dt,
+            tracked=state.tracked + dt,
+        )
+
+    def _turning_back(self, step: FloatArray) -> FloatArray:
+        """(32, 32) how an error of the tangent is seen from the moved configuration (adjoint, Sola eq. 82)."""
+        turn = np.eye(self._nv)
+        rows = self.model.ball_v
+        turn[rows[:, :, None], rows[:, None, :]] = so3.quat_to_matrix(so3.exp(-step[rows]))
+        return turn
+
+    # --- measurement
+
+    def _corrected(self, state: _State, measurement: _Measurement) -> _State:
+        """The Kalman update with the points that pass the gate; what was learnt of the sensor."""
+        dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
+        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
+        lines = self.model.linearise(state.q, state.lengths)
+        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
+        innovation = (measurement.positions - lines.posture.positions).reshape(-1)
+
+        cross_covariance = state.covariance[:, : self._observed] @ observation.T
+        seen = observation @ cross_covariance[: self._observed]
+        slow = np.repeat(np.sqrt(sensor.slow * measurement.model_variance), 3)
+        shared = None
+        if sensor.cross is not None:
+            shared = observation @ sensor.cross[: self._observed]
+            both = shared * slow
+            seen = seen + both + both.T
+            cross_covariance = cross_covariance + sensor.cross * slow
+        rows = np.arange(3 * self._points)
+        s = seen.copy()
+        s[rows, rows] += slow * slow + np.repeat(sensor.white, 3)
+        diagonal = np.arange(self._points)
+        own = s.reshape(self._points, 3, self._points, 3)[diagonal, :, diagonal]
+        y = innovation.reshape(-1, 3)
+        distances = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own), y)
+        used = measurement.measured & (distances < self._gate)
+        rejected = measurement.measured & ~used
+        self.counters["measured"] += int(used.sum())
+        self.counters["rejected"] += int(rejected.sum())
+
+        if not used.all():
+            rows = np.flatnonzero(np.repeat(used, 3))
+            s, cross_covariance, innovation = s[np.ix_(rows, rows)], cross_covariance[:, rows], innovation[rows]
+        rejected_for = np.where(used, 0.0, np.where(rejected, state.rejected_for + dt, state.rejected_for))
+        used_ns = np.where(used, measurement.stamp_ns, state.used_ns)
+        if not used.any():
+            sensors = {**state.sensors, measurement.sensor: self._seen_by(sensor, measurement, used)}
+            return replace(state, sensors=sensors, rejected_for=rejected_for, used_ns=used_ns)
+
+        factor, _ = dpotrf(s, lower=1, clean=1)
+        gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)  # (k, 85): L^-1 (P H^T)^T
+        white, _ = dtrtrs(factor, innovation, lower=1)
+        correction = white @ gain
+        covariance = state.covariance - gain.T @ gain
+        if state.settled:
+            correction[self._lengths] = 0.0
+            covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
+        self.innovation_distance, self.innovation_dimension = float(white @ white), len(white)
+
+        sensors = dict(state.sensors)
+        for name, other in state.sensors.items():
+            if other.cross is not None and name != measurement.sensor:
+                part = observation[rows] @ other.cross[: self._observed]
+                sensors[name] = replace(other, cross=self._considered(other.cross, gain, factor, part, state.settled))
+        own_cross = None
+        if sensor.slow > _NEGLIGIBLE_SLOW:
+            part = np.zeros((3 * self._points, 3 * self._points)) if shared is None else shared.copy()
+            part[np.arange(3 * self._points), np.arange(3 * self._points)] += slow
+            cross = np.zeros((self._size, 3 * self._points)) if sensor.cross is None else sensor.cross
+            own_cross = self._considered(cross, gain, factor, part[rows], state.settled)
+        sensor = self._slow_learnt(sensor, measurement, factor, white, rows, dt)
+        sensors[measurement.sensor] = replace(self._seen_by(sensor, measurement, used), cross=own_cross)
+
+        moved = state.moved + correction[self._velocities]
+        before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
+        moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
+        return replace(
+            state,
+            q=self.model.integrate(state.q, correction[self._tangent]),
+            lengths=state.lengths + correction[self._lengths],
+            velocity=state.velocity + correction[self._velocities],
+            covariance=covariance,
+            log_density=self._densities_learnt(state, moved, moved_variance, after, dt),
+            moved=moved,
+            moved_variance=moved_variance,
+            sensors=sensors,
+            rejected_for=rejected_for,
+            used_ns=used_ns,
+        )
+
+    def _considered(
+        self, cross: FloatArray, gain: FloatArray, factor: FloatArray, part: FloatArray, settled: bool
+    ) -> FloatArray:
+        """Covariance of the corrected state with slow errors, which are not estimated themselves (Schmidt 1966).
+
+        Args:
+            cross: (85, 57) before.
+            gain: (k, 85) of the correction.
+            factor: (k, k) of the innovation's covariance.
+            part: (k, 57) covariance of the innovation with the slow errors.
+            settled: whether the lengths are only considered, too.
+        """
+        half, _ = dtrtrs(factor, part, lower=1)
+        result: FloatArray = cross - gain.T @ half
+        if settled:
+            result[self._lengths] = cross[self._lengths]
+        return result
+
+    def _last_stamp(self, state: _State, measurement: _Measurement) -> int:
+        sensor = state.sensors.get(measurement.sensor)
+        return sensor.stamps[-1] if sensor is not None and sensor.stamps else measurement.stamp_ns
+
+    # --- learning
+
+    def _unknown_sensor(self) -> _SensorState:
+        p = self.parameters
+        white = np.full(self._points, p.white_stddev**2)
+        return _SensorState(
+            (), np.empty((0, self._points, 3)), white, np.full(self._points, 0.5), p.slow_scale, 4.0, None
+        )
+
+    def _seen_by(self, sensor: _SensorState, measurement: _Measurement, used: BoolArray) -> _SensorState:
+        """The variance of the white noise, from the third differences of the points that passed the gate."""
+        points = np.where(used[:, None], measurement.positions, np.nan)
+        stamps, frames = sensor.stamps, sensor.positions
+        white, weight = sensor.white, sensor.weight
+        if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
+            times = (np.array([*stamps, measurement.stamp_ns]) - stamps[0]) / NANOSECONDS
+            apart = times[:, None] - times
+            apart[np.arange(4), np.arange(4)] = 1.0
+            factors = 1.0 / apart.prod(axis=1)  # divided differences: exact for any spacing
+            factors /= np.sqrt((factors * factors).sum())
+            difference = factors[:3] @ frames.reshape(3, -1) + factors[3] * points.reshape(-1)
+            squared = (difference.reshape(-1, 3) ** 2).mean(axis=1)
+            known = np.isfinite(squared)
+            if known.any():
+                pooled = float(np.median(squared[known])) / _MEDIAN_OF_CHI2_3
+                # what all points say stands behind each one's own, and keeps one that just came back from any value
+                ratio = np.where(known, squared, pooled)
+                bounded = np.minimum(ratio, _OUTLYING * np.maximum(white, pooled))
+                keep = min(1.0, _NOISE_FRAMES / (_NOISE_FRAMES + 1.0))
+                new_weight = np.where(known, weight * keep + 1.0, weight)
+                white = np.where(known, (weight * keep * white + bounded) / new_weight, white)
+                weight = new_weight
+                # shrink towards the median of all points while a point has little of its own
+                share = _POOL / (_POOL + weight)
+                white = np.where(known & (weight < _POOL), (1 - share) * white + share * np.median(white), white)
+        white = np.maximum(white, _FLOOR**2)
+        stamps = (*stamps[-2:], measurement.stamp_ns)
+        frames = np.concatenate([frames[-2:], points[None]])
+        return replace(sensor, stamps=stamps, positions=frames, white=white, weight=weight)
+
+    def _slow_learnt(
+        self,
+        sensor: _SensorState,
+        measurement: _Measurement,
+        factor: FloatArray,
+        white: FloatArray,
+        rows: IntArray,
+        dt: float,
+    ) -> _SensorState:
+        """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance."""
+        if sensor.weight.max() < 2.0 * _POOL:
+            return sensor  # what is white is not known yet, and would be taken for slow
+        inverse, _ = dtrtrs(factor, np.eye(len(factor)), lower=1)
+        precision = inverse.T @ inverse
+        residual = white @ inverse
+        variances = np.repeat(measurement.model_variance, 3)[rows]
+        score = 0.5 * float(variances @ (np.minimum(residual**2, 9.0 * precision.diagonal()) - precision.diagonal()))
+        information = 0.5 * float(variances @ (precision * precision) @ variances)
+        total = sensor.slow_information * np.exp(-dt / _SLOW_MEMORY) + information
+        slow = float(np.clip(sensor.slow + score / total, 0.0, _MAX_SLOW))
+        return replace(sensor, slow=slow, slow_information=total)
+
+    def _densities_learnt(
+        self, state: _State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
+    ) -> FloatArray:
+        """The spectral densities, from whether the corrections of the velocities lean to one side."""
+        rate = self.parameters.density_rate * dt / _WHITENESS_TIME
+        # coordinates that the measurement does not touch say nothing
+        share = variance / (variance + _UNTOUCHED * remaining + 1e-30)
+        ratio = np.minimum(moved**2 / (variance + 1e-30), _RATIO_BOUND) - 1.0
+        lean = self._group_sum @ (share * ratio) / (self._group_sum @ share + 0.3)
+        log_density = state.log_density + rate * lean
+        return np.clip(log_density, self._first_log_density - _DENSITY_DOWN, self._first_log_density + _DENSITY_UP)
+
+    # --- start, restart
+
+    def _first_state(self, measurement: _Measurement, previous: _State | None) -> _State | None:
+        """The pose of one frame by inverse kinematics; None where no trunk is seen."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        stddev = self._point_stddev(measurement, previous)
+        lengths = self._lengths_of(points) if previous is None else previous.lengths
+        try:
+            fit = self.inverse.solve(points, stddev, lengths)
+        except ModelError:
+            self.counters["no_trunk"] += 1
+            return None
+        state = self._new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
+        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
+        sensor = self._seen_by(replace(sensor, cross=None), measurement, measurement.measured)
+        return replace(state, sensors={**state.sensors, measurement.sensor: sensor})
+
+    def _new_state(
+        self, stamp_ns: int, q: FloatArray, lengths: FloatArray, stddev: FloatArray, previous: _State | None
+    ) -> _State:
+        """A state at rest at a pose, as uncertain as a fit to points of this deviation (19,) leaves it."""
+        lines = self.model.linearise(q, lengths)
+        weights = np.where(np.isfinite(stddev), 1.0 / stddev**2, 0.0)
+        by_tangent = lines.jacobian.reshape(-1, self._nv)
+        by_length = lines.length_jacobian.reshape(-1, self._nl)
+        weighted = by_tangent * np.repeat(weights, 3)[:, None]
+        information = weighted.T @ by_tangent
+        information[np.arange(self._nv), np.arange(self._nv)] += self._rest_information
+        tangent = np.linalg.inv(information)
+        # the fit took the lengths for true: their errors are in the pose
+        from_lengths = -tangent @ (weighted.T @ by_length)
+        lengths_covariance = (
+            self._lengths_covariance if previous is None else (previous.covariance[self._lengths, self._lengths])
+        )
+        covariance = np.zeros((self._size, self._size))
+        t, n, v = self._tangent, self._lengths, self._velocities
+        covariance[t, t] = tangent + from_lengths @ lengths_covariance @ from_lengths.T
+        covariance[t, n] = from_lengths @ lengths_covariance
+        covariance[n, t] = covariance[t, n].T
+        covariance[n, n] = lengths_covariance
+        covariance[v, v] = np.diag(self._velocity_variance)
+        zero = np.zeros(self._nv)
+        return _State(
+            stamp_ns,
+            q,
+            lengths,
+            zero,
+            covariance,
+            self._first_log_density if previous is None else previous.log_density,
+            zero,
+            zero,
+            {} if previous is None else {k: replace(s, cross=None) for k, s in previous.sensors.items()},
+            np.zeros(self._points),
+            np.full(self._points, stamp_ns, dtype=np.intp),
+            0.0,
+            0.0 if previous is None else previous.tracked,
+            False if previous is None else previous.settled,
+        )
+
+    def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
+        """Start the pose anew where another one fits the rejected points much better."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        stddev = self._point_stddev(measurement, state)
+        state = replace(state, rejected_for=np.zeros(self._points))
+        try:
+            fit = self.inverse.solve(points, stddev, state.lengths)
+        except ModelError:
+            return state
+        if fit.cost > _MUCH_BETTER * self.inverse.cost(state.q, points, stddev, state.lengths):
+            return state
+        self.counters["restarts"] += 1
+        return self._new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
+
+    def _point_stddev(self, measurement: _Measurement, state: _State | None) -> FloatArray:
+        """(19,) metres; infinity where not measured."""
+        sensor = None if state is None else state.sensors.get(measurement.sensor)
+        sensor = sensor or self._unknown_sensor()
+        return np.where(measurement.measured, np.sqrt(sensor.white + sensor.slow * measurement.model_variance), np.inf)
+
+    def _lengths_of(self, points: FloatArray) -> FloatArray:
+        """(21,) average proportions at the size of the person that is seen."""
+        lengths = self.model.default_lengths()
+        neutral = self.model.forward(self.model.neutral(), lengths).positions
+        starts, ends = self._bones
+        seen = np.sqrt(((points[ends] - points[starts]) ** 2).sum(axis=1))
+        expected = np.sqrt(((neutral[ends] - neutral[starts]) ** 2).sum(axis=1))
+        ratio = seen / expected
+        ratio = ratio[np.isfinite(ratio)]
+        return lengths * float(np.clip(np.median(ratio), 0.5, 1.4)) if len(ratio) else lengths
+
+    # --- priors
+
+    def _groups(self) -> tuple[IntArray, FloatArray]:
+        """(32,) the group of each coordinate that shares a density, and (groups,) their first log densities."""
+        p = self.parameters
+        keys: list[str] = []
+        densities: list[float] = []
+        groups = np.empty(self._nv, dtype=np.intp)
+        for number, name in enumerate(self.model.coordinate_names):
+            part = name.split("_")[0]
+            side = name.rsplit("_", 1)[-1]
+            if part == "base":
+                key = "base_position" if number < 3 else "base_rotation"
+            elif side in ("left", "right"):
+                key = f"{part}_{side}"
+            else:
+                key = part
+            if key not in keys:
+                keys.append(key)
+                limb, hand = key.startswith(("shoulder", "elbow")), key.startswith(("forearm", "wrist"))
+                density = p.density_limb if limb else p.density_hand if hand else p.density_trunk
+                densities.append(p.density_translation if key == "base_position" else density)
+            groups[number] = keys.index(key)
+        return groups, np.log(densities)
+
+    def _pose_prior(self) -> None:
+        """What is known of a pose and of velocities without any measurement."""
+        self._rest_information = np.full(self._nv, 1e-4)
+        self._rest_information[6:] = 1.0 / self.ranges.stddev**2
+        self._velocity_variance = np.full(self._nv, _FIRST_TURN_RATE**2)
+        self._velocity_variance[:3] = _FIRST_SPEED**2
+        twist = np.zeros(self._nv - 6)
+        names = self.model.coordinate_names[6:]
+        lumbar, thoracic = (names.index(f"{part}_axial") for part in ("lumbar", "thoracic"))
+        twist[lumbar], twist[thoracic] = 1.0, -self.ranges.high[lumbar] / self.ranges.high[thoracic]
+        self._twist = twist
+        path = {Joint(joint): number for number, joint in enumerate(self.model.joints)}
+        bones = [(path[a], path[b]) for a, b in BONES if a in path and b in path]
+        self._bones = np.array([a for a, _ in bones], dtype=np.intp), np.array([b for _, b in bones], dtype=np.intp)
+
+    def _lengths_prior(self) -> None:
+        """How people differ in their proportions; left and right of one person hardly do."""
+        lengths = self.model.default_lengths()
+        names = self.model.length_names
+        kinds = [name.removesuffix("_left").removesuffix("_right") for name in names]
+        same = np.array([[a == b for b in kinds] for a in kinds])
+        relative = _STATURE_SHARE**2 + _PROPORTION_SHARE**2 * same + _SIDE_SHARE**2 * np.eye(len(names))
+        scale = np.maximum(lengths, _SHORTEST_SCALE)
+        self._lengths_covariance = relative * np.outer(scale, scale)
+
+    def _bounded(self, state: _State) -> _State:
+        """Bring in the ranges of motion: softly push back what left them, and bound what nothing observes."""
+        if state.since_prior < _PRIOR_PERIOD:
+            return state
+        soft = self.ranges.soft_coordinates(state.q)
+        excess = self.ranges.excess(state.q)
+        gradients = np.zeros((self._nv - 5, self._nv))
+        gradients[:-1, 6:] = soft.gradients
+        gradients[-1, 6:] = self._twist @ soft.gradients
+        values = np.append(soft.values - self.ranges.centre, self._twist @ soft.values)
+        stddev = np.append(self.ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
+        tangent = state.covariance[self._tangent, self._tangent]
+        variance = ((gradients @ tangent) * gradients).sum(axis=1)
+        density = np.exp(state.log_density)[self._group]
+        spread = np.append(density[6:], density[6:][self._twist != 0.0].max()) * self.parameters.velocity_time**2
+        # A walk of this spread, told so much per second, comes to rest at the range's deviation. Told only where
+        # an angle is as good as unknown: elsewhere it would draw what is measured towards the middle.
+        unknown = variance > (_UNKNOWN * stddev) ** 2
+        noise = stddev**4 / (spread * state.since_prior)
+        beyond = np.append(excess != 0.0, False)
+        rows = unknown | beyond
+        state = replace(state, since_prior=0.0)
+        if not rows.any():
+            return state
+        noise = np.where(beyond, np.radians(_LIMIT_STDDEV) ** 2, noise)[rows]
+        error = np.where(beyond, -np.append(excess, 0.0), -values)[rows]
+        observation = gradients[rows]
+        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+        s = observation @ cross_covariance[self._tangent] + np.diag(noise)
+        factor, _ = dpotrf(s, lower=1, clean=1)
+        gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
+        white, _ = dtrtrs(factor, error, lower=1)
+        correction = white @ gain
+        covariance = state.covariance - gain.T @ gain
+        if state.settled:
+            correction[self._lengths] = 0.0
+            covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
+        sensors = {
+            name: sensor
+            if sensor.cross is None
+            else replace(
+                sensor,
+                cross=self._considered(
+                    sensor.cross, gain, factor, observation @ sensor.cross[self._tangent], state.settled
+                ),
+            )
+            for name, sensor in state.sensors.items()
+        }
+        p = self.parameters
+        known = np.sqrt(covariance.diagonal()[self._lengths]).max() < p.settle_stddev
+        return replace(
+            state,
+            q=self.model.integrate(state.q, correction[self._tangent]),
+            lengths=state.lengths + correction[self._lengths],
+            velocity=state.velocity + correction[self._velocities],
+            covariance=covariance,
+            sensors=sensors,
+            settled=state.settled or bool(known) or state.tracked > p.settle_time,
+        )
+
+    # --- output
+
+    def _estimate(self, state: _State) -> ModelEstimate:
+        keep = np.r_[self._tangent, self._velocities]
+        return ModelEstimate(
+            state.stamp_ns,
+            self._frame_id,
+            self._body,
+            state.q,
+            state.velocity,
+            state.covariance[np.ix_(keep, keep)],
+            state.lengths,
+            np.sqrt(state.covariance.diagonal()[self._lengths]),
+        )
+
+    def _output(self, state: _State, skeleton: Skeleton) -> Skeleton:
+        lines = self.model.linearise(state.q, state.lengths)
+        joints = self.model.joints
+        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
+        flat = observation.reshape(-1, self._observed)
+        spread = (flat @ state.covariance[: self._observed, : self._observed]).reshape(self._points, 3, self._observed)
+        positions, velocities = np.full((N_JOINTS, 3), np.nan), np.full((N_JOINTS, 3), np.nan)
+        covariances = np.zeros((N_JOINTS, 3, 3))
+        covariances[:] = np.diag([np.inf] * 3)
+        states = np.zeros(N_JOINTS, dtype=np.uint8)
+        positions[joints] = lines.posture.positions
+        velocities[joints] = lines.jacobian @ state.velocity
+        covariances[joints] = spread @ observation.swapaxes(1, 2)
+        used = state.used_ns == skeleton.stamp_ns
+        states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
+        return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
