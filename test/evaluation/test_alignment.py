@@ -1,0 +1,141 @@
+"""Laws of aligning and comparing two recordings without a common clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from body_tracking.evaluation.alignment import AlignmentError, compare, estimate_warp, sample
+from body_tracking.skeleton import FloatArray
+
+
+def movement(times: FloatArray) -> FloatArray:
+    """Three features of an arm that is raised once and lowered again within some 3 s."""
+    raised = np.exp(-(((times - 1.5) / 0.6) ** 2))
+    return np.stack([raised, np.sin(2.0 * raised), np.exp(-(((times - 1.9) / 0.5) ** 2))], axis=1)
+
+
+REFERENCE_TIMES = np.arange(0.0, 3.0, 0.01)
+REFERENCE = movement(REFERENCE_TIMES)
+TIMES = np.arange(0.0, 2.0, 1.0 / 30.0)
+
+
+@settings(max_examples=10, deadline=None)
+@given(offset=st.floats(0.0, 0.6), rate=st.floats(0.8, 1.2), bend=st.floats(-0.1, 0.1))
+def test_a_smooth_warp_is_recovered(offset: float, rate: float, bend: float) -> None:
+    true = offset + rate * TIMES + bend * np.sin(np.pi * TIMES / 2.0)
+    warp = estimate_warp(TIMES, movement(true), REFERENCE_TIMES, REFERENCE)
+    at = warp(TIMES)
+    inside = np.isfinite(at)
+    assert inside.sum() > 30
+    # where little moves, little shows the time: so the error is weighed by the speed, in shares of the movement
+    assert np.abs(movement(at) - movement(true))[inside].max() < 0.05
+    assert (np.diff(at[np.isfinite(at)]) > 0.0).all()
+    assert warp.explained > 0.999
+
+
+def test_a_recording_is_aligned_with_itself_by_no_warp() -> None:
+    warp = estimate_warp(REFERENCE_TIMES, REFERENCE, REFERENCE_TIMES, REFERENCE)
+    at = warp(REFERENCE_TIMES)
+    assert np.nanmax(np.abs(at - REFERENCE_TIMES)) < 0.005
+    assert warp.rates == pytest.approx(1.0, abs=0.01)
+
+
+def test_bias_and_scale_of_a_feature_are_no_differences_of_time() -> None:
+    features = movement(0.3 + TIMES)
+    plain = estimate_warp(TIMES, features, REFERENCE_TIMES, REFERENCE)
+    # all gains alike: one that differs would weigh a feature anew
+    changed = estimate_warp(TIMES, 1.3 * features + [5.0, -2.0, 0.1], REFERENCE_TIMES, REFERENCE)
+    assert changed(TIMES) == pytest.approx(plain(TIMES), abs=1e-3, nan_ok=True)
+
+
+def test_noise_is_not_taken_for_time() -> None:
+    # dynamic time warping would halve this noise
+    generator = np.random.default_rng(5)
+    noise = 0.05 * generator.standard_normal((len(TIMES), 3))
+    true = 0.4 + TIMES
+    noisy = movement(true) + noise
+    at = estimate_warp(TIMES, noisy, REFERENCE_TIMES, REFERENCE)(TIMES)
+    measured = compare(noisy[:, 0], sample(at, REFERENCE_TIMES, REFERENCE[:, 0])).debiased_rms
+    assert measured == pytest.approx(noise[:, 0].std(), rel=0.15)
+
+
+def test_a_cycle_that_was_cut_elsewhere_is_continued() -> None:
+    cycle = np.arange(0.0, 2.0, 0.01)
+
+    def features(times: FloatArray) -> FloatArray:
+        return np.stack([np.cos(np.pi * times), np.sin(np.pi * times) ** 3], axis=1)
+
+    warp = estimate_warp(TIMES, features(TIMES + 1.0), cycle, features(cycle), period=2.0)
+    expected = np.mod(TIMES + 1.0, 2.0)
+    apart = np.abs(warp(TIMES) - expected)
+    assert np.minimum(apart, 2.0 - apart).max() < 0.03
+    assert np.isfinite(warp(TIMES)).all()
+
+
+def test_the_opposite_movement_explains_nothing() -> None:
+    raising = np.linspace(0.0, 1.0, 60)[:, None]
+    times = np.arange(60) / 30.0
+    assert estimate_warp(times, raising, times, 1.0 - raising).explained == pytest.approx(0.0, abs=1e-9)
+
+
+@given(
+    values=st.lists(st.tuples(st.floats(-100.0, 100.0), st.floats(-100.0, 100.0)), min_size=2, max_size=30),
+    shift=st.floats(-50.0, 50.0),
+)
+def test_bias_and_debiased_rms_make_up_the_rms(values: list[tuple[float, float]], shift: float) -> None:
+    estimate, reference = np.array(values).T
+    one, other = compare(estimate, reference), compare(estimate + shift, reference)
+    assert one.rms**2 == pytest.approx(one.bias**2 + one.debiased_rms**2, abs=1e-6)
+    assert other.bias == pytest.approx(one.bias + shift, abs=1e-6)
+    assert other.debiased_rms == pytest.approx(one.debiased_rms, abs=1e-6)
+
+
+def test_only_what_both_have_is_compared() -> None:
+    reference = np.array([1.0, 2.0, 3.0, np.nan, 5.0])
+    estimate = np.array([2.0, np.nan, 6.0, 8.0, 10.0])
+    agreement = compare(estimate, reference)
+    assert agreement.samples == 3
+    assert agreement.gain == pytest.approx(2.0)
+    assert agreement.correlation == pytest.approx(1.0)
+    assert agreement.bias == pytest.approx(3.0)
+
+
+def test_a_constant_series_has_no_correlation() -> None:
+    agreement = compare(np.array([1.0, 2.0]), np.array([3.0, 3.0]))
+    assert np.isnan(agreement.correlation) and np.isnan(agreement.gain)
+    assert agreement.bias == pytest.approx(-1.5)
+
+
+def test_samples_lie_on_the_line_and_not_beyond_its_ends() -> None:
+    times = np.array([0.0, 1.0, 3.0])
+    values = np.array([[0.0, 1.0], [2.0, 1.0], [6.0, 1.0]])
+    sampled = sample(np.array([-0.1, 0.0, 0.5, 2.0, 3.0, 3.1, np.nan]), times, values)
+    assert np.isnan(sampled[[0, 5, 6]]).all()
+    assert sampled[1:5] == pytest.approx(np.array([[0.0, 1.0], [1.0, 1.0], [4.0, 1.0], [6.0, 1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("times", "features", "message"),
+    [
+        (TIMES, movement(TIMES)[:-1], "features of shape"),
+        (TIMES[:2], movement(TIMES[:2]), "features of shape"),
+        (TIMES[::-1], movement(TIMES), "do not increase"),
+        (TIMES, np.full((len(TIMES), 3), np.nan), "not finite"),
+        (TIMES, np.ones((len(TIMES), 3)), "do not move"),
+        (TIMES, movement(TIMES)[:, :2], "2 features and 3"),
+        (10.0 * TIMES, movement(TIMES), "overlap"),
+    ],
+)
+def test_what_cannot_be_aligned_is_refused(times: FloatArray, features: FloatArray, message: str) -> None:
+    with pytest.raises(AlignmentError, match=message):
+        estimate_warp(times, features, REFERENCE_TIMES, REFERENCE)
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    with pytest.raises(AlignmentError, match="in common"):
+        compare(np.array([1.0, np.nan, 3.0]), np.array([np.nan, 2.0, 3.0]))
+    with pytest.raises(AlignmentError, match="shapes"):
+        compare(np.zeros(3), np.zeros(4))
