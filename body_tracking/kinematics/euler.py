@@ -1,0 +1,179 @@
+"""Rotations as three successive angles, held together near the poses where three angles fail.
+
+A rotation is told as ``R = R(e1, t1) R(e2, t2) R(e3, t3)``: intrinsic, about three of a frame's axes, one after the
+other. Every such sequence has a singular pose in which the first and the last axis coincide: for ``e3`` along ``e1``
+(proper Euler angles) where the middle angle is 0 or 180 deg, for three different axes (Cardan angles) where it is 90 or
+-90 deg. There only the sum or the difference of the outer angles is determined.
+
+Both kinds are one: turning a Cardan sequence by a quarter about its second axis makes it an Euler sequence, whose
+middle angle is a quarter turn less. All below is the Euler sequence x y x of ``pre @ R @ post``, with angles
+(a, b, c): ``t1 = a``, ``t2 = b + offset``, ``t3 = sign c``. Its first column, (cos b, sin a sin b, -cos a sin b),
+is the direction of the last axis, whose distance ``|sin b|`` from the first one says how well a is determined.
+
+Near the singular pose, where that distance is within the uncertainty of the rotation, the first angle is held at its
+previous value (at 0 where there is none), and the other two are those that come nearest to the rotation; the departure
+is of the size of the rotation's own uncertainty. From :data:`FREE` standard deviations on the angles are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.skeleton import BoolArray, FloatArray
+
+_TURN = 2.0 * np.pi
+
+HELD, FREE = 2.5, 5.0
+"""Standard deviations from the singular pose: within the first the split is held, from the second on it is free.
+
+The first is where the standard deviation of the outer angles stops to be infinite; noise alone exceeds it in one frame
+of twenty. Between the two the first angle turns by a share of what the rotation says.
+"""
+LEAST_HOLD = np.radians(0.1)
+"""Radians: a rotation is never taken for better known than that, so that rounding errors decide no angle."""
+GREATEST_HOLD = np.radians(4.0)
+"""Radians: nor for worse: 20 deg away from a singular pose even a rotation that nothing observes has its own angles."""
+MARGIN = np.radians(60.0)
+"""Radians by which an angle may leave its usual range for the sake of continuity, before it jumps back.
+
+Turning the long way round through the singular poses ends, without a jump, in angles that no reader would understand
+(arms hanging as -180, 180, 180 deg). An arm that swings back through hanging needs 60 deg (extension).
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class EulerAngles:
+    """How one rotation is told as three angles.
+
+    Attributes:
+        axes: the three axes, each along an axis of the frame, the second square to both others.
+        usual: degrees, (least, greatest) of the three angles: of all angles that tell a rotation, those are taken.
+        turn: (3, 3) the rotation is turned by this first: ``R @ turn`` is told. None for the identity.
+    """
+
+    axes: tuple[FloatArray, FloatArray, FloatArray]
+    usual: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    turn: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Split:
+    """Angles of n rotations, and what they change by.
+
+    Attributes:
+        angles: (n, 3) radians.
+        gradients: (n, 3, 3) of the angles by the angular velocity, in the parent's frame; huge at a singular pose.
+        rates: (n, 3, 3) the same for angles that are held as :attr:`angles` are.
+    """
+
+    angles: FloatArray
+    gradients: FloatArray
+    rates: FloatArray
+
+
+class EulerSequences:
+    """n three-angle sequences, split at once."""
+
+    def __init__(self, sequences: Sequence[EulerAngles]) -> None:
+        quarter = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # -90 deg about y
+        pre, post, offset, sign = [], [], [], []
+        for sequence in sequences:
+            first, second, third = sequence.axes
+            basis = np.stack([first, second, np.cross(first, second)], axis=-1)
+            along = float(third @ first)
+            cardan = along == 0.0
+            turn = np.eye(3) if sequence.turn is None else sequence.turn
+            pre.append(basis.T)
+            post.append(turn @ basis @ (quarter if cardan else np.eye(3)))
+            offset.append(0.5 * np.pi if cardan else 0.0)
+            sign.append(float(third @ basis[:, 2]) if cardan else along)
+        self.basis: FloatArray = np.stack(pre).swapaxes(-1, -2)
+        self._pre, self._post = np.stack(pre), np.stack(post)
+        self._offset, self._sign = np.array(offset), np.array(sign)
+        usual = np.radians([sequence.usual for sequence in sequences])
+        self._low, self._high = usual[..., 0], usual[..., 1]
+        self._centre = 0.5 * (self._low + self._high)
+
+    def split(self, rotations: FloatArray, covariances: FloatArray, previous: FloatArray | None) -> Split:
+        """Angles of rotations.
+
+        Args:
+            rotations: (n, 3, 3) of a child in its parent.
+            covariances: (n, 3, 3) square radians, of small rotations in the parent's frame; infinite where unknown.
+            previous: (n, 3) radians to stay near to, or None.
+        """
+        # entries of pre @ R @ post
+        r = self._pre @ rotations @ self._post
+        y, z = r[:, 1, 0], r[:, 2, 0]
+        distance = np.sqrt(y * y + z * z)
+        along = self._pre[:, 0]
+        # of a small rotation's three variances, the two that are not about the first axis
+        tilt = covariances.trace(axis1=1, axis2=2) - (along[:, None, :] @ covariances @ along[:, :, None])[:, 0, 0]
+        doubt = np.sqrt(np.minimum(np.maximum(0.5 * tilt, LEAST_HOLD**2), GREATEST_HOLD**2))
+        x = np.minimum(np.maximum((distance / doubt - HELD) / (FREE - HELD), 0.0), 1.0)
+        hold = 1.0 - x * x * (3.0 - 2.0 * x)
+
+        # two solutions, half a turn of the first angle apart: (2, n)
+        a = np.arctan2(y, -z)
+        a = np.stack([a, a + np.pi])
+        away = (0.0 if previous is None else previous[:, 0]) - a
+        a = a + hold * (away - _TURN * np.rint(away / _TURN))
+        ca, sa = np.cos(a), np.sin(a)
+        row_y = ca[..., None] * r[:, 1] + sa[..., None] * r[:, 2]
+        row_z = ca[..., None] * r[:, 2] - sa[..., None] * r[:, 1]
+        b = np.arctan2(-row_z[..., 0], r[:, 0, 0])
+        cb, sb = np.cos(b), np.sin(b)
+        c = np.arctan2(
+            sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2],
+            row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2],
+        )
+
+        angles = np.stack([a, b + self._offset, self._sign * c], axis=-1)
+        angles, best = self._choose(angles, previous)
+        ca, sa, cb, sb = (np.where(best, part[0], part[1]) for part in (ca, sa, cb, sb))
+        return Split(angles, *self._derivatives(ca, sa, cb, sb, distance, hold))
+
+    def _choose(self, angles: FloatArray, previous: FloatArray | None) -> tuple[FloatArray, BoolArray]:
+        """(n, 3) the better of (2, n, 3) solutions, with their full turns, and (n,) whether it is the first."""
+        near = self._centre if previous is None else previous
+        angles = angles + _TURN * np.rint((near - angles) / _TURN)
+        if previous is None:
+            cost = np.abs(angles) + 100.0 * self._excess(angles)
+        else:
+            excess = self._excess(angles)
+            if (excess > MARGIN).any():
+                usual = angles + _TURN * np.rint((self._centre - angles) / _TURN)
+                angles = np.where(excess > MARGIN, usual, angles)
+                excess = self._excess(angles)
+            # continuity first; of two solutions as near the more usual one
+            cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
+        total = cost.sum(axis=-1)
+        best: BoolArray = total[0] <= total[1]
+        return np.where(best[:, None], angles[0], angles[1]), best
+
+    def _excess(self, angles: FloatArray) -> FloatArray:
+        excess: FloatArray = np.maximum(np.maximum(angles - self._high, self._low - angles), 0.0)
+        return excess
+
+    def _derivatives(
+        self, ca: FloatArray, sa: FloatArray, cb: FloatArray, sb: FloatArray, distance: FloatArray, hold: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Two (n, 3, 3): angles' rates by the angular velocity in the parent's frame; free, and held.
+
+        From w = a' x + b' (0, cos a, sin a) + c' (cos b, sin a sin b, -cos a sin b) in the frame of the axes.
+        """
+        gradients = np.zeros((2, len(ca), 3, 3))
+        size = np.maximum(np.abs(sb), 1e-9)
+        held = np.maximum(distance, size)
+        across = np.copysign(np.stack([1.0 / size, (1.0 - hold) / held]), sb)
+        gradients[:, :, 1, 1], gradients[:, :, 1, 2] = ca, sa
+        gradients[1, :, 2, 0] = hold * cb
+        gradients[:, :, 2, 1], gradients[:, :, 2, 2] = across * sa, -across * ca
+        gradients[:, :, 0, 0] = 1.0
+        gradients[:, :, 0] -= cb[:, None] * gradients[:, :, 2]
+        gradients[:, :, 2] *= self._sign[:, None]
+        free, still = gradients @ self._pre
+        return free, still

@@ -1,0 +1,630 @@
+"""Angle conventions: rotations built anew from the angles, textbook poses, derivatives, honest uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import (
+    CONVENTIONS,
+    GREATEST_STDDEV,
+    KNOWN_SHARE,
+    ConventionError,
+    angles_of,
+    segment_quaternions,
+)
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
+from body_tracking.kinematics.upper_body import SEGMENTS, SHOULDER_AXES, UpperBody
+from body_tracking.skeleton import FloatArray
+
+MODEL = UpperBody()
+LENGTHS = MODEL.default_lengths()
+NV = MODEL.nv
+RANGES = Ranges(MODEL)
+SIDES = (("left", 1.0), ("right", -1.0))
+X, Y, Z = np.eye(3)
+DEGREE = np.pi / 180.0
+
+
+def estimate(
+    q: FloatArray, stddev: float = 1e-9, velocity: FloatArray | None = None, covariance: FloatArray | None = None
+) -> ModelEstimate:
+    return ModelEstimate(
+        stamp_ns=7,
+        frame_id="world",
+        body=0,
+        q=q,
+        velocity=np.zeros(NV) if velocity is None else velocity,
+        covariance=stddev**2 * np.eye(2 * NV) if covariance is None else covariance,
+        lengths=LENGTHS,
+        lengths_stddev=np.zeros_like(LENGTHS),
+    )
+
+
+def poses(count: int, seed: int = 3, share: float = 0.9) -> FloatArray:
+    """(count, 35) within the ranges of motion, bases anywhere."""
+    rng = np.random.default_rng(seed)
+    v = np.empty((count, NV))
+    v[:, :6] = rng.normal(size=(count, 6))
+    v[:, 6:] = RANGES.centre + share * rng.uniform(-1, 1, size=(count, NV - 6)) * (RANGES.high - RANGES.centre)
+    return MODEL.integrate(MODEL.neutral(), v)
+
+
+def arms(flexion: float, abduction: float, rotation: float = 0.0, elbow: float = 0.0) -> FloatArray:
+    """(35,) both arms alike, degrees; otherwise neutral."""
+    v = np.zeros(NV)
+    for side, _ in SIDES:
+        v[MODEL.coordinate_names.index(f"elbow_flexion_{side}")] = elbow * DEGREE
+    q = MODEL.integrate(MODEL.neutral(), v)
+    for side, _ in SIDES:
+        turns = [
+            so3.exp(np.radians(t) * a) for t, a in zip((flexion, abduction, rotation), SHOULDER_AXES[side], strict=True)
+        ]
+        q[MODEL.quaternion_of(f"upper_arm_{side}")] = so3.quat_multiply(so3.quat_multiply(turns[0], turns[1]), turns[2])
+    return q
+
+
+def told(angles: JointAngles) -> dict[str, float]:
+    return dict(zip(angles.names, angles.position.tolist(), strict=True))
+
+
+def turn(axis: FloatArray, angle: float) -> FloatArray:
+    matrix: FloatArray = Rotation.from_rotvec(angle * axis).as_matrix()
+    return matrix
+
+
+def rotations_of(q: FloatArray) -> dict[str, FloatArray]:
+    return dict(zip(SEGMENTS, MODEL.forward(q, LENGTHS).rotations, strict=True))
+
+
+# --- the conventions' own kinematics, written down once more: angles to rotations
+
+
+def assert_model(q: FloatArray, a: dict[str, float]) -> None:
+    r = rotations_of(q)
+    np.testing.assert_allclose(
+        r["pelvis"] @ turn(Y, a["trunk_flexion"]) @ turn(X, a["trunk_lateral"]) @ turn(Z, a["trunk_axial"]),
+        r["upper_trunk"],
+        atol=1e-9,
+    )
+    rebuilt = q.copy()
+    for number, name in zip(MODEL.scalar_q, np.array(MODEL.coordinate_names)[MODEL.scalar_v], strict=True):
+        rebuilt[number] = a[name]
+    for side, s in SIDES:
+        shoulder = (
+            turn(-Y, a[f"shoulder_flexion_{side}"])
+            @ turn(s * X, a[f"shoulder_abduction_{side}"])
+            @ turn(-s * Z, a[f"shoulder_rotation_{side}"])
+        )
+        rebuilt[MODEL.quaternion_of(f"upper_arm_{side}")] = so3.matrix_to_quat(shoulder)
+    np.testing.assert_allclose(
+        MODEL.forward(rebuilt, LENGTHS).rotations, MODEL.forward(q, LENGTHS).rotations, rtol=0, atol=1e-9
+    )
+
+
+def assert_isb(q: FloatArray, a: dict[str, float]) -> None:
+    """In ISB axes (X forward, Y up, Z right), left arms mirrored: z to -z."""
+    r = rotations_of(q)
+    to_isb = np.array([X, Z, -Y])  # rows: ISB axes in the segments' frames
+    mirror = np.diag([1.0, 1.0, -1.0])
+
+    def joint(parent: str, child: str, side: str = "right") -> FloatArray:
+        relative: FloatArray = to_isb @ r[parent].T @ r[child] @ to_isb.T
+        return mirror @ relative @ mirror if side == "left" else relative
+
+    np.testing.assert_allclose(
+        joint("pelvis", "upper_trunk"),
+        turn(Z, a["thorax_extension"]) @ turn(X, a["thorax_lateral_right"]) @ turn(Y, a["thorax_axial_left"]),
+        atol=1e-9,
+    )
+    np.testing.assert_allclose(
+        joint("upper_trunk", "head"), turn(Z, a["neck_extension"]) @ turn(X, a["neck_lateral_right"]), atol=1e-9
+    )
+    for side, _ in SIDES:
+        np.testing.assert_allclose(
+            joint("upper_trunk", f"clavicle_{side}", side),
+            turn(Y, a[f"clavicle_protraction_{side}"]) @ turn(X, a[f"clavicle_depression_{side}"]),
+            atol=1e-9,
+        )
+        np.testing.assert_allclose(
+            joint("upper_trunk", f"upper_arm_{side}", side),
+            turn(Y, a[f"shoulder_plane_of_elevation_{side}"])
+            @ turn(X, a[f"shoulder_elevation_{side}"])
+            @ turn(Y, a[f"shoulder_internal_rotation_{side}"]),
+            atol=1e-9,
+        )
+        # the bones of the forearm and the hand have their zero with the palm forward
+        palm_forward = turn(Y, -np.pi / 2)
+        np.testing.assert_allclose(
+            joint(f"upper_arm_{side}", f"forearm_{side}", side) @ palm_forward.T,
+            turn(Z, a[f"elbow_flexion_{side}"]) @ turn(Y, a[f"elbow_pronation_{side}"]),
+            atol=1e-9,
+        )
+        np.testing.assert_allclose(
+            palm_forward @ joint(f"forearm_{side}", f"hand_{side}", side) @ palm_forward.T,
+            turn(Z, a[f"wrist_flexion_{side}"]) @ turn(X, a[f"wrist_ulnar_deviation_{side}"]),
+            atol=1e-9,
+        )
+
+
+def assert_rep155(q: FloatArray, a: dict[str, float]) -> None:
+    """Axes of human_description; the torso of its tree, then head and arms."""
+    r = rotations_of(q)
+    torso = r["pelvis"] @ turn(Y, a["waist"])
+    assert abs((torso.T @ r["upper_trunk"] @ Z)[0]) < 1e-9  # what is left is lateral, and about the trunk itself
+    np.testing.assert_allclose(
+        torso @ turn(X, a["r_head"]) @ turn(Z, a["y_head"]) @ turn(-Y, a["p_head"]), r["head"], atol=1e-9
+    )
+    for side, s in SIDES:
+        letter = side[0]
+        upper_arm = (
+            torso
+            @ turn(-s * Z, a[f"{letter}_y_shoulder"])
+            @ turn(s * X, a[f"{letter}_p_shoulder"])
+            @ turn(s * Z, a[f"{letter}_r_shoulder"])
+        )
+        np.testing.assert_allclose(upper_arm, r[f"upper_arm_{side}"], atol=1e-9)
+        forearm = upper_arm @ turn(-Y, a[f"{letter}_elbow"])
+        np.testing.assert_allclose(forearm @ Z, r[f"forearm_{side}"] @ Z, atol=1e-9)
+
+
+def assert_dh26(q: FloatArray, a: dict[str, float]) -> None:
+    """Her forward kinematics puts her ten joints where ours are."""
+    posture = MODEL.forward(q, LENGTHS)
+    hers = Schlagenhauf26(q[:3], posture.rotations[0])
+    ours = dict(zip(MODEL.joints.tolist(), posture.positions, strict=True))
+    length = dict(zip(MODEL.length_names, LENGTHS, strict=True))
+    names = ["lower_trunk", "upper_trunk"]
+    names += [f"{bone}_{side}" for side, _ in SIDES for bone in ("clavicle", "upper_arm", "forearm", "hand")]
+    lengths = np.array([length[n] + (length[n.replace("hand", "hand_tip")] if "hand" in n else 0.0) for n in names])
+    theta = np.array([a[f"theta{i}"] for i in range(1, 27)])
+    np.testing.assert_allclose(
+        hers.forward(theta, lengths).positions, [ours[j] for j in hers.joints.tolist()], rtol=0, atol=1e-9
+    )
+    turned = dict(zip(hers.segment_names, hers.forward(theta, lengths).rotations, strict=True))
+    for segment in ("lower_trunk", "upper_trunk", "upper_arm_left", "upper_arm_right"):
+        np.testing.assert_allclose(turned[segment], rotations_of(q)[segment], rtol=0, atol=1e-9)
+    assert [a[f"theta{i}"] for i in (9, 12, 16, 23)] == [0.0] * 4
+
+
+REBUILT = {"model": assert_model, "isb": assert_isb, "rep155": assert_rep155, "dh26": assert_dh26}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_the_angles_rebuild_the_rotations(name: str) -> None:
+    for q in poses(100):
+        angles = angles_of(estimate(q), MODEL, name)
+        assert np.isfinite(angles.position).all()
+        REBUILT[name](q, told(angles))
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize(
+    "pose", [(0, 0), (0, 90), (90, 0), (180, 0), (0, 180), (90, 90), (-40, 0)], ids=lambda pose: f"{pose[0]}_{pose[1]}"
+)
+def test_the_angles_rebuild_singular_poses_too(name: str, pose: tuple[float, float]) -> None:
+    q = arms(*pose, rotation=20.0, elbow=50.0)
+    REBUILT[name](q, told(angles_of(estimate(q), MODEL, name)))
+
+
+def _expect(q: FloatArray, name: str, expected: dict[str, float]) -> None:
+    """Degrees; the names without their side, of both."""
+    angles = told(angles_of(estimate(q), MODEL, name))
+    for key, value in expected.items():
+        for label in (
+            [key]
+            if key in angles
+            else [f"{key}_left", f"{key}_right"]
+            if f"{key}_left" in angles
+            else [f"l_{key}", f"r_{key}"]
+        ):
+            assert np.degrees(angles[label]) == pytest.approx(value, abs=1e-6), label
+
+
+@pytest.mark.parametrize(
+    ("pose", "flexion", "abduction", "rotation", "elbow"),
+    [
+        ((0, 0, 0, 0), 0, 0, 0, 0),
+        ((0, 90, 0, 0), 0, 90, 0, 0),
+        ((90, 0, 0, 0), 90, 0, 0, 0),
+        ((170, 0, 0, 0), 170, 0, 0, 0),
+        ((0, 170, 0, 0), 0, 170, 0, 0),
+        ((-40, 0, 0, 90), -40, 0, 0, 90),
+        ((0, 30, 50, 90), 0, 30, 50, 90),
+    ],
+)
+def test_textbook_poses_of_the_model(
+    pose: tuple[float, ...], flexion: float, abduction: float, rotation: float, elbow: float
+) -> None:
+    expected = {
+        "shoulder_flexion": flexion,
+        "shoulder_abduction": abduction,
+        "shoulder_rotation": rotation,
+        "elbow_flexion": elbow,
+        "trunk_flexion": 0,
+        "trunk_lateral": 0,
+        "trunk_axial": 0,
+    }
+    _expect(arms(*pose), "model", expected)
+
+
+@pytest.mark.parametrize(
+    ("pose", "plane", "elevation", "rotation", "elbow"),
+    [
+        ((0, 0, 0, 0), 0, 0, 0, 0),  # hanging
+        ((0, 90, 0, 0), 0, -90, 0, 0),  # abduction: plane 0
+        ((90, 0, 0, 90), 90, -90, -90, 90),  # forward flexion: plane 90
+        ((-40, 0, 0, 0), -90, -40, 90, 0),  # extension
+        ((0, 45, 30, 90), 0, -45, 30, 90),  # internal rotation positive
+    ],
+)
+def test_textbook_poses_of_the_isb(
+    pose: tuple[float, ...], plane: float, elevation: float, rotation: float, elbow: float
+) -> None:
+    expected = {
+        "shoulder_plane_of_elevation": plane,
+        "shoulder_elevation": elevation,
+        "shoulder_internal_rotation": rotation,
+        "elbow_flexion": elbow,
+        "elbow_pronation": 90,  # thumbs forward where the arm hangs
+    }
+    _expect(arms(*pose), "isb", expected)
+
+
+@pytest.mark.parametrize(
+    ("pose", "yaw", "pitch", "roll", "elbow"),
+    [
+        ((0, 0, 0, 0), 0, 0, 0, 0),
+        ((0, 90, 0, 0), 0, 90, 0, 0),
+        ((90, 0, 0, 90), 90, 90, 90, 90),
+        ((0, 60, 0, 45), 0, 60, 0, 45),
+    ],
+)
+def test_textbook_poses_of_rep155(pose: tuple[float, ...], yaw: float, pitch: float, roll: float, elbow: float) -> None:
+    expected = {"y_shoulder": yaw, "p_shoulder": pitch, "r_shoulder": roll, "elbow": elbow, "waist": 0, "y_head": 0}
+    _expect(arms(*pose), "rep155", expected)
+
+
+def test_textbook_poses_of_dh26() -> None:
+    _expect(arms(0, 90), "dh26", {f"theta{i}": 0 for i in range(1, 27)})  # the T-pose
+    hanging = dict.fromkeys((f"theta{i}" for i in range(1, 27)), 0.0) | {"theta13": 90, "theta20": -90}
+    _expect(arms(0, 0), "dh26", hanging)
+    _expect(arms(0, 90, 0, 60), "dh26", {"theta17": -60, "theta24": 60, "theta16": 0, "theta23": 0})
+
+
+def _with(name: str, degrees: float) -> FloatArray:
+    v = np.zeros(NV)
+    v[MODEL.coordinate_names.index(name)] = degrees * DEGREE
+    return MODEL.integrate(arms(0, 45, 0, 30), v)
+
+
+@pytest.mark.parametrize(
+    ("coordinate", "name", "angle", "value"),
+    [
+        ("lumbar_flexion", "model", "trunk_flexion", 10),
+        ("thoracic_lateral", "model", "trunk_lateral", 10),
+        ("lumbar_flexion", "isb", "thorax_extension", -10),
+        ("lumbar_lateral", "isb", "thorax_lateral_right", 10),
+        ("thoracic_axial", "isb", "thorax_axial_left", 10),
+        ("neck_flexion", "isb", "neck_extension", -10),
+        ("clavicle_protraction_left", "isb", "clavicle_protraction_left", 10),
+        ("clavicle_elevation_right", "isb", "clavicle_depression_right", -10),
+        ("forearm_pronation_left", "isb", "elbow_pronation_left", 100),
+        ("forearm_pronation_right", "isb", "elbow_pronation_right", 100),
+        ("wrist_flexion_left", "isb", "wrist_flexion_left", 10),
+        ("wrist_deviation_right", "isb", "wrist_ulnar_deviation_right", -10),
+        ("lumbar_flexion", "rep155", "waist", 10),
+        ("neck_flexion", "rep155", "p_head", -10),
+        ("neck_lateral", "rep155", "r_head", 10),
+        ("lumbar_axial", "dh26", "theta1", 10),
+        ("lumbar_flexion", "dh26", "theta2", 10),
+        ("lumbar_lateral", "dh26", "theta3", -10),
+        ("thoracic_lateral", "dh26", "theta4", -10),
+        ("thoracic_axial", "dh26", "theta5", 10),
+        ("thoracic_flexion", "dh26", "theta6", 10),
+        ("clavicle_elevation_left", "dh26", "theta7", -10),
+        ("clavicle_protraction_left", "dh26", "theta8", -10),
+        ("clavicle_elevation_right", "dh26", "theta10", 10),
+        ("clavicle_protraction_right", "dh26", "theta11", 10),
+    ],
+)
+def test_a_single_movement_is_that_angle(coordinate: str, name: str, angle: str, value: float) -> None:
+    angles = told(angles_of(estimate(_with(coordinate, 10)), MODEL, name))
+    assert np.degrees(angles[angle]) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["model", "isb", "rep155"])
+def test_a_mirrored_person_has_the_sides_exchanged(name: str) -> None:
+    for q in poses(30, seed=11):
+        v = MODEL.difference(MODEL.neutral(), q)
+        mirrored = np.zeros(NV)
+        for number, coordinate in enumerate(MODEL.coordinate_names[6:], start=6):
+            other = coordinate.replace("left", "*").replace("right", "left").replace("*", "right")
+            flips = coordinate.startswith(("shoulder_x", "shoulder_z")) or coordinate.endswith(("lateral", "axial"))
+            mirrored[MODEL.coordinate_names.index(other)] = -v[number] if flips else v[number]
+        one = told(angles_of(estimate(q), MODEL, name))
+        two = told(angles_of(estimate(MODEL.integrate(MODEL.neutral(), mirrored)), MODEL, name))
+        for key, value in one.items():
+            if name == "rep155":
+                other = {"l_": "r_", "r_": "l_"}.get(key[:2], "??") + key[2:]
+                other = other if other in two else key
+                sign = -1.0 if key in ("r_head", "y_head") else 1.0
+            else:
+                other = key.replace("left", "*").replace("right", "left").replace("*", "right")
+                other = other if other in two else key
+                sign = -1.0 if "lateral" in key or "axial" in key else 1.0
+            assert two[other] == pytest.approx(sign * value, abs=1e-9), key
+
+
+def _away_from_singular(name: str, count: int, stddev: float) -> list[FloatArray]:
+    """Poses in which all angles but the redundant ones are well determined."""
+    chosen = []
+    for q in poses(40 * count, seed=17, share=0.5):
+        stddevs = angles_of(estimate(q, stddev), MODEL, name).position_stddev
+        if (stddevs[np.isfinite(stddevs)] < 5.0 * stddev).all() and np.isinf(stddevs).sum() == 4 * (name == "dh26"):
+            chosen.append(q)
+        if len(chosen) == count:
+            return chosen
+    raise AssertionError(f"{name}: only {len(chosen)} poses")
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_rates_and_standard_deviations_are_those_of_differences(name: str) -> None:
+    step = 1e-6
+    for q in _away_from_singular(name, 4, 1e-6):
+        now = angles_of(estimate(q), MODEL, name)
+        columns = []
+        for direction in np.eye(NV):
+            plus, minus = (
+                angles_of(estimate(MODEL.integrate(q, s * step * direction)), MODEL, name, now).position
+                for s in (1.0, -1.0)
+            )
+            columns.append((plus - minus) / (2.0 * step))
+        jacobian = np.stack(columns, axis=-1)
+        rng = np.random.default_rng(2)
+        velocity = rng.normal(size=NV)
+        root = rng.normal(size=(2 * NV, 2 * NV))
+        covariance = 1e-12 * root @ root.T
+        angles = angles_of(estimate(q, velocity=velocity, covariance=covariance), MODEL, name)
+        np.testing.assert_allclose(angles.velocity, jacobian @ velocity, rtol=0, atol=1e-7)
+        known = np.isfinite(angles.position_stddev)
+        for stddev, block in (
+            (angles.position_stddev, covariance[:NV, :NV]),
+            (angles.velocity_stddev, covariance[NV:, NV:]),
+        ):
+            expected = np.sqrt(np.einsum("ik,kl,il->i", jacobian, block, jacobian))
+            np.testing.assert_allclose(stddev[known], expected[known], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_samples_scatter_as_stated(name: str) -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(NV, NV))
+    covariance = np.zeros((2 * NV, 2 * NV))
+    covariance[:NV, :NV] = (0.5 * DEGREE) ** 2 * (np.eye(NV) + root @ root.T / NV)
+    for q in _away_from_singular(name, 2, 1.0 * DEGREE):
+        now = angles_of(estimate(q, covariance=covariance), MODEL, name)
+        errors = rng.multivariate_normal(np.zeros(NV), covariance[:NV, :NV], size=1500)
+        samples = np.array(
+            [angles_of(estimate(MODEL.integrate(q, e)), MODEL, name, now).position - now.position for e in errors]
+        )
+        known = np.isfinite(now.position_stddev)
+        # 1500 samples know a standard deviation to 1.8 %
+        np.testing.assert_allclose(samples[:, known].std(axis=0) / now.position_stddev[known], 1.0, atol=0.1)
+        assert (np.abs(samples[:, known].mean(axis=0)) < 0.2 * now.position_stddev[known]).all()
+
+
+SINGULAR = {"model": (0.0, 90.0), "isb": (0.0, 0.0), "rep155": (0.0, 0.0), "dh26": (90.0, 0.0)}
+OUTER = {
+    "model": ("shoulder_flexion_left", "shoulder_abduction_left", "shoulder_rotation_left"),
+    "isb": ("shoulder_plane_of_elevation_left", "shoulder_elevation_left", "shoulder_internal_rotation_left"),
+    "rep155": ("l_y_shoulder", "l_p_shoulder", "l_r_shoulder"),
+    "dh26": ("theta13", "theta14", "theta15"),
+}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> None:
+    """Outer angles: growing towards the singular pose, then infinite; the middle one stays what it is."""
+    stddev = 0.5 * DEGREE
+    before = 0.0
+    for away in (40.0, 20.0, 10.0, 6.0, 1.0, 0.0):
+        angles = angles_of(estimate(arms(SINGULAR[name][0] - away, SINGULAR[name][1] + 0.1), stddev), MODEL, name)
+        of = dict(zip(angles.names, angles.position_stddev, strict=True))
+        rates = dict(zip(angles.names, angles.velocity_stddev, strict=True))
+        first, middle, last = (of[key] for key in OUTER[name])
+        assert middle < 5.0 * stddev
+        if name == "model":
+            continue  # flexion is its first angle: it does not lead away from its singular pose
+        assert first > before
+        assert np.isfinite(first) == (away > 2.0)
+        assert np.isinf(last) == np.isinf(first) == np.isinf(rates[OUTER[name][0]])
+        before = first if np.isfinite(first) else before
+
+
+def test_abduction_leads_the_models_shoulder_into_its_singular_pose() -> None:
+    stddev, before = 0.5 * DEGREE, 0.0
+    for away in (40.0, 20.0, 10.0, 6.0, 1.0, 0.0):
+        angles = angles_of(estimate(arms(0.0, 90.0 - away), stddev), MODEL, "model")
+        of = dict(zip(angles.names, angles.position_stddev, strict=True))
+        assert np.isfinite(of["shoulder_flexion_right"]) == (away > 2.0)
+        assert of["shoulder_flexion_right"] > before
+        assert of["shoulder_abduction_right"] == pytest.approx(stddev)
+        before = min(of["shoulder_flexion_right"], 1e3)
+
+
+def _path(kind: str, offset: float) -> list[FloatArray]:
+    """An arm that swings through a pose and a little past it, degrees per step at most 3."""
+    steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # nobody's arm goes far behind straight up
+    if kind == "hanging":
+        return [arms(t, offset) for t in steps]
+    if kind == "t_pose":
+        return [arms(offset, 90.0 + t) for t in steps]
+    if kind == "up":
+        return [arms(180.0 + t, offset) for t in steps]
+    return [arms(90.0 + t, offset, 30.0) for t in steps]  # forward
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize("kind", ["hanging", "t_pose", "up", "forward"])
+@pytest.mark.parametrize("offset", [0.0, 0.5, -2.0])
+def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offset: float) -> None:
+    """An arm that moves by 3 deg a frame, known to 3 deg.
+
+    No angle takes steps of more than five times that (past a singular pose at 2 deg an exact split takes 74 deg in one
+    step), and the angles together do not stray from the rotation by more than three standard deviations.
+    """
+    before: JointAngles | None = None
+    for q in _path(kind, offset):
+        angles = angles_of(estimate(q, 3.0 * DEGREE), MODEL, name, before)
+        assert np.isfinite(angles.position).all()
+        if before is not None:
+            step = np.degrees(np.abs(angles.position - before.position))
+            assert step.max() < 15.0, [(n, s) for n, s in zip(angles.names, step, strict=True) if s > 5]
+        if name == "model":
+            for side, _ in SIDES:
+                a = told(angles)
+                t = [a[f"shoulder_{k}_{side}"] for k in ("flexion", "abduction", "rotation")]
+                built = np.linalg.multi_dot([turn(axis, x) for axis, x in zip(SHOULDER_AXES[side], t, strict=True)])
+                r = rotations_of(q)
+                error = Rotation.from_matrix(built.T @ r[f"clavicle_{side}"].T @ r[f"upper_arm_{side}"]).magnitude()
+                assert np.degrees(error) < 9.0
+        before = angles
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
+    """Ten seconds of a person who keeps the pose, with the noise that the filter states."""
+    rng = np.random.default_rng(3)
+    pose = arms(*SINGULAR[name])
+    before: JointAngles | None = None
+    seen = []
+    for _ in range(300):
+        q = MODEL.integrate(pose, np.concatenate([np.zeros(6), rng.normal(0.0, 1.5 * DEGREE, NV - 6)]))
+        before = angles_of(estimate(q, 1.5 * DEGREE), MODEL, name, before)
+        seen.append(before.position)
+    spread = np.degrees(np.ptp(np.array(seen), axis=0))
+    columns = [before.names.index(key) for key in OUTER[name]] if before is not None else []
+    assert spread[columns].max() < 60.0
+
+
+def test_an_angle_that_only_its_range_bounds_is_unobserved() -> None:
+    q = poses(1)[0]
+    for share, infinite in ((0.45, False), (0.55, True)):
+        covariance = np.zeros((2 * NV, 2 * NV))
+        number = MODEL.coordinate_names.index("thoracic_axial")
+        covariance[number, number] = (share * RANGES.stddev[number - 6]) ** 2
+        angles = angles_of(estimate(q, covariance=covariance), MODEL, "model")
+        index = angles.names.index("thoracic_axial")
+        assert np.isinf(angles.position_stddev[index]) == infinite
+        assert np.isinf(angles.velocity_stddev[index]) == infinite
+    assert 0.45 < KNOWN_SHARE < 0.55
+    assert pytest.approx(np.radians(180.0) / np.sqrt(12.0)) == GREATEST_STDDEV
+
+
+def test_infinite_variances_and_missing_velocities_stay_where_they_belong() -> None:
+    number = MODEL.coordinate_names.index("lumbar_axial")
+    covariance = 1e-6 * np.eye(2 * NV)
+    covariance[number, number] = np.inf
+    velocity = np.zeros(NV)
+    velocity[number] = np.nan
+    angles = angles_of(estimate(poses(1)[0], velocity=velocity, covariance=covariance), MODEL, "model")
+    told_stddev = dict(zip(angles.names, angles.position_stddev, strict=True))
+    assert {key for key, value in told_stddev.items() if np.isinf(value)} == {
+        "lumbar_axial",
+        "trunk_flexion",
+        "trunk_lateral",
+        "trunk_axial",
+    }
+    np.testing.assert_array_equal(np.isnan(angles.velocity), np.isinf(angles.position_stddev))
+
+
+def test_opposite_twists_of_the_two_trunk_joints_leave_the_whole_trunk_known() -> None:
+    """The full covariance goes through: what lumbar and thoracic twist share without being told apart is no loss."""
+    covariance = np.zeros((2 * NV, 2 * NV))
+    one, two = (MODEL.coordinate_names.index(name) for name in ("lumbar_axial", "thoracic_axial"))
+    covariance[np.ix_([one, two], [one, two])] = 0.5 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    angles = angles_of(estimate(arms(0, 45), covariance=covariance), MODEL, "model")
+    stddev = dict(zip(angles.names, angles.position_stddev, strict=True))
+    assert np.isinf(stddev["lumbar_axial"])
+    assert np.isinf(stddev["thoracic_axial"])
+    assert stddev["trunk_axial"] < 1e-9
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_moving_and_turning_the_person_changes_no_angle(name: str) -> None:
+    for q in poses(10):
+        moved = q.copy()
+        moved[:3] += 2.0
+        base = MODEL.quaternion_of("pelvis")
+        moved[base] = so3.quat_multiply(so3.exp(np.array([0.4, -1.0, 2.5])), q[base])
+        np.testing.assert_allclose(
+            angles_of(estimate(moved), MODEL, name).position,
+            angles_of(estimate(q), MODEL, name).position,
+            rtol=0,
+            atol=1e-9,
+        )
+
+
+def test_wrong_names_are_refused() -> None:
+    now = estimate(MODEL.neutral())
+    with pytest.raises(ConventionError, match="'euler': not one of model, isb, rep155, dh26"):
+        angles_of(now, MODEL, "euler")
+    with pytest.raises(ConventionError, match="previous angles"):
+        angles_of(now, MODEL, "isb", angles_of(now, MODEL, "model"))
+
+
+def test_names_and_stamp() -> None:
+    for name, count in (("model", 29), ("isb", 23), ("rep155", 12), ("dh26", 26)):
+        angles = angles_of(estimate(MODEL.neutral()), MODEL, name)
+        assert angles.stamp_ns == 7
+        assert len(set(angles.names)) == count
+        assert all(getattr(angles, field).shape == (count,) for field in ("position", "velocity", "position_stddev"))
+
+
+def test_segment_quaternions_are_the_models_rotations() -> None:
+    for q in poses(10):
+        result = segment_quaternions(estimate(q), MODEL)
+        r = MODEL.forward(q, LENGTHS).rotations
+        np.testing.assert_allclose(so3.quat_to_matrix(result.world), r, rtol=0, atol=1e-12)
+        for segment, parent in enumerate(result.parents):
+            expected = r[segment] if parent < 0 else r[parent].T @ r[segment]
+            np.testing.assert_allclose(so3.quat_to_matrix(result.relative[segment]), expected, rtol=0, atol=1e-12)
+
+
+def test_segment_quaternions_state_their_scatter_even_in_the_t_pose() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(NV, NV))
+    covariance = np.zeros((2 * NV, 2 * NV))
+    covariance[:NV, :NV] = (0.5 * DEGREE) ** 2 * (np.eye(NV) + root @ root.T / NV)
+    q = arms(0, 90)
+    now = segment_quaternions(estimate(q, covariance=covariance), MODEL)
+    errors = rng.multivariate_normal(np.zeros(NV), covariance[:NV, :NV], size=3000)
+    moved = MODEL.forward(MODEL.integrate(q, errors), LENGTHS).rotations
+    parents = np.array(now.parents)
+    world = so3.quat_multiply(so3.quat_inverse(now.world), so3.matrix_to_quat(moved))
+    np.testing.assert_allclose(so3.log(world).std(axis=0) / now.world_stddev, 1.0, atol=0.08)
+    relative = so3.matrix_to_quat(moved[:, parents[1:]].swapaxes(-1, -2) @ moved[:, 1:])
+    scatter = so3.log(so3.quat_multiply(so3.quat_inverse(now.relative[1:]), relative)).std(axis=0)
+    stated = now.relative_stddev[1:]
+    moves = stated > 1e-9  # joints of two axes do not turn about the third
+    np.testing.assert_allclose(scatter[moves] / stated[moves], 1.0, atol=0.08)
+    assert scatter[~moves].max() < 1e-3
+    np.testing.assert_allclose(now.relative_stddev[0], now.world_stddev[0])
+
+
+def test_an_unknown_orientation_is_infinitely_uncertain() -> None:
+    covariance = 1e-6 * np.eye(2 * NV)
+    number = MODEL.coordinate_names.index("forearm_pronation_left")
+    covariance[number, number] = np.inf
+    result = segment_quaternions(replace(estimate(arms(0, 45)), covariance=covariance), MODEL)
+    infinite = {result.names[s] for s in range(len(result.names)) if np.isinf(result.world_stddev[s]).any()}
+    assert infinite == {"forearm_left", "hand_left"}
+    assert np.isfinite(result.relative_stddev[result.names.index("hand_left")]).all()
