@@ -67,6 +67,7 @@ setup(
             "catkin_pkg>=1.0",
             "colcon-common-extensions",
             "colcon-ros",
+            "pin>=3",
             "psutil",
             "setuptools>=77",
         ],

@@ -268,8 +268,14 @@ SHOULDER_USUAL = ((-60.0, 180.0), (-60.0, 180.0), (-100.0, 100.0))
 _ELBOW_USUAL = (RANGES["elbow_flexion"], (-90.0, 90.0), RANGES["forearm_pronation"])
 
 
+def model_names(model: UpperBody) -> tuple[str, ...]:
+    """The model's 26 joint angles in the order of its tangent, the shoulders' as they are told."""
+    split = {"x": "flexion", "y": "abduction", "z": "rotation"}
+    words = [name.split("_") for name in model.coordinate_names[6:]]
+    return tuple("_".join([w[0], split[w[1]], w[2]] if w[0] == "shoulder" else w) for w in words)
+
+
 def _model(model: UpperBody) -> Convention:
-    names: list[str] = []
     chains = [
         Chain(
             ("trunk_flexion", "trunk_lateral", "trunk_axial"),
@@ -287,11 +293,7 @@ def _model(model: UpperBody) -> Convention:
         )
         for side in _SIDES
     ]
-    split = {"x": "flexion", "y": "abduction", "z": "rotation"}
-    for name in model.coordinate_names[6:]:
-        words = name.split("_")
-        names.append(f"shoulder_{split[words[1]]}_{words[2]}" if words[0] == "shoulder" else name)
-    return Convention(model, [*names, "trunk_flexion", "trunk_lateral", "trunk_axial"], chains)
+    return Convention(model, [*model_names(model), "trunk_flexion", "trunk_lateral", "trunk_axial"], chains)
 
 
 def _isb(model: UpperBody) -> Convention:
