@@ -18,6 +18,8 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -61,7 +63,8 @@ _POOL = 8.0
 _OUTLYING = 6.0
 """A squared difference counts as at most so many times the variance."""
 _NEGLIGIBLE_SLOW = 1e-3
-_SLOW_MEMORY = 3.0
+_SLOW_PERIOD_NS = NANOSECONDS // 15
+_SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
@@ -548,12 +551,19 @@ class ExtendedKalmanFilter:
             part[np.arange(3 * self._points), np.arange(3 * self._points)] += slow
             cross = np.zeros((self._size, 3 * self._points)) if sensor.cross is None else sensor.cross
             own_cross = self._considered(cross, gain, factor, part[rows], state.settled)
-        sensor = self._slow_learnt(sensor, measurement, factor, white, rows, dt)
-        sensors[measurement.sensor] = replace(self._seen_by(sensor, measurement, used), cross=own_cross)
-
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
+
+        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows)
+        if own_cross is not None and slow_scale != sensor.slow:
+            # What the slow errors did to the state so far is as much smaller as they are.
+            ratio = slow_scale / sensor.slow
+            covariance -= (1.0 - ratio) * (own_cross @ own_cross.T)
+            own_cross *= math.sqrt(ratio)
+        sensors[measurement.sensor] = replace(
+            self._seen_by(sensor, measurement, used), cross=own_cross, slow=slow_scale, slow_information=information
+        )
         return replace(
             state,
             q=self.model.integrate(state.q, correction[self._tangent]),
@@ -605,30 +615,34 @@ class ExtendedKalmanFilter:
         stamps, frames = sensor.stamps, sensor.positions
         white, weight = sensor.white, sensor.weight
         if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
-            times = (np.array([*stamps, measurement.stamp_ns]) - stamps[0]) / NANOSECONDS
-            apart = times[:, None] - times
-            apart[np.arange(4), np.arange(4)] = 1.0
-            factors = 1.0 / apart.prod(axis=1)  # divided differences: exact for any spacing
-            factors /= np.sqrt((factors * factors).sum())
-            difference = factors[:3] @ frames.reshape(3, -1) + factors[3] * points.reshape(-1)
-            squared = (difference.reshape(-1, 3) ** 2).mean(axis=1)
-            known = np.isfinite(squared)
+            factors = _third_difference((*stamps, measurement.stamp_ns))
+            difference = (factors[:3] @ frames.reshape(3, -1)).reshape(-1, 3) + factors[3] * points
+            squared = (difference * difference).mean(axis=1)
+            known = squared >= 0.0  # not NaN
             if known.any():
-                pooled = float(np.median(squared[known])) / _MEDIAN_OF_CHI2_3
-                # what all points say stands behind each one's own, and keeps one that just came back from any value
-                ratio = np.where(known, squared, pooled)
-                bounded = np.minimum(ratio, _OUTLYING * np.maximum(white, pooled))
-                keep = min(1.0, _NOISE_FRAMES / (_NOISE_FRAMES + 1.0))
-                new_weight = np.where(known, weight * keep + 1.0, weight)
-                white = np.where(known, (weight * keep * white + bounded) / new_weight, white)
-                weight = new_weight
-                # shrink towards the median of all points while a point has little of its own
-                share = _POOL / (_POOL + weight)
-                white = np.where(known & (weight < _POOL), (1 - share) * white + share * np.median(white), white)
-        white = np.maximum(white, _FLOOR**2)
-        stamps = (*stamps[-2:], measurement.stamp_ns)
+                white, weight = self._white_learnt(white, weight, squared, known)
         frames = np.concatenate([frames[-2:], points[None]])
-        return replace(sensor, stamps=stamps, positions=frames, white=white, weight=weight)
+        return replace(
+            sensor, stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames, white=white, weight=weight
+        )
+
+    def _white_learnt(
+        self, white: FloatArray, weight: FloatArray, squared: FloatArray, known: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(19,) variances and weights, with one more squared difference (19,) of the known points."""
+        fewest = float(weight.min())
+        bound = white
+        if fewest < 2.0 * _POOL:
+            # what all points say together keeps one that was not seen yet from any value
+            pooled = float(np.median(squared[known])) / _MEDIAN_OF_CHI2_3
+            bound = np.maximum(white, pooled)
+        kept = np.minimum(weight, _NOISE_FRAMES)
+        mean = (kept * white + np.minimum(squared, _OUTLYING * bound)) / (kept + 1.0)
+        if fewest < 2.0 * _POOL:
+            share = np.maximum(1.0 - weight / (2.0 * _POOL), 0.0)
+            mean += share * (np.median(mean[known]) - mean)
+        white = np.maximum(np.where(known, mean, white), _FLOOR**2)
+        return white, np.where(known, kept + 1.0, weight)
 
     def _slow_learnt(
         self,
@@ -637,20 +651,22 @@ class ExtendedKalmanFilter:
         factor: FloatArray,
         white: FloatArray,
         rows: IntArray,
-        dt: float,
-    ) -> _SensorState:
-        """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance."""
+    ) -> tuple[float, float]:
+        """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance; with its information."""
         if sensor.weight.max() < 2.0 * _POOL:
-            return sensor  # what is white is not known yet, and would be taken for slow
+            return sensor.slow, sensor.slow_information  # what is white is not known yet, and would be taken for slow
+        if measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
+            return sensor.slow, sensor.slow_information  # it changes slowly, and takes a while to compute
         inverse, _ = dtrtrs(factor, np.eye(len(factor)), lower=1)
         precision = inverse.T @ inverse
         residual = white @ inverse
         variances = np.repeat(measurement.model_variance, 3)[rows]
         score = 0.5 * float(variances @ (np.minimum(residual**2, 9.0 * precision.diagonal()) - precision.diagonal()))
         information = 0.5 * float(variances @ (precision * precision) @ variances)
-        total = sensor.slow_information * np.exp(-dt / _SLOW_MEMORY) + information
+        passed = _SLOW_PERIOD_NS / NANOSECONDS
+        total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
         slow = float(np.clip(sensor.slow + score / total, 0.0, _MAX_SLOW))
-        return replace(sensor, slow=slow, slow_information=total)
+        return slow, total
 
     def _densities_learnt(
         self, state: _State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
@@ -809,7 +825,7 @@ class ExtendedKalmanFilter:
         if state.since_prior < _PRIOR_PERIOD:
             return state
         soft = self.ranges.soft_coordinates(state.q)
-        excess = self.ranges.excess(state.q)
+        excess = self.ranges.excess_of(soft.values)
         gradients = np.zeros((self._nv - 5, self._nv))
         gradients[:-1, 6:] = soft.gradients
         gradients[-1, 6:] = self._twist @ soft.gradients
@@ -867,14 +883,18 @@ class ExtendedKalmanFilter:
     # --- output
 
     def _estimate(self, state: _State) -> ModelEstimate:
-        keep = np.r_[self._tangent, self._velocities]
+        covariance = np.empty((2 * self._nv, 2 * self._nv))
+        for row, rows in enumerate((self._tangent, self._velocities)):
+            for column, columns in enumerate((self._tangent, self._velocities)):
+                block = slice(row * self._nv, (row + 1) * self._nv), slice(column * self._nv, (column + 1) * self._nv)
+                covariance[block] = state.covariance[rows, columns]
         return ModelEstimate(
             state.stamp_ns,
             self._frame_id,
             self._body,
             state.q,
             state.velocity,
-            state.covariance[np.ix_(keep, keep)],
+            covariance,
             state.lengths,
             np.sqrt(state.covariance.diagonal()[self._lengths]),
         )
@@ -895,3 +915,11 @@ class ExtendedKalmanFilter:
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
+
+
+def _third_difference(stamps: Sequence[int]) -> FloatArray:
+    """(4,) factors of the third divided difference at these nanoseconds; their squares sum up to 1."""
+    t = [(stamp - stamps[0]) / NANOSECONDS for stamp in stamps]
+    factors = np.array([1.0 / math.prod(a - b for b in t if b != a) for a in t])
+    result: FloatArray = factors / np.sqrt(factors @ factors)
+    return result

@@ -182,7 +182,7 @@ class InverseKinematics:
 
         soft = self.ranges.soft_coordinates(q)
         off = soft.values - self.ranges.centre
-        over = self.ranges.excess(q)
+        over = self.ranges.excess_of(soft.values)
         prior = 1.0 / self.ranges.stddev**2
         limit = np.where(over != 0.0, 1.0 / _LIMIT_STDDEV**2, 0.0)
         inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)

@@ -119,7 +119,10 @@ class Ranges:
 
         The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
         """
-        values = self.soft_coordinates(q).values
+        return self.excess_of(self.soft_coordinates(q).values)
+
+    def excess_of(self, values: FloatArray) -> FloatArray:
+        """The same of the values (..., 26) of :class:`SoftCoordinates`."""
         excess = np.maximum(values - self.high, 0.0) + np.minimum(values - self.low, 0.0)
         for rows in self._soft:
             swing = values[..., rows[:2]]

@@ -12,6 +12,7 @@ import numpy as np
 from body_tracking.skeleton import FloatArray
 
 _SMALL = 1e-8
+_TINY = 1e-12
 _LEVI_CIVITA = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
@@ -26,6 +27,15 @@ for _i in range(3):
         _MATRIX[5 * _j, 4 * _i] -= 1.0
     _MATRIX[15, 4 * _i] += 1.0
 _MATRIX[3:12:4] += 2.0 * SKEW
+
+_PRODUCT: FloatArray = np.zeros((4, 4, 4))
+# a * b = (aw bv + bw av + av x bv, aw bw - av . bv), as the linear map of the products of the quaternions' numbers
+for _i in range(3):
+    _PRODUCT[3, _i, _i] = _PRODUCT[_i, 3, _i] = 1.0
+    _PRODUCT[_i, _i, 3] = -1.0
+_PRODUCT[:3, :3, :3] += _LEVI_CIVITA
+_PRODUCT[3, 3, 3] = 1.0
+_PRODUCT = _PRODUCT.reshape(16, 4)
 
 
 def skew(v: FloatArray) -> FloatArray:
@@ -63,17 +73,8 @@ def matrix_to_quat(matrix: FloatArray) -> FloatArray:
 
 def quat_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """(..., 4) products of quaternions xyzw: turned by b first."""
-    ax, ay, az, aw = (a[..., i] for i in range(4))
-    bx, by, bz, bw = (b[..., i] for i in range(4))
-    result: FloatArray = np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=-1,
-    )
+    products = a[..., :, None] * b[..., None, :]
+    result: FloatArray = products.reshape(*products.shape[:-2], 16) @ _PRODUCT
     return result
 
 
@@ -86,8 +87,11 @@ def quat_inverse(q: FloatArray) -> FloatArray:
 def exp(v: FloatArray) -> FloatArray:
     """(..., 4) unit quaternions xyzw of (..., 3) rotation vectors, radians."""
     half = 0.5 * np.sqrt((v * v).sum(axis=-1, keepdims=True))
-    # sin(x) / x by numpy's sinc, which knows the limit
-    return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
+    q = np.empty((*v.shape[:-1], 4))
+    q[..., 3:] = np.cos(half)
+    half = np.maximum(half, _TINY)  # sin(x) / x is 1 there, exactly
+    q[..., :3] = (0.5 * np.sin(half) / half) * v
+    return q
 
 
 def log(q: FloatArray) -> FloatArray:

@@ -31,7 +31,8 @@ from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import Linearisation, ModelError, Posture
 from body_tracking.skeleton import FloatArray, IntArray, Joint
 
-_X, _Y, _Z = np.eye(3)
+_EYE3 = np.eye(3)
+_X, _Y, _Z = _EYE3
 
 SEGMENTS: tuple[str, ...] = (
     "pelvis",
@@ -217,37 +218,23 @@ class UpperBody:
         # rotations of the joints: exp(angle [axis]x) = 1 + sin [axis]x + (1 - cos) [axis]x^2
         self._scalar_segments = np.array(scalar_segments, dtype=np.intp)
         self._ball_segments = np.array(ball_segments, dtype=np.intp)
-        self._axis = axes[scalar_segments]
         self._axis_slot: IntArray = np.array(v_of_axis, dtype=np.intp)
-        self._generator = so3.skew(self._axis)
-        self._generator_squared = self._generator @ self._generator
+        generator = so3.skew(axes[scalar_segments])
+        self._generators = np.stack([generator, generator @ generator])
 
-        # the tree: levels of segments that can be computed at once
+        # the tree: levels of segments that can be computed at once; these and their parents stand side by side
         depth = [0] * len(SEGMENTS)
         for segment, parent in enumerate(PARENTS[1:], start=1):
             depth[segment] = depth[parent] + 1
+        levels = [[s for s in range(len(SEGMENTS)) if depth[s] == level] for level in range(1, max(depth) + 1)]
         self._levels = [
-            (
-                np.array([s for s in range(len(SEGMENTS)) if depth[s] == level], dtype=np.intp),
-                np.array([PARENTS[s] for s in range(len(SEGMENTS)) if depth[s] == level], dtype=np.intp),
-            )
-            for level in range(1, max(depth) + 1)
+            (slice(level[0], level[-1] + 1), slice(PARENTS[level[0]], PARENTS[level[-1]] + 1)) for level in levels
         ]
         point_of = {joint: number for number, (joint, _, _) in enumerate(_POINTS)}
         segment_of = [SEGMENTS.index(name) for _, name, _ in _POINTS]
-        self._point_segment: IntArray = np.array(segment_of, dtype=np.intp)
         self._origin_point: IntArray = np.array([point_of[joint] for joint in _ORIGINS], dtype=np.intp)
-        self._path = np.zeros((len(_POINTS), len(_POINTS)))
-        for point, segment in enumerate(segment_of):
-            self._path[point, point] = 1.0
-            while segment > 0:
-                self._path[point, self._origin_point[segment]] = 1.0
-                # the origin is a point of the parent, and hangs on the parent's own origin
-                segment = PARENTS[segment]
-        self._offsets = np.zeros((len(_POINTS), 3, len(LENGTHS)))
-        for point, (_, _, parts) in enumerate(_POINTS):
-            for name, direction in parts:
-                self._offsets[point, :, LENGTHS.index(name)] = direction
+        self._place_directions(scalar_segments, ball_segments)
+        self._place_lengths(segment_of)
 
         # which coordinates turn which segment, and move which point
         turns = np.zeros((len(SEGMENTS), self.nv))
@@ -255,18 +242,55 @@ class UpperBody:
             if parent >= 0:
                 turns[segment] = turns[parent]
             turns[segment, self.segment_coordinates[segment]] = 1.0
-        self._turns = turns[:, 3:]
-        self._moves = self._turns[segment_of][:, None, :]
-        self._coordinate_segment: IntArray = np.array(
-            [
-                next(s for s, c in enumerate(self.segment_coordinates) if c.start <= v < c.stop)
-                for v in range(3, self.nv)
-            ],
-            dtype=np.intp,
-        )
-        self._scalar_columns = self.scalar_v - 3
-        self._ball_columns = (self.ball_v - 3).reshape(-1)
-        self._scalar_parent: IntArray = np.array([PARENTS[s] for s in scalar_segments], dtype=np.intp)
+        self._turns = turns[:, None, 3:]
+        self._minus_moves = -self._turns[segment_of]
+        carrier = [
+            segment for segment, part in enumerate(self.segment_coordinates) for _ in range(part.start, part.stop)
+        ]
+        self._centre_segment: IntArray = np.array(carrier, dtype=np.intp)
+
+    def _place_directions(self, scalar_segments: list[int], ball_segments: list[int]) -> None:
+        """Where the axis of each rotational coordinate is a column, or its opposite, of a rotation in world.
+
+        The last axis of a joint stands still in the segment that it turns, the first one in the parent. The middle one
+        of three stands still in a frame of its own, which comes after the segments.
+        """
+        self._three: IntArray = np.array([k for k, s in enumerate(scalar_segments) if len(_AXES[s] or ()) == 3])
+        self._three_parents = np.array([PARENTS[scalar_segments[k]] for k in self._three], dtype=np.intp)
+        frame: dict[int, tuple[int, FloatArray]] = {}
+        for segment in ball_segments:
+            start = self.segment_coordinates[segment].start
+            frame.update({start + axis: (segment, np.eye(3)[axis]) for axis in range(3)})
+        for number, segment in enumerate(scalar_segments):
+            joint = _AXES[segment]
+            assert joint is not None
+            start = self.segment_coordinates[segment].start
+            frame[start] = (PARENTS[segment], joint[0][1])
+            frame[start + len(joint) - 1] = (segment, joint[-1][1])
+            if len(joint) == 3:
+                frame[start + 1] = (len(SEGMENTS) + list(self._three).index(number), joint[1][1])
+        self._axis_columns = _columns([frame[v] for v in range(3, self.nv)])
+
+    def _place_lengths(self, segment_of: list[int]) -> None:
+        """Along which column of which segment each length extends, and in the places of which points it counts."""
+        carried: dict[str, tuple[int, FloatArray]] = {}
+        self._counts = np.zeros((len(_POINTS), len(LENGTHS)))
+        for point, (_, _, parts) in enumerate(_POINTS):
+            for name, direction in parts:
+                known, along = carried.setdefault(name, (segment_of[point], direction))
+                assert known == segment_of[point] and np.array_equal(along, direction)
+                self._counts[point, LENGTHS.index(name)] = 1.0
+        for point, segment in enumerate(segment_of):
+            while segment > 0:
+                origin = int(self._origin_point[segment])
+                # the origin is a point of the parent, and hangs on the parent's own origin
+                self._counts[point] += (
+                    self._counts[origin]
+                    * (segment_of[origin] == PARENTS[segment])
+                    * ([carried[name][0] == PARENTS[segment] for name in LENGTHS])
+                )
+                segment = PARENTS[segment]
+        self._length_columns = _columns([carried[name] for name in LENGTHS])
 
     def neutral(self) -> FloatArray:
         """(35,) the neutral-zero pose at the world's origin, facing x."""
@@ -313,63 +337,68 @@ class UpperBody:
         Raises:
             ModelError: the last dimension of an argument is another.
         """
-        _, rotations = self._rotations(q)
-        return self._place(q, lengths, rotations)[1]
+        return self._place(q, lengths, self._frames(q))[1]
 
     def linearise(self, q: FloatArray, lengths: FloatArray) -> Linearisation:
         """Forward kinematics and its derivatives; arguments and errors as of :meth:`forward`."""
-        axes, rotations = self._rotations(q)
-        by_lengths, posture = self._place(q, lengths, rotations)
-        # a segment turns with the axes of all joints up to it, and a point moves by axis x (point - origin)
-        generators = (axes @ so3.SKEW).reshape(*axes.shape[:-1], 3, 3)
-        centres = posture.origins[..., self._coordinate_segment, :]
-        arms = np.moveaxis(generators, -3, -2)  # (..., 3, 29, 3)
-        swept = (arms * centres[..., None, :, :]).sum(axis=-1)
-        shape = arms.shape[:-3]
-        flat = arms.reshape(*shape, -1, 3)
-        moved = (posture.positions @ flat.swapaxes(-1, -2)).reshape(*shape, -1, 3, self.nv - 3)
+        frames = self._frames(q)
+        along, posture = self._place(q, lengths, frames)
+        axes = self._directions(frames, self._axis_columns)  # (..., 29, 3)
+        columns = axes.swapaxes(-1, -2)
+        # a segment turns with the axes of all joints up to it; a point moves by axis x (point - origin)
+        centres = posture.origins.take(self._centre_segment, axis=-2)
+        swept = (so3.skew(axes) * centres[..., None, :]).sum(axis=-1).swapaxes(-1, -2)
+        shape = axes.shape[:-2]
+        arms = so3.skew(posture.positions).reshape(*shape, -1, 3)
+        moved = (arms @ columns).reshape(*shape, len(self.joints), 3, self.nv - 3)
         jacobian = np.empty((*shape, len(self.joints), 3, self.nv))
-        jacobian[..., :3] = np.eye(3)
-        jacobian[..., 3:] = (moved - swept[..., None, :, :]) * self._moves
+        jacobian[..., :3] = _EYE3
+        np.multiply(moved + swept[..., None, :, :], self._minus_moves, out=jacobian[..., 3:])
         turning = np.zeros((*shape, len(SEGMENTS), 3, self.nv))
-        turning[..., 3:] = axes.swapaxes(-1, -2)[..., None, :, :] * self._turns[:, None, :]
+        np.multiply(columns[..., None, :, :], self._turns, out=turning[..., 3:])
+        by_lengths = self._counts[:, None, :] * along.swapaxes(-1, -2)[..., None, :, :]
         return Linearisation(posture, jacobian, by_lengths, turning)
 
-    def _rotations(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(..., 29, 3) axes of the rotational coordinates, and (..., 12, 3, 3) rotations of the segments, in world."""
+    def _frames(self, q: FloatArray) -> FloatArray:
+        """(..., 14, 3, 3) rotations in world: of the segments, then of the middle axes of the joints with three."""
         if q.shape[-1] != self.nq:
             raise ModelError(f"upper_body: a configuration of {q.shape[-1]} numbers, expected {self.nq}")
         leading = q.shape[:-1]
         angles = np.zeros((*leading, 3 * len(self._scalar_segments)))
-        angles[..., self._axis_slot] = q[..., self.scalar_q]
+        angles[..., self._axis_slot] = q.take(self.scalar_q, axis=-1)
         angles = angles.reshape(*leading, -1, 3, 1, 1)
-        steps = np.eye(3) + np.sin(angles) * self._generator + (1.0 - np.cos(angles)) * self._generator_squared
+        first, second = self._generators
+        steps = _EYE3 + np.sin(angles) * first + (1.0 - np.cos(angles)) * second
+        frames = np.empty((*leading, len(SEGMENTS) + len(self._three), 3, 3))
         two = steps[..., 0, :, :] @ steps[..., 1, :, :]
-        local = np.empty((*leading, len(SEGMENTS), 3, 3))
-        local[..., self._scalar_segments, :, :] = two @ steps[..., 2, :, :]
-        local[..., self._ball_segments, :, :] = so3.quat_to_matrix(q[..., self._quat_q])
+        frames[..., self._scalar_segments, :, :] = two
+        last = self._scalar_segments[self._three]
+        frames[..., last, :, :] = two[..., self._three, :, :] @ steps[..., self._three, 2, :, :]
+        frames[..., self._ball_segments, :, :] = so3.quat_to_matrix(q[..., self._quat_q])
+        for segments, parents in self._levels:  # in place, parents first; the base has its own already
+            frames[..., segments, :, :] = frames[..., parents, :, :] @ frames[..., segments, :, :]
+        middle = frames[..., self._three_parents, :, :] @ steps[..., self._three, 0, :, :]
+        frames[..., len(SEGMENTS) :, :, :] = middle
+        return frames
 
-        world = local  # the base has its own already; the others are turned in place, parents first
-        for segments, parents in self._levels:
-            world[..., segments, :, :] = world[..., parents, :, :] @ local[..., segments, :, :]
+    def _directions(self, frames: FloatArray, columns: tuple[IntArray, FloatArray]) -> FloatArray:
+        """(..., n, 3) columns of rotations (..., 14, 3, 3), or their opposites."""
+        places, signs = columns
+        flat = frames.swapaxes(-1, -2).reshape(*frames.shape[:-3], -1, 3)
+        result: FloatArray = flat.take(places, axis=-2) * signs
+        return result
 
-        in_parent = np.empty((*leading, len(self._scalar_segments), 3, 3))
-        in_parent[..., 0] = self._axis[:, 0]
-        in_parent[..., 1] = (steps[..., 0, :, :] @ self._axis[:, 1, :, None])[..., 0]
-        in_parent[..., 2] = (two @ self._axis[:, 2, :, None])[..., 0]
-        in_world = (world[..., self._scalar_parent, :, :] @ in_parent).swapaxes(-1, -2)
-        axes = np.empty((*leading, self.nv - 3, 3))
-        axes[..., self._scalar_columns, :] = in_world.reshape(*leading, -1, 3)[..., self._axis_slot, :]
-        balls = world[..., self._ball_segments, :, :].swapaxes(-1, -2)
-        axes[..., self._ball_columns, :] = balls.reshape(*leading, -1, 3)
-        return axes, world
-
-    def _place(self, q: FloatArray, lengths: FloatArray, rotations: FloatArray) -> tuple[FloatArray, Posture]:
-        """(..., 19, 3, 21) derivatives of the points by the lengths, in which they are linear, and the posture."""
+    def _place(self, q: FloatArray, lengths: FloatArray, frames: FloatArray) -> tuple[FloatArray, Posture]:
+        """(..., 21, 3) directions of the lengths in world, and the posture; points are linear in the lengths."""
         if lengths.shape[-1] != len(LENGTHS):
             raise ModelError(f"upper_body: {lengths.shape[-1]} segment lengths, expected {len(LENGTHS)}")
-        own = rotations[..., self._point_segment, :, :] @ self._offsets
-        shape = own.shape
-        by_lengths = (self._path @ own.reshape(*shape[:-2], -1)).reshape(shape)
-        positions = q[..., None, :3] + (by_lengths @ lengths[..., None, :, None])[..., 0]
-        return by_lengths, Posture(positions, positions[..., self._origin_point, :], rotations)
+        along = self._directions(frames, self._length_columns)
+        positions = q[..., None, :3] + self._counts @ (lengths[..., None] * along)
+        origins = positions.take(self._origin_point, axis=-2)
+        return along, Posture(positions, origins, frames[..., : len(SEGMENTS), :, :])
+
+
+def _columns(places: list[tuple[int, FloatArray]]) -> tuple[IntArray, FloatArray]:
+    """(n,) indices of columns in a stack of rotations, row after row, and (n, 1) signs, of (rotation, signed axis)."""
+    columns = np.array([3 * frame + int(np.abs(axis).argmax()) for frame, axis in places], dtype=np.intp)
+    return columns, np.array([[float(axis.sum())] for _, axis in places])
