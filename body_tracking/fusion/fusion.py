@@ -9,7 +9,7 @@ little earlier or later gives the same numbers.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right, insort
+from bisect import insort
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,15 +18,13 @@ import numpy as np
 
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
+from body_tracking.fusion.placement import CLOCK_JUMP, Placement
 from body_tracking.fusion.sides import PAIRS, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
 from body_tracking.measurement import joint_stddev, viewing_angle
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 WORLD = "world"
-
-CLOCK_JUMP = 1.0
-"""A sensor whose stamps go back by more than this starts again, seconds."""
 
 DUE_MARGIN = 0.002
 """A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
@@ -143,12 +141,11 @@ class _Frame:
     since_ns: int  # reference time of the first frame of its run, after a silence
 
 
-class _Sensor:
+class _Sensor(Placement):
     """The recent frames of one sensor and where and when it is."""
 
     def __init__(self) -> None:
-        self.poses: list[SensorPose] = []  # by valid_from_ns, from the one in force at the last output on
-        self.clocks: list[tuple[int, ClockModel]] = []  # likewise
+        super().__init__()
         self.clear()
 
     def clear(self) -> None:
@@ -166,30 +163,6 @@ class _Sensor:
     def period(self) -> float:
         """Seconds between frames, by the median: a lost frame does not make a sensor slower."""
         return sorted(self._steps)[len(self._steps) // 2] if self._steps else 1.0 / 30.0
-
-    def to_reference(self, sensor_ns: int) -> int:
-        """A stamp of this sensor in the reference's clock, by the relation that is in force then."""
-        found = sensor_ns
-        for index, (valid_from_ns, clock) in enumerate(self.clocks):
-            reference_ns = clock.to_reference(sensor_ns)
-            if index > 0 and reference_ns < valid_from_ns:
-                break
-            found = reference_ns
-        return found
-
-    def pose(self, now_ns: int) -> SensorPose | None:
-        """The pose in force at a reference time."""
-        at = bisect_right(self.poses, now_ns, key=_valid_from)
-        return self.poses[at - 1] if at else None
-
-    def forget_before(self, now_ns: int) -> None:
-        """Drop poses and clocks that others have replaced by then."""
-        del self.poses[: max(0, bisect_right(self.poses, now_ns, key=_valid_from) - 1)]
-        del self.clocks[: max(0, bisect_right(self.clocks, now_ns, key=lambda each: each[0]) - 1)]
-
-
-def _valid_from(pose: SensorPose) -> int:
-    return pose.valid_from_ns
 
 
 class Fusion:
@@ -234,10 +207,7 @@ class Fusion:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""
         for sensor in self._sensors.values():
             sensor.clear()
-            del sensor.poses[:-1], sensor.clocks[:-1]
-            if sensor.poses:
-                pose = sensor.poses[0]
-                sensor.poses[0] = SensorPose(pose.sensor, pose.translation, pose.quat_xyzw)
+            sensor.restart()
         self._forget_output()
         self.counters["resets"] += 1
 
@@ -248,18 +218,16 @@ class Fusion:
         sensor = self._sensors.get(pose.sensor)
         if sensor is None:
             self.counters["unknown_sensor"] += 1
-            return
-        at = bisect_right(sensor.poses, pose.valid_from_ns, key=_valid_from)
-        sensor.poses.insert(at, pose)
+        else:
+            sensor.set_pose(pose)
 
     def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
         """Take a sensor's clock, in force from a reference time; unknown sensors are counted and ignored."""
         known = self._sensors.get(sensor)
         if known is None:
             self.counters["unknown_sensor"] += 1
-            return
-        at = bisect_right(known.clocks, valid_from_ns, key=lambda each: each[0])
-        known.clocks.insert(at, (valid_from_ns, clock))
+        else:
+            known.set_clock(valid_from_ns, clock)
 
     # --- frames in
 

@@ -1,0 +1,187 @@
+"""One sensor's frames as they come, in ``world`` and the reference's clock: for a filter that takes each by itself.
+
+What :mod:`body_tracking.fusion.fusion` does with frames that it pairs is done here with each alone: poses and clocks
+come into force at their times, every joint states its uncertainty, and a body that a sensor sees turned around is put
+right by what the others see at that time. Nothing waits and nothing is lost: late frames go on as they are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.fusion.fusion import WORLD, FusionError
+from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.sides import Sides
+from body_tracking.measurement import joint_stddev, viewing_angle
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
+
+FRESH = 0.1
+"""Frames of other sensors count for left and right while they are no further away in time than this, seconds."""
+
+TURNED_HOLD = 1.0
+"""Left and right are held against a body that all sensors see reversed at once for this long, seconds."""
+
+_DIAGONAL = np.arange(3)
+_KEEP = 5 * NANOSECONDS
+"""Poses and clocks are kept for frames that are late by no more than this, nanoseconds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A frame in world."""
+
+    stamp_ns: int
+    positions: FloatArray
+    variance: FloatArray
+    states: np.ndarray
+    angle: float
+    body: int
+
+
+class _Sensor(Placement):
+    """Where and when a sensor is, and its newest frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clear()
+
+    def clear(self) -> None:
+        self.last_ns: int | None = None  # in its own clock
+        self.newest: _Seen | None = None
+
+
+class SensorAlignment:
+    """Brings frames of calibrated sensors into one frame and one clock, one by one.
+
+    Args:
+        sensors: their names.
+        reference: the sensor whose clock is that of ``world``; the first one when None.
+        world: the frame of the output.
+
+    Attributes:
+        counters: what happened since the construction, for diagnostics.
+
+    Raises:
+        FusionError: the reference is not among the sensors.
+    """
+
+    def __init__(self, sensors: Sequence[str], reference: str | None = None, world: str = WORLD) -> None:
+        self.reference = reference or (sensors[0] if sensors else "")
+        if self.reference not in sensors:
+            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {', '.join(sensors)}")
+        self.world = world
+        self.counters: Counter[str] = Counter()
+        self._sensors = {name: _Sensor() for name in sensors}
+        self._sides = Sides(TURNED_HOLD)
+
+    def reset(self) -> None:
+        """Forget all frames; calibrations stay, and those that wait for their time come into force."""
+        for sensor in self._sensors.values():
+            sensor.clear()
+            sensor.restart()
+        self._sides.reset()
+        self.counters["resets"] += 1
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""
+        sensor = self._sensors.get(pose.sensor)
+        if sensor is None:
+            self.counters["unknown_sensor"] += 1
+        else:
+            sensor.set_pose(pose)
+
+    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
+        """Take a sensor's clock, in force from a reference time; unknown sensors are counted and ignored."""
+        known = self._sensors.get(sensor)
+        if known is None:
+            self.counters["unknown_sensor"] += 1
+        else:
+            known.set_clock(valid_from_ns, clock)
+
+    def push(self, sensor: str, skeleton: Skeleton) -> Skeleton | None:
+        """One frame of one sensor, in ``world``.
+
+        Args:
+            sensor: its name.
+            skeleton: in the sensor's optical frame and clock.
+
+        Returns:
+            The same body at its capture time in the reference's clock, with the covariances of
+            ``body_tracking.measurement`` in all directions alike; joints that are not valid, and those of a body half
+            that is seen across what is believed, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
+        """
+        source = self._sensors.get(sensor)
+        if source is None:
+            self.counters["unknown_sensor"] += 1
+            return None
+        self._note(sensor, source, skeleton.stamp_ns)
+        stamp = source.to_reference(skeleton.stamp_ns)
+        pose = source.pose(stamp)
+        if pose is None:
+            self.counters["uncalibrated"] += 1
+            return None
+        source.forget_before(stamp - _KEEP)
+        seen = _in_world(skeleton, stamp, pose)
+        if source.newest is None or stamp > source.newest.stamp_ns:
+            source.newest = seen
+        self.counters["aligned"] += 1
+        return self._settled(sensor, seen)
+
+    def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
+        """Start anew when a sensor's clock jumped back: the reference's takes the others with it."""
+        if source.last_ns is not None and stamp_ns < source.last_ns - CLOCK_JUMP * NANOSECONDS:
+            if sensor == self.reference:
+                self.reset()
+            else:
+                source.clear()
+                self.counters["resets"] += 1
+        if source.last_ns is None or stamp_ns > source.last_ns:
+            source.last_ns = stamp_ns
+        else:
+            self.counters["late"] += 1
+
+    def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
+        """The frame with left and right as they are believed from what all sensors see at that time."""
+        fresh = {
+            name: seen if name == sensor else source.newest
+            for name, source in self._sensors.items()
+            if name == sensor
+            or (source.newest is not None and abs(seen.stamp_ns - source.newest.stamp_ns) <= FRESH * NANOSECONDS)
+        }
+        frames = [frame for frame in fresh.values() if frame is not None]
+        own = list(fresh).index(sensor)
+        points, variance, states = (
+            np.stack([getattr(frame, name) for frame in frames]) for name in ("positions", "variance", "states")
+        )
+        # What is repaired in the others' frames was counted when these came.
+        counted: Counter[str] = Counter()
+        angles = [frame.angle for frame in frames]
+        self._sides.settle(seen.stamp_ns, tuple(fresh), angles, points, variance, states, counted)
+        known = np.isfinite(variance[own])
+        self.counters["reversals_accepted"] += counted["reversals_accepted"]
+        self.counters["repaired"] += not np.array_equal(points[own], seen.positions, equal_nan=True)
+        self.counters["turned_joints"] += int(np.count_nonzero(np.isfinite(seen.variance) & ~known))
+        covariances = np.zeros((N_JOINTS, 3, 3))
+        covariances[:, _DIAGONAL, _DIAGONAL] = variance[own][:, None]
+        return Skeleton(
+            seen.stamp_ns,
+            self.world,
+            np.where(known[:, None], points[own], np.nan),
+            np.where(known, states[own], 0).astype(np.uint8),
+            frames[0].body,
+            covariances,
+        )
+
+
+def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Seen:
+    known = skeleton.valid
+    positions = np.where(known[:, None], skeleton.positions, np.nan)
+    states = np.where(known, skeleton.states, 0)
+    angle = viewing_angle(positions)
+    variance = joint_stddev(positions, states, angle) ** 2
+    return _Seen(stamp_ns, pose.apply(positions), variance, states, float(angle), skeleton.body)

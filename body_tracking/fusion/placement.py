@@ -1,0 +1,61 @@
+"""Where a sensor stands and how its clock runs, as a calibration says it: each statement from its time on."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+from body_tracking.calibration.result import ClockModel, SensorPose
+
+CLOCK_JUMP = 1.0
+"""A sensor whose stamps go back by more than this starts again, seconds."""
+
+
+class Placement:
+    """The poses and clock relations of one sensor, by the reference times from which they are in force."""
+
+    def __init__(self) -> None:
+        self._poses: list[SensorPose] = []  # by valid_from_ns
+        self._clocks: list[tuple[int, ClockModel]] = []  # likewise
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """Take a pose, in force from its ``valid_from_ns``."""
+        self._poses.insert(bisect_right(self._poses, pose.valid_from_ns, key=_valid_from), pose)
+
+    def set_clock(self, valid_from_ns: int, clock: ClockModel) -> None:
+        """Take a relation of the clocks, in force from a reference time."""
+        self._clocks.insert(bisect_right(self._clocks, valid_from_ns, key=_first), (valid_from_ns, clock))
+
+    def to_reference(self, sensor_ns: int) -> int:
+        """A stamp of this sensor in the reference's clock, by the relation that is in force then."""
+        found = sensor_ns
+        for index, (valid_from_ns, clock) in enumerate(self._clocks):
+            reference_ns = clock.to_reference(sensor_ns)
+            if index > 0 and reference_ns < valid_from_ns:
+                break
+            found = reference_ns
+        return found
+
+    def pose(self, now_ns: int) -> SensorPose | None:
+        """The pose in force at a reference time."""
+        at = bisect_right(self._poses, now_ns, key=_valid_from)
+        return self._poses[at - 1] if at else None
+
+    def forget_before(self, now_ns: int) -> None:
+        """Drop poses and clocks that others have replaced by then."""
+        del self._poses[: max(0, bisect_right(self._poses, now_ns, key=_valid_from) - 1)]
+        del self._clocks[: max(0, bisect_right(self._clocks, now_ns, key=_first) - 1)]
+
+    def restart(self) -> None:
+        """Let the newest pose and clock hold always, because time begins anew."""
+        del self._poses[:-1], self._clocks[:-1]
+        if self._poses:
+            pose = self._poses[0]
+            self._poses[0] = SensorPose(pose.sensor, pose.translation, pose.quat_xyzw)
+
+
+def _valid_from(pose: SensorPose) -> int:
+    return pose.valid_from_ns
+
+
+def _first(entry: tuple[int, ClockModel]) -> int:
+    return entry[0]
