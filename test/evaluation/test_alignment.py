@@ -52,7 +52,7 @@ def test_bias_and_scale_of_a_feature_are_no_differences_of_time() -> None:
 
 
 def test_noise_is_not_taken_for_time() -> None:
-    # dynamic time warping would halve this noise
+    # dynamic time warping shows this noise smaller than it is, by 22 % with all features and 42 % with the first alone
     generator = np.random.default_rng(5)
     noise = 0.05 * generator.standard_normal((len(TIMES), 3))
     true = 0.4 + TIMES
