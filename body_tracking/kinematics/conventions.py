@@ -186,10 +186,9 @@ class Convention:
                 rotations, turning = self._extend(rotations, turning, values, gradients)
             back = rotations[parents].swapaxes(-1, -2)
             turned = back @ (turning[children] - turning[parents])
-            uncertain = turned @ covariance @ turned.swapaxes(-1, -2)
+            uncertain = ((turned @ covariance) * turned).sum(axis=-1)
             if unknown is not None:
-                lost = (np.abs(turned[:, :, unknown]) > _ROUNDING).any(axis=(1, 2))
-                uncertain[lost] += 100.0 * np.eye(3)
+                uncertain[(np.abs(turned[:, :, unknown]) > _ROUNDING).any(axis=-1)] = np.pi**2
             split = sequences.split(
                 back @ rotations[children], uncertain, None if before is None else before[rows].reshape(-1, 3)
             )

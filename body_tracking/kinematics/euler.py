@@ -92,49 +92,53 @@ class EulerSequences:
             sign.append(float(third @ basis[:, 2]) if cardan else along)
         self.basis: FloatArray = np.stack(pre).swapaxes(-1, -2)
         self._pre, self._post = np.stack(pre), np.stack(post)
+        # of a small rotation's three variances the mean of the two that are not about the first axis
+        self._tilt = 0.5 * (1.0 - self._pre[:, 0] ** 2)
         self._offset, self._sign = np.array(offset), np.array(sign)
         usual = np.radians([sequence.usual for sequence in sequences])
         self._low, self._high = usual[..., 0], usual[..., 1]
         self._centre = 0.5 * (self._low + self._high)
 
-    def split(self, rotations: FloatArray, covariances: FloatArray, previous: FloatArray | None) -> Split:
+    def split(self, rotations: FloatArray, variances: FloatArray, previous: FloatArray | None) -> Split:
         """Angles of rotations.
 
         Args:
             rotations: (n, 3, 3) of a child in its parent.
-            covariances: (n, 3, 3) square radians, of small rotations in the parent's frame; infinite where unknown.
+            variances: (n, 3) square radians, of a small rotation about the parent's axes; pi squared where unknown.
             previous: (n, 3) radians to stay near to, or None.
         """
         # entries of pre @ R @ post
         r = self._pre @ rotations @ self._post
         y, z = r[:, 1, 0], r[:, 2, 0]
         distance = np.sqrt(y * y + z * z)
-        along = self._pre[:, 0]
-        # of a small rotation's three variances, the two that are not about the first axis
-        tilt = covariances.trace(axis1=1, axis2=2) - (along[:, None, :] @ covariances @ along[:, :, None])[:, 0, 0]
-        doubt = np.sqrt(np.minimum(np.maximum(0.5 * tilt, LEAST_HOLD**2), GREATEST_HOLD**2))
+        tilt = (self._tilt * variances).sum(axis=-1)
+        doubt = np.sqrt(np.minimum(np.maximum(tilt, LEAST_HOLD**2), GREATEST_HOLD**2))
         x = np.minimum(np.maximum((distance / doubt - HELD) / (FREE - HELD), 0.0), 1.0)
         hold = 1.0 - x * x * (3.0 - 2.0 * x)
 
         # two solutions, half a turn of the first angle apart: (2, n)
-        a = np.arctan2(y, -z)
-        a = np.stack([a, a + np.pi])
+        angles = np.empty((2, len(r), 3))
+        a = angles[..., 0]
+        a[0] = np.arctan2(y, -z)
+        a[1] = a[0] + np.pi
         away = (0.0 if previous is None else previous[:, 0]) - a
-        a = a + hold * (away - _TURN * np.rint(away / _TURN))
-        ca, sa = np.cos(a), np.sin(a)
+        a += hold * (away - _TURN * np.rint(away / _TURN))
+        # cosines and sines of a and b
+        parts = np.empty((4, 2, len(r)))
+        ca, sa, cb, sb = np.cos(a, out=parts[0]), np.sin(a, out=parts[1]), parts[2], parts[3]
         row_y = ca[..., None] * r[:, 1] + sa[..., None] * r[:, 2]
         row_z = ca[..., None] * r[:, 2] - sa[..., None] * r[:, 1]
         b = np.arctan2(-row_z[..., 0], r[:, 0, 0])
-        cb, sb = np.cos(b), np.sin(b)
+        np.cos(b, out=cb)
+        np.sin(b, out=sb)
         c = np.arctan2(
             sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2],
             row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2],
         )
-
-        angles = np.stack([a, b + self._offset, self._sign * c], axis=-1)
-        angles, best = self._choose(angles, previous)
-        ca, sa, cb, sb = (np.where(best, part[0], part[1]) for part in (ca, sa, cb, sb))
-        return Split(angles, *self._derivatives(ca, sa, cb, sb, distance, hold))
+        angles[..., 1] = b + self._offset
+        angles[..., 2] = self._sign * c
+        chosen, best = self._choose(angles, previous)
+        return Split(chosen, *self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold))
 
     def _choose(self, angles: FloatArray, previous: FloatArray | None) -> tuple[FloatArray, BoolArray]:
         """(n, 3) the better of (2, n, 3) solutions, with their full turns, and (n,) whether it is the first."""
@@ -144,12 +148,13 @@ class EulerSequences:
             cost = np.abs(angles) + 100.0 * self._excess(angles)
         else:
             excess = self._excess(angles)
-            if (excess > MARGIN).any():
+            # continuity first; of two solutions as near the more usual one
+            cost = np.abs(angles - previous) + 0.1 * excess
+            if excess.max() > MARGIN:
                 usual = angles + _TURN * np.rint((self._centre - angles) / _TURN)
                 angles = np.where(excess > MARGIN, usual, angles)
                 excess = self._excess(angles)
-            # continuity first; of two solutions as near the more usual one
-            cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
+                cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
         total = cost.sum(axis=-1)
         best: BoolArray = total[0] <= total[1]
         return np.where(best[:, None], angles[0], angles[1]), best
@@ -158,17 +163,19 @@ class EulerSequences:
         excess: FloatArray = np.maximum(np.maximum(angles - self._high, self._low - angles), 0.0)
         return excess
 
-    def _derivatives(
-        self, ca: FloatArray, sa: FloatArray, cb: FloatArray, sb: FloatArray, distance: FloatArray, hold: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _derivatives(self, parts: FloatArray, distance: FloatArray, hold: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Two (n, 3, 3): angles' rates by the angular velocity in the parent's frame; free, and held.
 
         From w = a' x + b' (0, cos a, sin a) + c' (cos b, sin a sin b, -cos a sin b) in the frame of the axes.
         """
+        ca, sa, cb, sb = parts
         gradients = np.zeros((2, len(ca), 3, 3))
         size = np.maximum(np.abs(sb), 1e-9)
         held = np.maximum(distance, size)
-        across = np.copysign(np.stack([1.0 / size, (1.0 - hold) / held]), sb)
+        across = np.empty((2, len(ca)))
+        across[0] = 1.0 / size
+        across[1] = (1.0 - hold) / held
+        across = np.copysign(across, sb)
         gradients[:, :, 1, 1], gradients[:, :, 1, 2] = ca, sa
         gradients[1, :, 2, 0] = hold * cb
         gradients[:, :, 2, 1], gradients[:, :, 2, 2] = across * sa, -across * ca
