@@ -500,6 +500,25 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
+def test_rates_of_held_angles_are_those_of_the_angles_that_are_told(name: str) -> None:
+    """One degree beside the singular pose, known to 3 deg: the first angle stands, the last takes the whole turn."""
+    q = arms(SINGULAR[name][0] + 0.6, SINGULAR[name][1] - 0.8)
+    rng = np.random.default_rng(5)
+    velocity = np.concatenate([np.zeros(6), rng.normal(size=NV - 6)])
+    now = angles_of(estimate(q, 3.0 * DEGREE, velocity), MODEL, name)
+    step = 1e-6
+    after, earlier = (
+        angles_of(estimate(MODEL.integrate(q, s * step * velocity), 3.0 * DEGREE), MODEL, name, now).position
+        for s in (1.0, -1.0)
+    )
+    first, _, last = (now.names.index(key) for key in OUTER[name])
+    # held at a value that is the rotation's to a degree or so: the rates are exact to that
+    np.testing.assert_allclose(now.velocity, (after - earlier) / (2.0 * step), rtol=0, atol=0.05)
+    assert abs(now.velocity[first]) < 0.05
+    assert abs(now.velocity[last]) > 0.1
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
 def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
     """Ten seconds of a person who keeps the pose, with the noise that the filter states."""
     rng = np.random.default_rng(3)
