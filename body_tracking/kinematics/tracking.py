@@ -1,0 +1,341 @@
+"""A body model that follows a person frame by frame, where no filter of its own estimates it.
+
+:class:`SkeletonFit` fits ``upper_body`` to filtered joint positions; :class:`AngleStream` makes joint angles of what a
+node receives, in any convention; :class:`LengthChanges` tells when a person's lengths are news.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.inverse import Fit, InverseKinematics
+from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.motion import joint_densities
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
+
+POSITIONAL = "positional"
+"""The convention of :mod:`body_tracking.kinematics.positional`, which needs no model."""
+
+ALL_CONVENTIONS: tuple[str, ...] = (*CONVENTIONS, POSITIONAL)
+
+_GAP_NS = NANOSECONDS // 2
+"""After longer than this the last pose is no better a start than none."""
+_POOR = 4.0
+"""Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
+_EACH, _THEN_EVERY, _FRAMES = 30, 6, 300
+"""Lengths are taken from each of the first frames, then from every so many, and the median is over the last of them."""
+_GREATEST_RATE = 10.0
+"""rad/s and m/s: standard deviation of a rate of which nothing is known."""
+_ENOUGH = 10
+"""Frames in which a length must have been seen to be taken from them."""
+
+_TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
+_ARM = {"clavicle": "SHOULDER", "upper_arm": "ELBOW", "forearm": "WRIST", "hand": "HAND", "hand_tip": "HAND_TIP"}
+_SIDES = ("left", "right")
+
+
+def _bones() -> dict[str, tuple[Joint, Joint]]:
+    """The lengths that are distances between two joints."""
+    bones = {
+        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
+        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
+        "neck": (Joint.SPINE_SHOULDER, Joint.NECK),
+        "head": (Joint.NECK, Joint.HEAD),
+    }
+    for side in _SIDES:
+        start = Joint.SPINE_SHOULDER
+        for length, name in _ARM.items():
+            end = Joint[f"{name}_{side.upper()}"]
+            bones[f"{length}_{side}"] = start, end
+            start = end
+    return bones
+
+
+_BONES = _bones()
+
+
+class RunningLengths:
+    """The segment lengths of ``upper_body`` as medians over frames.
+
+    Attributes:
+        lengths: (21,) metres; those that were never seen are the other side's, or in proportion to the others.
+        stddev: (21,) metres, of the medians; infinity where never seen.
+    """
+
+    def __init__(self, model: UpperBody) -> None:
+        self._average = model.default_lengths()
+        names = model.length_names
+        self._column = {name: number for number, name in enumerate(names)}
+        self._bone_columns: IntArray = np.array([self._column[name] for name in _BONES], dtype=np.intp)
+        self._starts, self._ends = (np.array([pair[k] for pair in _BONES.values()], dtype=np.intp) for k in (0, 1))
+        other = dict(zip(_SIDES, reversed(_SIDES), strict=True))
+        self._other_side: IntArray = np.array(
+            [
+                self._column[f"{name.rsplit('_', 1)[0]}_{other[side]}"] if side in other else number
+                for number, name in enumerate(names)
+                for side in (name.rsplit("_", 1)[-1],)
+            ],
+            dtype=np.intp,
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._count = 0
+        self._seen: deque[FloatArray] = deque(maxlen=_FRAMES)
+        self.lengths: FloatArray = self._average
+        self.stddev: FloatArray = np.full(len(self._average), np.inf)
+
+    def update(self, positions: FloatArray) -> None:
+        """Take the positions of a frame: (25, 3) metres, NaN where not known."""
+        self._count += 1
+        if self._count > _EACH and self._count % _THEN_EVERY:
+            return
+        self._seen.append(self._measured(positions))
+        ordered = np.sort(np.array(self._seen), axis=0)  # NaN last
+        count = np.isfinite(ordered).sum(axis=0)
+        median = _middle(ordered, count)
+        spread = 1.4826 * _middle(np.sort(np.abs(ordered - median), axis=0), count)
+        enough = count >= min(_ENOUGH, len(self._seen))
+        known = enough & (median > 0.0)
+        both = np.where(known, median, np.where(known[self._other_side], median[self._other_side], np.nan))
+        found = np.isfinite(both)
+        scale = float(np.median(both[found] / self._average[found])) if found.any() else 1.0
+        self.lengths = np.where(found, both, scale * self._average)
+        # pi / 2 is the variance of a median against that of a mean
+        self.stddev = np.where(known, spread * np.sqrt(0.5 * np.pi / np.maximum(count, 1)), np.inf)
+
+    def _measured(self, positions: FloatArray) -> FloatArray:
+        """(21,) metres of one frame."""
+        lengths = np.empty(len(self._average))
+        bones = positions[self._ends] - positions[self._starts]
+        lengths[self._bone_columns] = np.sqrt((bones * bones).sum(axis=1))
+        base = positions[Joint.SPINE_BASE]
+        hips = positions[[Joint.HIP_LEFT, Joint.HIP_RIGHT]] - base
+        across = _unit(hips[0] - hips[1])
+        out = hips @ across
+        lengths[self._column["hip_width_left"]], lengths[self._column["hip_width_right"]] = out[0], -out[1]
+        below = hips.mean(axis=0) - across * out.mean()
+        lengths[self._column["hip_drop"]] = np.sqrt(below @ below)
+        for side in _SIDES:
+            wrist, hand, thumb = (positions[Joint[f"{name}_{side.upper()}"]] for name in ("WRIST", "HAND", "THUMB"))
+            direction = _unit(hand - wrist)
+            along = float((thumb - wrist) @ direction)
+            aside = thumb - wrist - along * direction
+            lengths[self._column[f"thumb_along_{side}"]] = along
+            lengths[self._column[f"thumb_out_{side}"]] = np.sqrt(aside @ aside)
+        return lengths
+
+
+def _middle(ordered: FloatArray, count: IntArray) -> FloatArray:
+    """(n,) medians of the first ``count`` of each sorted column; NaN where there is none."""
+    columns = np.arange(ordered.shape[1])
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(ordered) - 1)
+    result: FloatArray = 0.5 * (ordered[low, columns] + ordered[high, columns])
+    return result
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    size = np.sqrt(vector @ vector)
+    direction: FloatArray = vector / size if size > 0.0 else np.full(3, np.nan)
+    return direction
+
+
+class SkeletonFit:
+    """Inverse kinematics of one frame after the other, each started from the one before.
+
+    The velocity is the one whose points move as the skeleton says (least squares); the deviations of the points'
+    velocities are the bounds of :mod:`body_tracking.kinematics.positional`.
+
+    Attributes:
+        model: the body.
+        lengths: the person's, from the frames so far.
+        counters: what happened since the construction, for diagnostics.
+    """
+
+    def __init__(self, model: UpperBody | None = None) -> None:
+        self.model = model or UpperBody()
+        self.lengths = RunningLengths(self.model)
+        self.counters: Counter[str] = Counter()
+        self._inverse = InverseKinematics(self.model)
+        self._densities = joint_densities()[self.model.joints]
+        self._trunk: BoolArray = np.isin(self.model.joints, _TRUNK)
+        self._last: tuple[int, FloatArray] | None = None
+
+    def reset(self) -> None:
+        """Forget the person; the counters stay."""
+        self.lengths.reset()
+        self._last = None
+
+    def update(self, skeleton: Skeleton) -> ModelEstimate | None:
+        """The model at one frame.
+
+        Args:
+            skeleton: in a frame with z up, with covariances; usually ``/filtered/skeleton``.
+
+        Returns:
+            The estimate; the covariance knows of no tie between coordinates and rates, and without velocities in the
+            skeleton the rates are NaN with an infinite variance. None where no trunk is seen.
+        """
+        if self._last is not None and not 0 <= skeleton.stamp_ns - self._last[0] <= _GAP_NS:
+            self._last = None
+        points = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
+        self.lengths.update(points)
+        joints, lengths = self.model.joints, self.lengths.lengths
+        positions = points[joints]
+        variance = self._variance(skeleton)
+        measured = np.isfinite(positions).all(axis=1) & np.isfinite(variance)
+        fit = self._fit(positions, np.sqrt(variance), measured)
+        if fit is None:
+            self.counters["no trunk"] += 1
+            self._last = None
+            return None
+        self.counters["frames"] += 1
+        self._last = skeleton.stamp_ns, fit.q
+        nv = self.model.nv
+        covariance = np.zeros((2 * nv, 2 * nv))
+        covariance[:nv, :nv] = fit.covariance
+        velocity, covariance[nv:, nv:] = self._velocity(skeleton, fit.q, variance, measured)
+        return ModelEstimate(
+            skeleton.stamp_ns,
+            skeleton.frame_id,
+            skeleton.body,
+            fit.q,
+            velocity,
+            covariance,
+            lengths,
+            self.lengths.stddev,
+        )
+
+    def _variance(self, skeleton: Skeleton) -> FloatArray:
+        """(19,) square metres per axis; infinity where the skeleton states none that makes sense."""
+        if skeleton.covariances is None:
+            return np.full(len(self.model.joints), np.inf)
+        diagonal = skeleton.covariances[self.model.joints].diagonal(axis1=1, axis2=2)
+        return np.where((diagonal > 0.0).all(axis=1), diagonal.mean(axis=1), np.inf)
+
+    def _fit(self, positions: FloatArray, stddev: FloatArray, measured: BoolArray) -> Fit | None:
+        if np.count_nonzero(measured & self._trunk) < 2:
+            return None
+        lengths = self.lengths.lengths
+        before = None if self._last is None else self._last[1]
+        try:
+            fit = self._inverse.solve(positions, stddev, lengths, before)
+            if before is not None and fit.cost > _POOR * 3.0 * np.count_nonzero(measured):
+                self.counters["poor fits"] += 1
+                anew = self._inverse.solve(positions, stddev, lengths)
+                fit = anew if anew.cost < fit.cost else fit
+        except ModelError:
+            return None
+        return fit
+
+    def _velocity(
+        self, skeleton: Skeleton, q: FloatArray, variance: FloatArray, measured: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(nv,) tangent velocity and (nv, nv) its covariance."""
+        nv = self.model.nv
+        if skeleton.velocities is None:
+            return np.full(nv, np.nan), np.diag(np.full(nv, np.inf))
+        velocities = skeleton.velocities[self.model.joints]
+        known = measured & np.isfinite(velocities).all(axis=1)
+        bound = np.cbrt(3.0 * self._densities**2 * np.where(known, variance, 1.0))
+        weights = np.repeat(np.where(known, 1.0 / bound, 0.0), 3)
+        jacobian = self.model.linearise(q, self.lengths.lengths).jacobian.reshape(-1, nv)
+        weighted = jacobian * weights[:, None]
+        information = weighted.T @ jacobian
+        information[np.arange(nv), np.arange(nv)] += _GREATEST_RATE**-2
+        covariance = np.linalg.inv(information).astype(np.float64)
+        velocity = covariance @ (weighted.T @ np.where(known[:, None], velocities, 0.0).reshape(-1))
+        return velocity, covariance
+
+
+class AngleStream:
+    """Joint angles in one convention, of skeletons or of states of ``upper_body``, one instant after the other.
+
+    Args:
+        convention: one of ``ALL_CONVENTIONS``.
+
+    Attributes:
+        model: the body.
+        fit: what follows skeletons.
+
+    Raises:
+        ConventionError: another one.
+    """
+
+    def __init__(self, convention: str) -> None:
+        if convention not in ALL_CONVENTIONS:
+            raise ConventionError(f"angle convention {convention!r}: not one of {', '.join(ALL_CONVENTIONS)}")
+        self.convention = convention
+        self.model = UpperBody()
+        self.fit = SkeletonFit(self.model)
+        self._previous: JointAngles | None = None
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self.fit.reset()
+        self._previous = None
+
+    def of_skeleton(self, skeleton: Skeleton) -> JointAngles | None:
+        """Of one frame; None where the convention needs a model and no trunk is seen."""
+        if self.convention == POSITIONAL:
+            return positional_angles(skeleton)
+        estimate = self.fit.update(skeleton)
+        return None if estimate is None else self.of_estimate(estimate)
+
+    def of_estimate(self, estimate: ModelEstimate) -> JointAngles:
+        """Of one state of the model.
+
+        Raises:
+            ConventionError: the convention is made of positions.
+        """
+        angles = angles_of(estimate, self.model, self.convention, self._previous)
+        self._previous = angles
+        return angles
+
+
+class LengthChanges:
+    """Tells when the lengths of a person's segments are news: at first, when they change, and where they settle.
+
+    Args:
+        tolerance: metres by which a length must differ from what was told last.
+        period: seconds between two pieces of news.
+    """
+
+    def __init__(self, tolerance: float = 0.002, period: float = 1.0) -> None:
+        self._tolerance = tolerance
+        self._period_ns = round(period * NANOSECONDS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._told: FloatArray | None = None
+        self._told_ns = 0
+        self._before: FloatArray | None = None
+
+    def news(self, stamp_ns: int, lengths: FloatArray) -> bool:
+        """Whether to tell these (n,) lengths, metres, of this capture time; if so, they count as told."""
+        settled = self._before is not None and np.array_equal(self._before, lengths)
+        self._before = lengths
+        if self._told is not None:
+            if 0 <= stamp_ns - self._told_ns < self._period_ns:
+                return False
+            change = float(np.abs(lengths - self._told).max())
+            if change <= self._tolerance and not (settled and change > 0.0):
+                return False
+        self._told, self._told_ns = lengths, stamp_ns
+        return True
+
+
+def segment_poses(estimate: ModelEstimate, model: UpperBody) -> tuple[FloatArray, FloatArray]:
+    """(12, 3) origins and (12, 4) quaternions xyzw of the segments, in the estimate's frame."""
+    posture = model.forward(estimate.q, estimate.lengths)
+    return posture.origins, so3.matrix_to_quat(posture.rotations)
