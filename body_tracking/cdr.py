@@ -20,7 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.messages import skeletons_to_cloud
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import BodyModel
+from body_tracking.messages import (
+    COVARIANCE_ENCODING,
+    coordinates_to_configuration,
+    covariance_rows,
+    rows_to_covariance,
+    skeletons_to_cloud,
+    stddevs,
+)
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
@@ -193,11 +202,11 @@ _KNOWN = _known_layouts()
 
 
 @cache
-def _names(names: tuple[str, ...], body: str) -> bytes:
-    """``name``, padded to 4."""
+def _names(names: tuple[str, ...], body: str = "") -> bytes:
+    """``name``, padded to 4; with ``_<body>`` behind each, where there is one."""
     table = struct.pack("<I", len(names))
     for name in names:
-        table = _padded(table + _string(f"{name}_{body}"))
+        table = _padded(table + _string(f"{name}_{body}" if body else name))
     return table
 
 
@@ -218,3 +227,105 @@ def _doubles(position: int, *values: FloatArray) -> bytes:
         data += bytes(-(position + len(data) - 4) % 8) if len(value) else b""
         data += value.astype("<f8").tobytes()
     return data + struct.pack("<I", 0)
+
+
+# --- the state of a body model
+
+
+def encode_model_state(estimate: ModelEstimate, model: BodyModel) -> tuple[bytes, bytes]:
+    """``estimate_to_joint_states``, serialised: values, and standard deviations."""
+    start = _header(estimate.stamp_ns, estimate.frame_id) + _names(model.coordinate_names)
+    deviations = stddevs(estimate)
+    return (
+        start + _doubles(len(start), model.difference(model.neutral(), estimate.q), estimate.velocity),
+        start + _doubles(len(start), deviations[: model.nv], deviations[model.nv :]),
+    )
+
+
+def decode_model_state(cdr: bytes, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray] | None:
+    """``joint_state_to_model`` of a serialised message, for messages as :func:`encode_model_state` makes them.
+
+    Returns:
+        As there; None where the layout is any other.
+
+    Raises:
+        MessageError: numbers that are none.
+    """
+    header = _read_header(cdr)
+    if header is None:
+        return None
+    stamp_ns, frame_id, start = header
+    names, nv = _names(model.coordinate_names), model.nv
+    first = start + len(names)
+    positions = first + 4 + (-first % 8)
+    velocities = positions + 8 * nv + 8
+    end = velocities + 8 * nv
+    if not cdr.startswith(names, start) or not end + 4 <= len(cdr) < end + 8:
+        return None
+    if any(
+        int.from_bytes(cdr[at : at + 4], "little") != size for at, size in ((first, nv), (velocities - 8, nv), (end, 0))
+    ):
+        return None
+    position, velocity = (np.frombuffer(cdr, "<f8", nv, at).astype(np.float64) for at in (positions, velocities))
+    return stamp_ns, frame_id, *coordinates_to_configuration(position, velocity, model)
+
+
+def encode_covariance(estimate: ModelEstimate) -> bytes:
+    """``covariance_to_image``, serialised."""
+    rows = covariance_rows(estimate)
+    return _header(estimate.stamp_ns, estimate.frame_id) + _image(*rows.shape) + rows.tobytes()
+
+
+def decode_covariance(cdr: bytes, model: BodyModel) -> tuple[int, FloatArray] | None:
+    """``image_to_covariance`` of a serialised message, for messages as :func:`encode_covariance` makes them.
+
+    Returns:
+        As there; None where the layout is any other.
+
+    Raises:
+        MessageError: numbers that are none.
+    """
+    header = _read_header(cdr)
+    if header is None:
+        return None
+    stamp_ns, _, start = header
+    nv = model.nv
+    table = _image(2 * nv, nv)
+    data, size = start + len(table), 8 * nv * nv
+    if not cdr.startswith(table, start) or not data + size <= len(cdr) < data + size + 4:
+        return None
+    rows = np.frombuffer(cdr, "<f4", 2 * nv * nv, data).reshape(2 * nv, nv).astype(np.float64)
+    return stamp_ns, rows_to_covariance(rows)
+
+
+@cache
+def _image(height: int, width: int) -> bytes:
+    """``height`` to the length of ``data``; it begins and ends at a multiple of 4."""
+    encoding = _string(COVARIANCE_ENCODING) + b"\0"  # and is_bigendian
+    return struct.pack("<II", height, width) + _padded(encoding) + struct.pack("<II", 4 * width, 4 * width * height)
+
+
+def encode_segments(
+    estimate: ModelEstimate, names: tuple[str, ...], origins: FloatArray, quats_xyzw: FloatArray
+) -> bytes:
+    """``segments_to_joint_state``, serialised."""
+    start = _header(estimate.stamp_ns, estimate.frame_id) + _names(names) + struct.pack("<I", len(names))
+    data = np.concatenate([origins, quats_xyzw], axis=1).astype("<f8").tobytes()
+    return start + bytes(-(len(start) - 4) % 8) + data + struct.pack("<II", 0, 0)
+
+
+def encode_string(text: str) -> bytes:
+    """``std_msgs/String``, serialised."""
+    return _ENCAPSULATION + _string(text)
+
+
+def _read_header(cdr: bytes) -> tuple[int, str, int] | None:
+    """Stamp, frame and the place behind ``std_msgs/Header``, padded to 4; None where there is none."""
+    if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
+        return None
+    sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)
+    try:
+        frame_id = cdr[16 : 15 + length].decode()
+    except UnicodeDecodeError:
+        return None
+    return sec * NANOSECONDS + nanosec, frame_id, 16 + (length + 3 & ~3)

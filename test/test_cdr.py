@@ -7,12 +7,39 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
+from body_tracking.cdr import (
+    decode_covariance,
+    decode_model_state,
+    decode_skeletons,
+    encode_angles,
+    encode_covariance,
+    encode_model_state,
+    encode_segments,
+    encode_skeletons,
+    encode_string,
+)
+from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.messages import angles_to_joint_states, cloud_to_skeletons, skeletons_to_cloud
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.messages import (
+    IMAGE,
+    SEGMENTS,
+    STRING,
+    MessageError,
+    angles_to_joint_states,
+    cloud_to_skeletons,
+    covariance_to_image,
+    estimate_to_joint_states,
+    image_to_covariance,
+    joint_state_to_model,
+    segments_to_joint_state,
+    skeletons_to_cloud,
+)
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 from body_tracking.skeleton import Skeleton
 
+MODEL = UpperBody()
 CLOUD, STATES = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/JointState"
 FRAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=30)
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
@@ -127,3 +154,133 @@ def test_ros_reads_angles_as_they_were_written() -> None:
             assert list(message.position) == list(position)
             assert list(message.velocity) == list(velocity)
             assert message.header.frame_id == frame_id
+
+
+# --- the state of a body model
+
+
+def estimate(seed: int, stamp_ns: int = 10**9, frame_id: str = "world") -> ModelEstimate:
+    """Random."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(2, MODEL.nv, MODEL.nv))
+    covariance = np.zeros((2 * MODEL.nv, 2 * MODEL.nv))
+    covariance[: MODEL.nv, : MODEL.nv], covariance[MODEL.nv :, MODEL.nv :] = root @ root.transpose(0, 2, 1)
+    covariance = covariance.astype(np.float32).astype(np.float64)
+    q = MODEL.integrate(MODEL.neutral(), random.normal(size=MODEL.nv))
+    lengths = MODEL.default_lengths()
+    return ModelEstimate(stamp_ns, frame_id, 0, q, random.normal(size=MODEL.nv), covariance, lengths, 0.1 * lengths)
+
+
+@given(st.integers(0, 2**32), STAMPS, FRAMES)
+def test_a_model_state_is_written_and_read_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str) -> None:
+    given_estimate = estimate(seed, stamp_ns, frame_id)
+    messages = estimate_to_joint_states(given_estimate, MODEL, BAG_MESSAGES)
+    for cdr, message in zip(encode_model_state(given_estimate, MODEL), messages, strict=True):
+        assert cdr == serialize(message)
+    cdr = encode_model_state(given_estimate, MODEL)[0]
+    fast = decode_model_state(cdr, MODEL)
+    assert fast is not None
+    for read in (fast, joint_state_to_model(deserialize(STATES, cdr), MODEL)):
+        assert read[:2] == (stamp_ns, frame_id)
+        np.testing.assert_allclose(MODEL.difference(given_estimate.q, read[2]), 0.0, atol=1e-9)
+        np.testing.assert_array_equal(read[3], given_estimate.velocity)
+
+
+@given(st.integers(0, 2**32), STAMPS, FRAMES)
+def test_a_covariance_is_written_and_read_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str) -> None:
+    given_estimate = estimate(seed, stamp_ns, frame_id)
+    cdr = encode_covariance(given_estimate)
+    assert cdr == serialize(covariance_to_image(given_estimate, BAG_MESSAGES))
+    fast = decode_covariance(cdr, MODEL)
+    assert fast is not None
+    for stamp, covariance in (fast, image_to_covariance(deserialize(IMAGE, cdr), MODEL)):
+        assert stamp == stamp_ns
+        np.testing.assert_array_equal(covariance, given_estimate.covariance)
+
+
+@given(st.integers(0, 2**32), STAMPS, FRAMES)
+def test_segments_and_text_are_written_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str) -> None:
+    given_estimate = estimate(seed, stamp_ns, frame_id)
+    posture = MODEL.forward(given_estimate.q, given_estimate.lengths)
+    placed = MODEL.segment_names, posture.origins, so3.matrix_to_quat(posture.rotations)
+    cdr = encode_segments(given_estimate, *placed)
+    assert cdr == serialize(segments_to_joint_state(given_estimate, *placed, BAG_MESSAGES))
+    read = deserialize(SEGMENTS, cdr)
+    assert len(read.transforms) == len(read.joint_names) == len(MODEL.segment_names)
+    assert encode_string(frame_id) == serialize(BAG_MESSAGES.make(STRING, data=frame_id))
+
+
+@given(st.integers(0, 2**32), st.data())
+def test_a_damaged_model_state_is_read_as_by_the_serialiser_or_left_to_it(seed: int, data: st.DataObject) -> None:
+    cdr = bytearray(encode_model_state(estimate(seed), MODEL)[0])
+    for _ in range(data.draw(st.integers(1, 4))):
+        cdr[data.draw(st.integers(0, len(cdr) - 1))] = data.draw(st.integers(0, 255))
+    damaged = bytes(cdr[: len(cdr) - data.draw(st.sampled_from([0, 0, 1, 8]))])
+    try:
+        fast = decode_model_state(damaged, MODEL)
+    except MessageError as error:
+        with pytest.raises(MessageError, match=str(error).split(" is ")[0]):
+            joint_state_to_model(deserialize(STATES, damaged), MODEL)
+        return
+    if fast is not None:
+        slow = joint_state_to_model(deserialize(STATES, damaged), MODEL)
+        assert fast[:2] == slow[:2]
+        np.testing.assert_array_equal(fast[2], slow[2])
+        np.testing.assert_array_equal(fast[3], slow[3])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("name", [*MODEL.coordinate_names[:-1], "nose"], "unknown name 'nose'"),
+        ("name", list(reversed(MODEL.coordinate_names)), "32 names, or in another order"),
+        ("position", np.zeros(31), "31 position values, expected 32"),
+        ("velocity", np.zeros(0), "0 velocity values, expected 32"),
+        ("position", np.full(32, np.nan), "position of base_x is nan"),
+        ("velocity", np.full(32, -np.inf), "velocity of base_x is -inf"),
+    ],
+)
+def test_a_model_state_that_is_none_is_refused(field: str, value: object, said: str) -> None:
+    message = estimate_to_joint_states(estimate(0), MODEL, BAG_MESSAGES)[0]
+    setattr(message, field, value)
+    with pytest.raises(MessageError, match=said):
+        joint_state_to_model(message, MODEL)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("height", 32, "covariance of 32 x 32"),
+        ("width", 31, "expected 64 x 32 float32"),
+        ("step", 64, "with 64 bytes a row"),
+        ("data", np.zeros(100, np.uint8), "100 in all"),
+        ("encoding", "64FC1", "encoding '64FC1', expected 32FC1"),
+        ("is_bigendian", 1, "big-endian"),
+        ("data", np.full(64 * 32, np.nan, "<f4").view(np.uint8), "a covariance is NaN"),
+        ("data", np.full(64 * 32, -1.0, "<f4").view(np.uint8), "a variance is negative"),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(field: str, value: object, said: str) -> None:
+    message = covariance_to_image(estimate(0), BAG_MESSAGES)
+    setattr(message, field, value)
+    with pytest.raises(MessageError, match=said):
+        image_to_covariance(message, MODEL)
+
+
+def test_ros_reads_a_model_state_as_it_was_written() -> None:
+    serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
+    from sensor_msgs.msg import Image, JointState, MultiDOFJointState
+
+    for frame_id in ("", "a", "ab", "abc", "abcd", "world"):
+        given_estimate = estimate(0, frame_id=frame_id)
+        state = serialization.deserialize_message(encode_model_state(given_estimate, MODEL)[0], JointState)
+        assert tuple(state.name) == MODEL.coordinate_names
+        np.testing.assert_array_equal(state.velocity, given_estimate.velocity)
+        image = serialization.deserialize_message(encode_covariance(given_estimate), Image)
+        np.testing.assert_array_equal(image_to_covariance(image, MODEL)[1], given_estimate.covariance)
+        posture = MODEL.forward(given_estimate.q, given_estimate.lengths)
+        quats = so3.matrix_to_quat(posture.rotations)
+        cdr = encode_segments(given_estimate, MODEL.segment_names, posture.origins, quats)
+        segments = serialization.deserialize_message(cdr, MultiDOFJointState)
+        assert tuple(segments.joint_names) == MODEL.segment_names
+        assert segments.transforms[-1].rotation.w == quats[-1, 3]
