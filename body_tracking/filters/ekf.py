@@ -19,7 +19,7 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -47,6 +47,10 @@ from body_tracking.skeleton import (
 )
 
 _DIMENSIONS = 3
+_START_FRAMES = 4
+"""Frames of one sensor that tell its noise."""
+_WAIT_NS = NANOSECONDS // 2
+"""Frames farther apart than this do not make a start together."""
 _FLOOR = 1e-3
 """Metres: no sensor's white noise is taken for less."""
 _MAX_COORDINATE = 100.0
@@ -63,6 +67,9 @@ _POOL = 8.0
 _OUTLYING = 6.0
 """A squared difference counts as at most so many times the variance."""
 _NEGLIGIBLE_SLOW = 1e-3
+_STRETCH = 0.1
+"""Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
+_SLOW_BOUND = 9.0
 _SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
@@ -73,11 +80,15 @@ _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 6.0, 4.0
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
-_UNKNOWN = 0.6
+_UNKNOWN = 0.85
 """Share of the range's deviation from which an angle counts as unknown."""
 _LIMIT_STDDEV = 3.0
 """Degrees: how softly limits push back, each time."""
 _MUCH_BETTER = 0.5
+_LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
+"""Seconds over which innovations are averaged, and how many it takes to see them lean."""
+_STRAINED = 30.0
+"""Squared Mahalanobis distance of a mean innovation that no filter in the right pose comes to (1e-6 by chance)."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
@@ -123,7 +134,7 @@ class EkfParameters:
         0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
     )
     slow_scale: float = _parameter(
-        0.05,
+        0.02,
         "variance of a sensor's slow errors before it is learnt, as a share of the measurement model's",
         "1",
         0.0,
@@ -192,7 +203,7 @@ class _SensorState:
         weight: (19,) how many differences stand behind it.
         slow: scale of the slow variance.
         slow_information: of its estimate.
-        cross: (85, 57) covariance of the state with the slow errors, these in units of their deviation; None for zero.
+        cross: (85, 61) covariance of the state with the slow errors, these in units of their deviation; None for zero.
     """
 
     stamps: tuple[int, ...]
@@ -217,6 +228,9 @@ class _State:
         moved_variance: (32,) its variance, if all is right.
         sensors: what is known of each.
         rejected_for: (19,) seconds.
+        lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
+        leaning: (19,) how many innovations it is worth.
+        strain: the greatest squared Mahalanobis distance of such a mean (chi-square with 3 degrees of freedom).
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last brought in.
         tracked: seconds since the start.
@@ -233,6 +247,9 @@ class _State:
     moved_variance: FloatArray
     sensors: dict[str, _SensorState]
     rejected_for: FloatArray
+    lean: FloatArray
+    leaning: FloatArray
+    strain: float
     used_ns: IntArray
     since_prior: float
     tracked: float
@@ -266,6 +283,8 @@ class ExtendedKalmanFilter:
         self._group, self._first_log_density = self._groups()
         self._group_sum = np.zeros((len(self._first_log_density), self._nv))
         self._group_sum[self._group, np.arange(self._nv)] = 1.0
+        self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
+        self._limb_points = self._limb_table()
         self._pose_prior()
         self._lengths_prior()
         self.counters: dict[str, int] = dict.fromkeys(
@@ -294,6 +313,7 @@ class ExtendedKalmanFilter:
         self._frame_id = ""
         self._body = 0
         self._history: list[tuple[_State, _Measurement]] = []
+        self._waiting: list[_Measurement] = []
         self._jacobian: FloatArray | None = None
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
@@ -333,11 +353,9 @@ class ExtendedKalmanFilter:
         state = self._state  # a jump of time may have reset it
         self.counters["frames"] += 1
         if state is None:
-            self._state = self._first_state(measurement, None)
-            if self._state is None:
-                return None
             self._frame_id, self._body = skeleton.frame_id, skeleton.body
-            return self._output(self._state, skeleton)
+            self._state = self._begun(measurement)
+            return None if self._state is None else self._output(self._state, skeleton)
         late = measurement.stamp_ns < state.stamp_ns
         self._state = self._replay(measurement) if late else self._remember(state, measurement)
         self._body = skeleton.body
@@ -429,6 +447,8 @@ class ExtendedKalmanFilter:
         state = self._corrected(state, measurement)
         if state.rejected_for.max() > self.parameters.reacquire_after:
             state = self._reacquired(state, measurement)
+        elif state.strain > _STRAINED:
+            state = self._straightened(state, measurement)
         return self._bounded(state)
 
     def _predicted(self, state: _State, stamp_ns: int) -> _State:
@@ -502,16 +522,18 @@ class ExtendedKalmanFilter:
 
         cross_covariance = state.covariance[:, : self._observed] @ observation.T
         seen = observation @ cross_covariance[: self._observed]
-        slow = np.repeat(np.sqrt(sensor.slow * measurement.model_variance), 3)
+        basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
         shared = None
-        if sensor.cross is not None:
-            shared = observation @ sensor.cross[: self._observed]
-            both = shared * slow
-            seen = seen + both + both.T
-            cross_covariance = cross_covariance + sensor.cross * slow
         rows = np.arange(3 * self._points)
+        if basis is not None:
+            seen = seen + basis @ basis.T
+            if sensor.cross is not None:
+                shared = observation @ sensor.cross[: self._observed]
+                both = shared @ basis.T
+                seen += both + both.T
+                cross_covariance = cross_covariance + sensor.cross @ basis.T
         s = seen.copy()
-        s[rows, rows] += slow * slow + np.repeat(sensor.white, 3)
+        s[rows, rows] += np.repeat(sensor.white, 3)
         diagonal = np.arange(self._points)
         own = s.reshape(self._points, 3, self._points, 3)[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
@@ -520,6 +542,7 @@ class ExtendedKalmanFilter:
         rejected = measurement.measured & ~used
         self.counters["measured"] += int(used.sum())
         self.counters["rejected"] += int(rejected.sum())
+        lean, leaning, strain = self._leaning(state, y, own, measurement.measured, distances, dt)
 
         if not used.all():
             rows = np.flatnonzero(np.repeat(used, 3))
@@ -528,7 +551,15 @@ class ExtendedKalmanFilter:
         used_ns = np.where(used, measurement.stamp_ns, state.used_ns)
         if not used.any():
             sensors = {**state.sensors, measurement.sensor: self._seen_by(sensor, measurement, used)}
-            return replace(state, sensors=sensors, rejected_for=rejected_for, used_ns=used_ns)
+            return replace(
+                state,
+                sensors=sensors,
+                rejected_for=rejected_for,
+                used_ns=used_ns,
+                lean=lean,
+                leaning=leaning,
+                strain=strain,
+            )
 
         factor, _ = dpotrf(s, lower=1, clean=1)
         gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)  # (k, 85): L^-1 (P H^T)^T
@@ -546,16 +577,15 @@ class ExtendedKalmanFilter:
                 part = observation[rows] @ other.cross[: self._observed]
                 sensors[name] = replace(other, cross=self._considered(other.cross, gain, factor, part, state.settled))
         own_cross = None
-        if sensor.slow > _NEGLIGIBLE_SLOW:
-            part = np.zeros((3 * self._points, 3 * self._points)) if shared is None else shared.copy()
-            part[np.arange(3 * self._points), np.arange(3 * self._points)] += slow
-            cross = np.zeros((self._size, 3 * self._points)) if sensor.cross is None else sensor.cross
+        if basis is not None:
+            part = basis if shared is None else shared + basis
+            cross = np.zeros((self._size, basis.shape[1])) if sensor.cross is None else sensor.cross
             own_cross = self._considered(cross, gain, factor, part[rows], state.settled)
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
 
-        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows)
+        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows, basis)
         if own_cross is not None and slow_scale != sensor.slow:
             # What the slow errors did to the state so far is as much smaller as they are.
             ratio = slow_scale / sensor.slow
@@ -576,6 +606,9 @@ class ExtendedKalmanFilter:
             sensors=sensors,
             rejected_for=rejected_for,
             used_ns=used_ns,
+            lean=lean,
+            leaning=leaning,
+            strain=strain,
         )
 
     def _considered(
@@ -584,10 +617,10 @@ class ExtendedKalmanFilter:
         """Covariance of the corrected state with slow errors, which are not estimated themselves (Schmidt 1966).
 
         Args:
-            cross: (85, 57) before.
+            cross: (85, 61) before.
             gain: (k, 85) of the correction.
             factor: (k, k) of the innovation's covariance.
-            part: (k, 57) covariance of the innovation with the slow errors.
+            part: (k, 61) covariance of the innovation with the slow errors.
             settled: whether the lengths are only considered, too.
         """
         half, _ = dtrtrs(factor, part, lower=1)
@@ -651,22 +684,42 @@ class ExtendedKalmanFilter:
         factor: FloatArray,
         white: FloatArray,
         rows: IntArray,
+        basis: FloatArray | None,
     ) -> tuple[float, float]:
         """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance; with its information."""
         if sensor.weight.max() < 2.0 * _POOL:
             return sensor.slow, sensor.slow_information  # what is white is not known yet, and would be taken for slow
         if measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
             return sensor.slow, sensor.slow_information  # it changes slowly, and takes a while to compute
-        inverse, _ = dtrtrs(factor, np.eye(len(factor)), lower=1)
-        precision = inverse.T @ inverse
-        residual = white @ inverse
-        variances = np.repeat(measurement.model_variance, 3)[rows]
-        score = 0.5 * float(variances @ (np.minimum(residual**2, 9.0 * precision.diagonal()) - precision.diagonal()))
-        information = 0.5 * float(variances @ (precision * precision) @ variances)
+        scale = sensor.slow
+        if basis is None:
+            scale, basis = 1.0, self._slow_basis(1.0, measurement, measurement.positions)
+            assert basis is not None
+        half, _ = dtrtrs(factor, basis[rows] / math.sqrt(scale), lower=1)
+        likely = white @ half
+        gram = half.T @ half
+        expected = gram.diagonal()
+        score = 0.5 * float((np.minimum(likely**2, _SLOW_BOUND * expected) - expected).sum())
+        information = 0.5 * float((gram * gram).sum())
         passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
-        slow = float(np.clip(sensor.slow + score / total, 0.0, _MAX_SLOW))
-        return slow, total
+        return float(np.clip(sensor.slow + score / total, 0.0, _MAX_SLOW)), total
+
+    def _slow_basis(self, scale: float, measurement: _Measurement, positions: FloatArray) -> FloatArray | None:
+        """(57, 61) displacement of the points by each slow error of unit variance; None where these are negligible.
+
+        Each point is off by itself, and the upper arms and forearms are too long or too short in some poses, with all
+        that hangs on them: along a limb a depth sensor finds its joints by a tenth of the length nearer or farther.
+        """
+        if scale < _NEGLIGIBLE_SLOW:
+            return None
+        basis = np.zeros((3 * self._points, 3 * self._points + len(self._limbs)))
+        diagonal = np.arange(3 * self._points)
+        basis[diagonal, diagonal] = np.repeat(np.sqrt(scale * measurement.model_variance), 3)
+        starts, ends, beyond = self._limb_points
+        along = (_STRETCH * math.sqrt(scale)) * (positions[ends] - positions[starts])
+        basis[:, 3 * self._points :] = (beyond[:, None, :] * along.T).reshape(-1, len(self._limbs))
+        return basis
 
     def _densities_learnt(
         self, state: _State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
@@ -682,10 +735,38 @@ class ExtendedKalmanFilter:
 
     # --- start, restart
 
-    def _first_state(self, measurement: _Measurement, previous: _State | None) -> _State | None:
+    def _begun(self, measurement: _Measurement) -> _State | None:
+        """The state after the first few frames, as many as tell a sensor's noise: without it the start is a guess."""
+        if self._waiting and abs(measurement.stamp_ns - self._waiting[-1].stamp_ns) > _WAIT_NS:
+            self._waiting.clear()
+        self._waiting.append(measurement)
+        self._waiting.sort(key=lambda each: each.stamp_ns)
+        by_sensor = [each for each in self._waiting if each.sensor == measurement.sensor]
+        if len(by_sensor) < _START_FRAMES:
+            return None
+        sensors: dict[str, _SensorState] = {}
+        for each in self._waiting:
+            known = sensors.get(each.sensor) or self._unknown_sensor()
+            sensors[each.sensor] = self._seen_by(known, each, each.measured)
+        # only the noise is kept: the frames themselves are still to come
+        learnt = {
+            name: replace(sensor, stamps=(), positions=self._unknown_sensor().positions)
+            for name, sensor in sensors.items()
+        }
+        first, *others = self._waiting
+        self._waiting = []
+        state = self._first_state(first, None, learnt)
+        for each in others:
+            state = self._remember(state, each) if state is not None else self._first_state(each, None, learnt)
+        return state
+
+    def _first_state(
+        self, measurement: _Measurement, previous: _State | None, learnt: dict[str, _SensorState] | None = None
+    ) -> _State | None:
         """The pose of one frame by inverse kinematics; None where no trunk is seen."""
         points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
-        stddev = self._point_stddev(measurement, previous)
+        known = learnt if learnt is not None else {} if previous is None else previous.sensors
+        stddev = self._point_stddev(measurement, known)
         lengths = self._lengths_of(points) if previous is None else previous.lengths
         try:
             fit = self.inverse.solve(points, stddev, lengths)
@@ -693,6 +774,8 @@ class ExtendedKalmanFilter:
             self.counters["no_trunk"] += 1
             return None
         state = self._new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
+        if learnt is not None:
+            state = replace(state, sensors=learnt)
         sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
         sensor = self._seen_by(replace(sensor, cross=None), measurement, measurement.measured)
         return replace(state, sensors={**state.sensors, measurement.sensor: sensor})
@@ -733,6 +816,9 @@ class ExtendedKalmanFilter:
             zero,
             {} if previous is None else {k: replace(s, cross=None) for k, s in previous.sensors.items()},
             np.zeros(self._points),
+            np.zeros((self._points, 3)),
+            np.zeros(self._points),
+            0.0,
             np.full(self._points, stamp_ns, dtype=np.intp),
             0.0,
             0.0 if previous is None else previous.tracked,
@@ -742,21 +828,59 @@ class ExtendedKalmanFilter:
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
         """Start the pose anew where another one fits the rejected points much better."""
         points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
-        stddev = self._point_stddev(measurement, state)
-        state = replace(state, rejected_for=np.zeros(self._points))
+        stddev = self._point_stddev(measurement, state.sensors)
+        return self._restarted(replace(state, rejected_for=np.zeros(self._points)), points, stddev, _MUCH_BETTER)
+
+    def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
+        """A pose that fits points with at most a share of the present one's cost; else the present state."""
         try:
             fit = self.inverse.solve(points, stddev, state.lengths)
         except ModelError:
             return state
-        if fit.cost > _MUCH_BETTER * self.inverse.cost(state.q, points, stddev, state.lengths):
+        if fit.cost > share * self.inverse.cost(state.q, points, stddev, state.lengths):
             return state
         self.counters["restarts"] += 1
         return self._new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
 
-    def _point_stddev(self, measurement: _Measurement, state: _State | None) -> FloatArray:
+    def _leaning(
+        self,
+        state: _State,
+        innovation: FloatArray,
+        covariance: FloatArray,
+        measured: BoolArray,
+        distances: FloatArray,
+        dt: float,
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """The faded mean of the innovations (19, 3), its weights (19,) and the strain."""
+        fade = math.exp(-dt / _LEAN_TIME)
+        bounded = np.minimum(1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9)))  # one outlier is no lean
+        weight = np.where(measured, fade * state.leaning + 1.0, fade * state.leaning)
+        step = np.where(measured, bounded / np.maximum(weight, 1.0), 0.0)
+        lean = state.lean + step[:, None] * innovation - (measured / np.maximum(weight, 1.0))[:, None] * state.lean
+        # variance of a faded mean of white innovations with this weight
+        worth = np.minimum(weight * (1.0 + fade) / 2.0, weight)
+        solved = np.linalg.solve(covariance, lean[:, :, None])[:, :, 0]
+        strain = np.where(weight > _LEAN_FRAMES, worth * (lean * solved).sum(axis=1), 0.0)
+        return lean, weight, float(strain.max())
+
+    def _straightened(self, state: _State, measurement: _Measurement) -> _State:
+        """Start the pose anew where another one fits much better what the points have shown for some time.
+
+        A filter can settle in a wrong pose that no single frame contradicts: an elbow that looks straight because
+        the upper arm is turned the wrong way about itself.
+        """
+        sure = state.leaning > _LEAN_FRAMES
+        posture = self.model.forward(state.q, state.lengths)
+        points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
+        stddev = self._point_stddev(measurement, state.sensors)
+        finite = np.isfinite(stddev)
+        stddev = np.where(finite, stddev / np.sqrt(np.maximum(state.leaning, 1.0)), np.inf)
+        state = replace(state, lean=np.zeros_like(state.lean), leaning=np.zeros(self._points), strain=0.0)
+        return self._restarted(state, points, stddev, _MUCH_BETTER)
+
+    def _point_stddev(self, measurement: _Measurement, sensors: Mapping[str, _SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
-        sensor = None if state is None else state.sensors.get(measurement.sensor)
-        sensor = sensor or self._unknown_sensor()
+        sensor = sensors.get(measurement.sensor) or self._unknown_sensor()
         return np.where(measurement.measured, np.sqrt(sensor.white + sensor.slow * measurement.model_variance), np.inf)
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
@@ -782,7 +906,9 @@ class ExtendedKalmanFilter:
             part = name.split("_")[0]
             side = name.rsplit("_", 1)[-1]
             if part == "base":
-                key = "base_position" if number < 3 else "base_rotation"
+                # people walk and turn, and hardly rise or tilt
+                kinds = {"x": "base_level", "y": "base_level", "z": "base_height", "rz": "base_turn"}
+                key = kinds.get(side, "base_tilt")
             elif side in ("left", "right"):
                 key = f"{part}_{side}"
             else:
@@ -791,9 +917,23 @@ class ExtendedKalmanFilter:
                 keys.append(key)
                 limb, hand = key.startswith(("shoulder", "elbow")), key.startswith(("forearm", "wrist"))
                 density = p.density_limb if limb else p.density_hand if hand else p.density_trunk
-                densities.append(p.density_translation if key == "base_position" else density)
+                densities.append(p.density_translation if key in ("base_level", "base_height") else density)
             groups[number] = keys.index(key)
         return groups, np.log(densities)
+
+    def _limb_table(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """(4,) points at the start and (4,) at the end of each limb, and (19, 4) which points it carries."""
+        point = {Joint(joint): number for number, joint in enumerate(self.model.joints)}
+        starts, ends = [], []
+        beyond = np.zeros((self._points, len(self._limbs)))
+        chain = ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
+        for column, limb in enumerate(self._limbs):
+            first = 0 if limb.startswith("upper_arm") else 1
+            parts = [point[Joint[f"{name}_{limb.rsplit('_', 1)[1].upper()}"]] for name in chain]
+            starts.append(parts[first])
+            ends.append(parts[first + 1])
+            beyond[parts[first + 1 :], column] = 1.0
+        return np.array(starts, dtype=np.intp), np.array(ends, dtype=np.intp), beyond
 
     def _pose_prior(self) -> None:
         """What is known of a pose and of velocities without any measurement."""
@@ -839,23 +979,25 @@ class ExtendedKalmanFilter:
         # an angle is as good as unknown: elsewhere it would draw what is measured towards the middle.
         unknown = variance > (_UNKNOWN * stddev) ** 2
         noise = stddev**4 / (spread * state.since_prior)
-        beyond = np.append(excess != 0.0, False)
-        rows = unknown | beyond
-        state = replace(state, since_prior=0.0)
-        if not rows.any():
-            return state
-        noise = np.where(beyond, np.radians(_LIMIT_STDDEV) ** 2, noise)[rows]
-        error = np.where(beyond, -np.append(excess, 0.0), -values)[rows]
-        observation = gradients[rows]
+        known = np.sqrt(state.covariance.diagonal()[self._lengths]).max() < self.parameters.settle_stddev
+        settled = state.settled or bool(known) or state.tracked > self.parameters.settle_time
+        state = replace(state, since_prior=0.0, settled=settled)
+        if unknown.any():
+            state = self._told(state, gradients[unknown], -values[unknown], noise[unknown])
+        beyond = excess != 0.0
+        if beyond.any():
+            state = self._pushed_back(state, gradients[:-1][beyond], excess[beyond])
+        return state
+
+    def _told(self, state: _State, observation: FloatArray, error: FloatArray, noise: FloatArray) -> _State:
+        """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,)."""
         cross_covariance = state.covariance[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(noise)
         factor, _ = dpotrf(s, lower=1, clean=1)
         gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
         white, _ = dtrtrs(factor, error, lower=1)
-        correction = white @ gain
         covariance = state.covariance - gain.T @ gain
         if state.settled:
-            correction[self._lengths] = 0.0
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
         sensors = {
             name: sensor
@@ -868,16 +1010,26 @@ class ExtendedKalmanFilter:
             )
             for name, sensor in state.sensors.items()
         }
-        p = self.parameters
-        known = np.sqrt(covariance.diagonal()[self._lengths]).max() < p.settle_stddev
+        return self._moved(replace(state, covariance=covariance, sensors=sensors), white @ gain)
+
+    def _pushed_back(self, state: _State, observation: FloatArray, excess: FloatArray) -> _State:
+        """The nearest state, by the covariance, within the limits; softly (Simon 2010, projection of the estimate).
+
+        The covariance stays: that an angle is within its limits does not tell where.
+        """
+        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+        s = observation @ cross_covariance[self._tangent]
+        s[np.arange(len(s)), np.arange(len(s))] += np.radians(_LIMIT_STDDEV) ** 2
+        return self._moved(state, -cross_covariance @ np.linalg.solve(s, excess))
+
+    def _moved(self, state: _State, correction: FloatArray) -> _State:
+        """The state moved by a correction (85,)."""
+        lengths = state.lengths if state.settled else state.lengths + correction[self._lengths]
         return replace(
             state,
             q=self.model.integrate(state.q, correction[self._tangent]),
-            lengths=state.lengths + correction[self._lengths],
+            lengths=lengths,
             velocity=state.velocity + correction[self._velocities],
-            covariance=covariance,
-            sensors=sensors,
-            settled=state.settled or bool(known) or state.tracked > p.settle_time,
         )
 
     # --- output
