@@ -298,10 +298,14 @@ def summarise(runs: list[Run], settles: list[float], seconds: float) -> dict[str
     summary["average_over_runs"] = {"joint": average_over_runs(runs, lambda run: run.joint, len(OBSERVED))}
     for number, name in enumerate(NAMES):
         summary["average_over_runs"][name] = average_over_runs(runs, lambda run, n=number: run.position[:, n], 1)
-    worst = sorted(runs, key=lambda run: -np.nanmean(run.joint) if np.isfinite(run.joint).any() else -np.inf)[:5]
-    summary["worst_runs"] = [
-        {"number": run.number, "noise": run.noise, "mean": float(np.nanmean(run.joint)) / len(OBSERVED)}
-        for run in worst
+    summary["each_run"] = [
+        {
+            "number": run.number,
+            "noise": run.noise,
+            "mean": float(np.nanmean(run.joint)) / len(OBSERVED) if np.isfinite(run.joint).any() else np.inf,
+            "worst": NAMES[OBSERVED[run.position[:, OBSERVED].mean(axis=0).argmax()]],
+        }
+        for run in runs
     ]
     first = summary["settled"][f"{settles[0]:g}"]
     summary["missed"] = [
@@ -348,8 +352,11 @@ def show(summary: dict[str, Any]) -> None:
             of = figures[what]
             line += f"  {100 * of['in_band']:7.1f} {100 * of['below']:6.1f} {of['mean']:6.2f}"
         print(line)
-    worst = [f"{run['number']} ({1e3 * run['noise']:.0f} mm: mean {run['mean']:.1f})" for run in summary["worst_runs"]]
-    print(f"\nmost over-confident runs (--only N): {', '.join(worst)}")
+    ordered = sorted(summary["each_run"], key=lambda run: -run["mean"])
+    levels = np.quantile([run["mean"] for run in ordered], [0.1, 0.5, 0.9])
+    print("\njoint mean of a run: 10 % below {:.2f}, half below {:.2f}, 90 % below {:.2f}".format(*levels))
+    worst = [f"{run['number']} ({1e3 * run['noise']:.0f} mm: {run['mean']:.1f}, {run['worst']})" for run in ordered[:8]]
+    print(f"most over-confident runs (--only N): {', '.join(worst)}")
     if summary["missed"]:
         print(f"in band in less than {100 * BAR:.0f} % of the time steps: " + ", ".join(summary["missed"]))
     else:
