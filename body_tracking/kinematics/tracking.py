@@ -30,6 +30,8 @@ _GAP_NS = NANOSECONDS // 2
 """After longer than this the last pose is no better a start than none."""
 _POOR = 4.0
 """Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
+_STEPS, _TOLERANCE = 4, 2e-3
+"""Of a fit that starts from the frame before: at most so many steps, until one is smaller than this, rad and m."""
 _EACH, _THEN_EVERY, _FRAMES = 30, 6, 300
 """Lengths are taken from each of the first frames, then from every so many, and the median is over the last of them."""
 _GREATEST_RATE = 10.0
@@ -168,7 +170,7 @@ class SkeletonFit:
         self._inverse = InverseKinematics(self.model)
         self._densities = joint_densities()[self.model.joints]
         self._trunk: BoolArray = np.isin(self.model.joints, _TRUNK)
-        self._last: tuple[int, FloatArray] | None = None
+        self._last: ModelEstimate | None = None
 
     def reset(self) -> None:
         """Forget the person; the counters stay."""
@@ -185,7 +187,7 @@ class SkeletonFit:
             The estimate; the covariance knows of no tie between coordinates and rates, and without velocities in the
             skeleton the rates are NaN with an infinite variance. None where no trunk is seen.
         """
-        if self._last is not None and not 0 <= skeleton.stamp_ns - self._last[0] <= _GAP_NS:
+        if self._last is not None and not 0 <= skeleton.stamp_ns - self._last.stamp_ns <= _GAP_NS:
             self._last = None
         points = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
         self.lengths.update(points)
@@ -193,18 +195,17 @@ class SkeletonFit:
         positions = points[joints]
         variance = self._variance(skeleton)
         measured = np.isfinite(positions).all(axis=1) & np.isfinite(variance)
-        fit = self._fit(positions, np.sqrt(variance), measured)
+        fit = self._fit(skeleton.stamp_ns, positions, np.sqrt(variance), measured)
         if fit is None:
             self.counters["no trunk"] += 1
             self._last = None
             return None
         self.counters["frames"] += 1
-        self._last = skeleton.stamp_ns, fit.q
         nv = self.model.nv
         covariance = np.zeros((2 * nv, 2 * nv))
         covariance[:nv, :nv] = fit.covariance
         velocity, covariance[nv:, nv:] = self._velocity(skeleton, fit.q, variance, measured)
-        return ModelEstimate(
+        self._last = ModelEstimate(
             skeleton.stamp_ns,
             skeleton.frame_id,
             skeleton.body,
@@ -214,6 +215,7 @@ class SkeletonFit:
             lengths,
             self.lengths.stddev,
         )
+        return self._last
 
     def _variance(self, skeleton: Skeleton) -> FloatArray:
         """(19,) square metres per axis; infinity where the skeleton states none that makes sense."""
@@ -222,14 +224,18 @@ class SkeletonFit:
         diagonal = skeleton.covariances[self.model.joints].diagonal(axis1=1, axis2=2)
         return np.where((diagonal > 0.0).all(axis=1), diagonal.mean(axis=1), np.inf)
 
-    def _fit(self, positions: FloatArray, stddev: FloatArray, measured: BoolArray) -> Fit | None:
+    def _fit(self, stamp_ns: int, positions: FloatArray, stddev: FloatArray, measured: BoolArray) -> Fit | None:
         if np.count_nonzero(measured & self._trunk) < 2:
             return None
         lengths = self.lengths.lengths
-        before = None if self._last is None else self._last[1]
         try:
-            fit = self._inverse.solve(positions, stddev, lengths, before)
-            if before is not None and fit.cost > _POOR * 3.0 * np.count_nonzero(measured):
+            if self._last is None:
+                return self._inverse.solve(positions, stddev, lengths)
+            elapsed = (stamp_ns - self._last.stamp_ns) / NANOSECONDS
+            moved = np.where(np.isfinite(self._last.velocity), elapsed * self._last.velocity, 0.0)
+            start = self.model.integrate(self._last.q, moved)
+            fit = self._inverse.solve(positions, stddev, lengths, start, max_iterations=_STEPS, tolerance=_TOLERANCE)
+            if fit.cost > _POOR * 3.0 * np.count_nonzero(measured):
                 self.counters["poor fits"] += 1
                 anew = self._inverse.solve(positions, stddev, lengths)
                 fit = anew if anew.cost < fit.cost else fit
