@@ -72,6 +72,7 @@ setup(
             "setuptools>=77",
         ],
         "bench": ["psutil"],
+        "peers": ["biorbd==1.12.4", "opensim==4.6"],
     },
     entry_points={
         "console_scripts": [
