@@ -1,0 +1,207 @@
+"""Inverse kinematics finds the pose again that points were made of, and says how well it knows it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from body_tracking.kinematics.inverse import InverseKinematics
+from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
+from body_tracking.skeleton import BoolArray, FloatArray, Joint
+
+INVERSE = InverseKinematics(MODEL)
+RANGES = Ranges(MODEL)
+NAMES = MODEL.coordinate_names
+MILLIMETRE = 1e-3
+BONES = (
+    (Joint.SPINE_BASE, Joint.SPINE_MID),
+    (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
+    (Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT),
+    (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
+    (Joint.ELBOW_LEFT, Joint.WRIST_LEFT),
+    (Joint.WRIST_LEFT, Joint.HAND_LEFT),
+    (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
+    (Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT),
+    (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
+    (Joint.WRIST_RIGHT, Joint.HAND_RIGHT),
+)
+EXACT = np.full(len(MODEL.joints), 1e-4)
+"""Metres: a noise that leaves the ranges of motion nothing to say."""
+
+
+def people(count: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(count, 35) configurations, (count, 21) lengths and (count, 19, 3) points of people in the midst of a motion."""
+    rng = np.random.default_rng(seed)
+    q = np.empty((count, MODEL.nq))
+    lengths = np.empty((count, len(MODEL.length_names)))
+    for number in range(count):
+        lengths[number] = RandomPerson.draw(rng).lengths
+        q[number] = RandomMotion(rng, 10.0).configuration(rng.uniform(2.0, 10.0, 1))[0]
+    return q, lengths, MODEL.forward(q, lengths).positions
+
+
+def of(*joints: Joint) -> BoolArray:
+    """(19,) which points of the model these joints are."""
+    return np.isin(MODEL.joints, joints)
+
+
+def distances(q: FloatArray, lengths: FloatArray, points: FloatArray) -> FloatArray:
+    """(19,) metres between the points and those of a configuration."""
+    return np.linalg.norm(MODEL.forward(q, lengths).positions - points, axis=1)
+
+
+def test_points_without_noise_are_reproduced_whatever_the_pose() -> None:
+    _, lengths, points = people(60, 1)
+    for length, point in zip(lengths, points, strict=True):
+        fit = INVERSE.solve(point, EXACT, length, max_iterations=50)
+        assert distances(fit.q, length, point).max() < MILLIMETRE
+        assert_allclose(fit.residuals, point - MODEL.forward(fit.q, length).positions, atol=1e-12)
+        assert np.abs(RANGES.excess(fit.q)).max() < np.radians(1.0)
+
+
+def test_the_closed_form_needs_no_lengths_to_point_every_bone_the_right_way() -> None:
+    """Exact, unless it had to keep an angle from leaving its range."""
+    _, lengths, points = people(60, 2)
+    starts, ends = (np.array([np.flatnonzero(of(bone[k]))[0] for bone in BONES]) for k in (0, 1))
+    rows = MODEL.scalar_v - 6
+    exact = 0
+    for length, point in zip(lengths, points, strict=True):
+        q = INVERSE.start(point)
+        angles = q[MODEL.scalar_q]
+        if ((angles <= RANGES.low[rows]) | (angles >= RANGES.high[rows])).any():
+            continue
+        found = MODEL.forward(q, length).positions
+        a, b = found[ends] - found[starts], point[ends] - point[starts]
+        sine, cosine = np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)
+        assert np.arctan2(sine, cosine).max() < 1e-6
+        exact += 1
+    assert exact > 30
+
+
+def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
+    """By up to 30 degrees in every angle, and half a metre."""
+    rng = np.random.default_rng(3)
+    _, lengths, points = people(40, 3)
+    stddev = np.full(points.shape[1], 0.02)
+    for length, point in zip(lengths, points, strict=True):
+        known = INVERSE.solve(point, stddev, length, max_iterations=100)
+        wrong = np.concatenate([rng.uniform(-0.5, 0.5, 3), np.radians(rng.uniform(-30.0, 30.0, MODEL.nv - 3))])
+        fit = INVERSE.solve(point, stddev, length, MODEL.integrate(known.q, wrong), max_iterations=100)
+        assert_allclose(MODEL.difference(known.q, fit.q), 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("missing", "unknown"),
+    [
+        (ARMS["LEFT"], ("elbow_flexion_left", "forearm_pronation_left", "wrist_flexion_left", "wrist_deviation_left")),
+        ((Joint.SHOULDER_RIGHT, *ARMS["RIGHT"]), ("clavicle_elevation_right", "elbow_flexion_right")),
+        ((Joint.HEAD,), ("neck_flexion", "neck_lateral")),
+        ((Joint.HIP_LEFT,), ()),
+        ((Joint.SPINE_MID,), ()),
+    ],
+)
+def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unknown: tuple[str, ...]) -> None:
+    """And of an angle that no seen point depends on, only its range of motion is known."""
+    _, lengths, points = people(30, 4)
+    gone = of(*missing)
+    for length, point in zip(lengths, points, strict=True):
+        fit = INVERSE.solve(np.where(gone[:, None], np.nan, point), EXACT, length, max_iterations=50)
+        assert distances(fit.q, length, point)[~gone].max() < MILLIMETRE
+        assert_array_equal(np.isnan(fit.residuals).all(axis=1), gone)
+        stddev = np.sqrt(fit.covariance.diagonal())
+        for name in unknown:
+            column = NAMES.index(name)
+            assert_allclose(stddev[column], RANGES.stddev[column - 6], rtol=0.01)
+
+
+def test_the_covariance_is_that_of_many_noisy_fits() -> None:
+    """Of the fitted points, which are what noise reaches; the ranges of motion tell the rest."""
+    rng = np.random.default_rng(5)
+    _, lengths, points = people(1, 6)
+    for length, point in zip(lengths, points, strict=True):
+        stddev = rng.uniform(0.005, 0.015, len(point))
+        exact = INVERSE.solve(point, stddev, length)
+        fitted = np.array(
+            [
+                MODEL.forward(
+                    INVERSE.solve(point + stddev[:, None] * rng.normal(size=point.shape), stddev, length, exact.q).q,
+                    length,
+                ).positions
+                for _ in range(300)
+            ]
+        )
+        jacobian = MODEL.linearise(exact.q, length).jacobian
+        stated = np.sqrt(np.einsum("pij,jk,pik->pi", jacobian, exact.covariance, jacobian))
+        assert_allclose(fitted.std(axis=0) / stated, 1.0, atol=0.25)
+        assert_allclose((fitted.var(axis=0) / stated**2).mean(), 1.0, atol=0.1)
+
+
+def test_limits_push_back_softly() -> None:
+    """An elbow seen 40 degrees beyond straight: good points are believed, poor ones are not."""
+    column = NAMES.index("elbow_flexion_left")
+    tangent = np.zeros(MODEL.nv)
+    tangent[column] = np.radians(-40.0)
+    q, lengths = MODEL.integrate(MODEL.neutral(), tangent), MODEL.default_lengths()
+    points = MODEL.forward(q, lengths).positions
+    flexion = [
+        MODEL.difference(MODEL.neutral(), INVERSE.solve(points, np.full(len(points), noise), lengths, q).q)[column]
+        for noise in (1e-4, 0.02, 0.1)
+    ]
+    low = RANGES.low[column - 6]
+    assert_allclose(flexion[0], np.radians(-40.0), atol=np.radians(0.1))
+    assert np.radians(-25.0) < flexion[1] < low
+    assert flexion[1] < flexion[2]
+
+
+def test_the_pull_of_an_outlier_does_not_grow_with_its_distance() -> None:
+    """Huber: a point 1 m off bends the pose no more than one 0.5 m off; most poses stay within the noise."""
+    rng = np.random.default_rng(7)
+    _, lengths, points = people(40, 8)
+    noise, count = 0.01, points.shape[1]
+    stddev = np.full(count, noise)
+    errors = []
+    for number, (length, point) in enumerate(zip(lengths, points, strict=True)):
+        noisy = point + noise * rng.normal(size=point.shape)
+        clean = INVERSE.solve(noisy, stddev, length, max_iterations=100)
+        off = np.zeros_like(point)
+        direction = rng.normal(size=3)
+        off[number % count] = direction / np.linalg.norm(direction)
+        near, far = (
+            INVERSE.solve(noisy + away * off, stddev, length, clean.q, max_iterations=100) for away in (0.5, 1.0)
+        )
+        others = np.arange(count) != number % count
+        moved = [
+            distances(fit.q, length, MODEL.forward(clean.q, length).positions)[others].max() for fit in (near, far)
+        ]
+        assert moved[1] < 1.3 * moved[0] + noise, Joint(MODEL.joints[number % count]).name
+        errors.append(np.sqrt((distances(far.q, length, point)[others] ** 2).mean()))
+    assert np.median(errors) < np.sqrt(3.0) * noise
+
+
+def test_what_it_cannot_start_from_is_an_error() -> None:
+    """One point of the trunk shows no trunk; a start that is given needs none."""
+    _, lengths, points = people(1, 9)
+    gone = of(Joint.SPINE_BASE, Joint.SPINE_SHOULDER)
+    points[0][gone] = np.nan
+    with pytest.raises(ModelError, match="no two of SpineBase, SpineMid, SpineShoulder"):
+        INVERSE.start(points[0])
+    with pytest.raises(ModelError, match="no two of"):
+        INVERSE.solve(points[0], EXACT, lengths[0])
+    fit = INVERSE.solve(points[0], EXACT, lengths[0], MODEL.neutral())
+    assert np.isfinite(fit.q).all() and np.isfinite(fit.covariance).all()
+
+
+def test_the_cost_is_that_of_the_fit() -> None:
+    rng = np.random.default_rng(10)
+    _, lengths, points = people(5, 10)
+    stddev = np.full(points.shape[1], 0.02)
+    for length, point in zip(lengths, points, strict=True):
+        noisy = point + 0.02 * rng.normal(size=point.shape)
+        fit = INVERSE.solve(noisy, stddev, length, max_iterations=50)
+        assert_allclose(INVERSE.cost(fit.q, noisy, stddev, length), fit.cost, rtol=1e-9)
+        for _ in range(10):
+            away = MODEL.integrate(fit.q, rng.normal(scale=0.05, size=MODEL.nv))
+            assert INVERSE.cost(away, noisy, stddev, length) > fit.cost
