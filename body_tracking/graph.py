@@ -7,19 +7,26 @@ Knows no ROS library.
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.messages import (
     CLOCK,
     DIAGNOSTICS,
+    IMAGE,
     JOINT_STATE,
     POINT_CLOUD,
+    SEGMENTS,
+    STRING,
     TIME_REFERENCE,
     TRANSFORM,
 )
-from body_tracking.parameters import Parameter, Value, as_yaml
+from body_tracking.parameters import Parameter, Value, as_yaml, is_wildcard, matches, read_file
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.sensors import check_sensor_name
 
@@ -35,6 +42,9 @@ CALIBRATION = "/calibration"
 CALIBRATION_CLOCK = "/calibration/clock"
 FUSED = "/fused/skeleton"
 FILTERED = "/filtered/skeleton"
+MODEL_STATE = "/filtered/model_state"
+MODEL_STATE_STDDEV = f"{MODEL_STATE}_stddev"
+MODEL_COVARIANCE = "/filtered/model_covariance"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 CLOCK_TOPIC = "/clock"
 TF_STATIC = "/tf_static"
@@ -63,6 +73,31 @@ def joint_states_stddev_topic(body: str) -> str:
     return f"{joint_states_topic(body)}_stddev"
 
 
+def urdf_topic(body: str) -> str:
+    """Where the model of a person with measured segment lengths is published."""
+    return f"/humans/bodies/{body}/urdf"
+
+
+def segments_topic(body: str) -> str:
+    """Where the poses of a person's segments are published."""
+    return f"/humans/bodies/{body}/segments"
+
+
+URDF_QOS = Qos(durability="transient_local", depth=1)
+"""Of a person's model: who comes late gets the latest."""
+
+
+def check_body(body: str) -> str:
+    """The id of a person, as topics and names of angles take it.
+
+    Raises:
+        GraphError: it is none.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", body):
+        raise GraphError(f"parameter 'body': {body!r}, expected letters, digits and _, a letter first")
+    return body
+
+
 def sensors_among(topics: Iterable[str]) -> tuple[str, ...]:
     """The sensors whose skeleton topics are among these, by name."""
     found = []
@@ -74,6 +109,46 @@ def sensors_among(topics: Iterable[str]) -> tuple[str, ...]:
             except BodyTrackingError:
                 continue  # fused, filtered, ground_truth
     return tuple(sorted(found))
+
+
+# --- filters
+
+AUTO = "auto"
+"""What a parameter says to go by the filter's name."""
+POSITIONAL = "positional"
+"""The convention that is made of positions, of any filter."""
+FUSED_INPUT, SENSORS_INPUT = "fused", "sensors"
+SKELETON_INPUT, MODEL_INPUT = "skeleton", "model_state"
+
+
+@dataclass(frozen=True, slots=True)
+class FilterRole:
+    """What a filter means for the nodes around it.
+
+    Attributes:
+        input: what ``skeleton_filter`` listens to: the fused skeleton, or every sensor.
+        angles_input: what ``joint_angles`` listens to: the filtered skeleton, or the state of the filter's own model.
+        convention: of the joint angles, where none is asked for.
+    """
+
+    input: str = FUSED_INPUT
+    angles_input: str = SKELETON_INPUT
+    convention: str = POSITIONAL
+
+
+ROLES: Final[Mapping[str, FilterRole]] = {
+    "lkf_zero_velocity": FilterRole(),
+    "lkf_constant_velocity": FilterRole(),
+    "ekf": FilterRole(SENSORS_INPUT, MODEL_INPUT, "model"),
+    "schlagenhauf_ekf": FilterRole(convention="model"),
+}
+"""Of each filter in ``filters.FILTERS``."""
+
+
+_CONVENTIONS: Final = {SKELETON_INPUT: POSITIONAL, MODEL_INPUT: "model"}
+
+
+# --- topics
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +210,46 @@ TOPICS: tuple[TopicSpec, ...] = (
         POINT_CLOUD,
         SKELETON,
         "skeleton_filter",
-        "the same, filtered; in addition velocity `vx vy vz`",
+        "the same, filtered; in addition velocity `vx vy vz`; with `ekf` one per sensor's frame, and predicted ones "
+        "while nothing arrives",
+    ),
+    TopicSpec(
+        MODEL_STATE,
+        JOINT_STATE,
+        SKELETON,
+        "skeleton_filter",
+        "`ekf`: coordinates of the body model and their rates; base x y z in `world`, rotation vectors of the base and "
+        "of the upper arms, the other angles",
+    ),
+    TopicSpec(
+        MODEL_STATE_STDDEV,
+        JOINT_STATE,
+        SKELETON,
+        "skeleton_filter",
+        "`ekf`: the standard deviation of each; of a rotation, that of a small one more in the segment's own frame",
+    ),
+    TopicSpec(
+        MODEL_COVARIANCE,
+        IMAGE,
+        SKELETON,
+        "skeleton_filter",
+        "`ekf`: the whole covariance of these coordinates (rows 0 to 31) and of their rates (rows 32 to 63), `32FC1`, "
+        "with the stamp of the state",
+    ),
+    TopicSpec(
+        segments_topic("<id>"),
+        SEGMENTS,
+        RELIABLE,
+        "skeleton_filter",
+        "`ekf`: the pose of each segment of the body in `world`; quaternions have no singular pose",
+    ),
+    TopicSpec(
+        urdf_topic("<id>"),
+        STRING,
+        URDF_QOS,
+        "skeleton_filter",
+        "`ekf`: the person's model with the segment lengths known so far, for robot_state_publisher; its joints are "
+        "the angles of the convention `model`",
     ),
     TopicSpec(
         joint_states_topic("<id>"),
@@ -232,6 +346,9 @@ class GraphOptions:
         record: record into this folder; empty for not.
         rate: of the bag.
         filter_name: overrides the parameters file; empty for not.
+        filter_input: likewise: what the filter listens to.
+        convention: likewise: of the joint angles.
+        angles_input: likewise: what the angles are made of.
         calibration_file: overrides the parameters file; empty for not.
         reliable: transport every skeleton reliably.
     """
@@ -241,6 +358,9 @@ class GraphOptions:
     record: str = ""
     rate: float = 1.0
     filter_name: str = ""
+    filter_input: str = ""
+    convention: str = ""
+    angles_input: str = ""
     calibration_file: str = ""
     reliable: bool = False
 
@@ -249,7 +369,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     """The nodes of a graph; sources last, so that those who listen are there first.
 
     Raises:
-        GraphError: no sensor, or one twice.
+        GraphError: no sensor, or one twice; a filter was asked for what it cannot do.
         SensorNameError: a name that cannot be a sensor's.
     """
     sensors = tuple(check_sensor_name(sensor) for sensor in options.sensors)
@@ -261,10 +381,13 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     skeletons: dict[str, Value] = {"reliable": True} if options.reliable else {}
     several: dict[str, Value] = {"sensors": sensors, **common, **skeletons}
     calibration: dict[str, Value] = {"calibration_file": options.calibration_file} if options.calibration_file else {}
-    chosen: dict[str, Value] = {"filter": options.filter_name} if options.filter_name else {}
+    role = role_of(options)
+    asked = {"filter": options.filter_name, "input": options.filter_input}
+    chosen: dict[str, Value] = {name: value for name, value in asked.items() if value}
+    angles: dict[str, Value] = {"convention": role.convention, "input": role.angles_input}
     specs = [
-        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons}),
-        NodeSpec("skeleton_filter", "skeleton_filter", parameters={**common, **skeletons, **chosen}),
+        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles}),
+        NodeSpec("skeleton_filter", "skeleton_filter", parameters={**several, **chosen}),
         NodeSpec("fusion", "fusion", parameters=several),
         NodeSpec("calibration", "calibration", parameters={**several, **calibration}),
     ]
@@ -272,9 +395,13 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
     recorders = int(bool(options.record))
     # Besides the next node and the recorder nobody is waited for.
-    after = {FUSED: 1 + recorders, FILTERED: 1 + recorders}
+    to_filter = {FUSED: 1} if role.input == FUSED_INPUT else {FUSED: 0}
+    to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
-        specs.append(_player(options, sensors, after))
+        # Calibration, fusion and, maybe, the filter and the recorder.
+        listeners = 2 + int(role.input == SENSORS_INPUT) + recorders
+        specs.append(_player(options, sensors, listeners, after))
     else:
         specs += [
             NodeSpec(
@@ -286,6 +413,65 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
             for sensor in sensors
         ]
     return tuple(specs)
+
+
+def role_of(options: GraphOptions) -> FilterRole:
+    """What the filter does in this graph: its own role, but for what was asked for otherwise.
+
+    Raises:
+        GraphError: it was asked for what this filter cannot do.
+    """
+    name = options.filter_name or DEFAULT_FILTER
+    own = ROLES.get(name, FilterRole())
+    asked = {"input": options.filter_input, "convention": options.convention, "angles_input": options.angles_input}
+    role = replace(own, **{name: value for name, value in asked.items() if value not in ("", AUTO)})
+    if role.input == SENSORS_INPUT != own.input:
+        raise GraphError(f"filter {name} takes fused skeletons; its input cannot be the sensors")
+    if role.convention == POSITIONAL:
+        return replace(role, angles_input=SKELETON_INPUT)
+    if role.angles_input == MODEL_INPUT != own.angles_input:
+        raise GraphError(f"filter {name} has no model of the body; joint angles must be made of its skeleton")
+    return role
+
+
+def angles_for(convention: str, source: str) -> tuple[str, str]:
+    """The convention and the input of ``joint_angles`` by its parameters; what is not said is as the default filter's.
+
+    Args:
+        convention: a convention, or ``AUTO``.
+        source: ``SKELETON_INPUT``, ``MODEL_INPUT``, or ``AUTO``.
+    """
+    default = ROLES[DEFAULT_FILTER]
+    source = default.angles_input if source == AUTO else source
+    if convention == AUTO:
+        convention = default.convention if source == default.angles_input else _CONVENTIONS[source]
+    return convention, SKELETON_INPUT if convention == POSITIONAL else source
+
+
+_FROM_FILE: Final = (
+    ("filter_name", "skeleton_filter", "filter"),
+    ("filter_input", "skeleton_filter", "input"),
+    ("convention", "joint_angles", "convention"),
+    ("angles_input", "joint_angles", "input"),
+)
+"""(option, node, parameter) by which the nodes must know of each other, whoever says it."""
+
+
+def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
+    """The options with what a parameters file says where they say nothing.
+
+    Raises:
+        ParameterError: the file is none.
+    """
+    sections = read_file(file) if file is not None else {}
+    found: dict[str, Any] = {}
+    for pattern, values in sorted(sections.items(), key=lambda item: not is_wildcard(item[0])):
+        for option, node, parameter in _FROM_FILE:
+            value = values.get(parameter)
+            # What is no string at all is refused by whoever checks the parameters.
+            if isinstance(value, str) and not getattr(options, option) and matches(pattern, f"/{node}"):
+                found[option] = value
+    return replace(options, **found)
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -307,14 +493,14 @@ def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
     sections = {}
     for spec in sorted(all_nodes_for(GraphOptions()), key=lambda spec: EXECUTABLES.index(spec.executable)):
-        sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in spec.parameters]
+        shown = {parameter for _, node, parameter in _FROM_FILE if node == spec.name}
+        hidden = spec.parameters.keys() - shown
+        sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
     return f"{CONFIG_HEADER}\n{as_yaml(sections)}"
 
 
-def _player(options: GraphOptions, sensors: Sequence[str], after: Mapping[str, int]) -> NodeSpec:
+def _player(options: GraphOptions, sensors: Sequence[str], listeners: int, after: Mapping[str, int]) -> NodeSpec:
     topics = tuple(skeleton_topic(sensor) for sensor in sensors)
-    # Calibration, fusion and, maybe, the recorder.
-    listeners = 3 if options.record else 2
     parameters: dict[str, Value] = {
         "bag": options.bag,
         "rate": options.rate,

@@ -99,26 +99,28 @@ class Parameter:
         return value if type(value) is type(self.default) else None
 
 
-def parameters_from(parameter_class: type[Any], *, live: bool = False) -> tuple[Parameter, ...]:
+def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: str = "") -> tuple[Parameter, ...]:
     """A parameter per field of a library's parameter dataclass.
 
     Args:
         parameter_class: a dataclass with a default for every field; ``field(metadata=...)`` may hold ``doc``, ``unit``,
             ``min``, ``max`` and ``choices``.
         live: whether they may change while the node runs.
+        prefix: of the parameters' names, such as ``ekf.``.
     """
     table = []
     for item in fields(parameter_class):
         default: Any = item.default
         known = {key: item.metadata[key] for key in ("unit", "min", "max") if key in item.metadata}
         choices = tuple(item.metadata.get("choices", ()))
-        table.append(Parameter(item.name, default, item.metadata.get("doc", ""), choices=choices, live=live, **known))
+        name, doc = f"{prefix}{item.name}", item.metadata.get("doc", "")
+        table.append(Parameter(name, default, doc, choices=choices, live=live, **known))
     return tuple(table)
 
 
-def fields_of(parameter_class: type[Any], values: Mapping[str, Value]) -> dict[str, Any]:
-    """Those of a node's values that are fields of a library's parameter dataclass."""
-    return {item.name: values[item.name] for item in fields(parameter_class)}
+def fields_of(parameter_class: type[Any], values: Mapping[str, Value], *, prefix: str = "") -> dict[str, Any]:
+    """Those of a node's values that are fields of a library's parameter dataclass; ``prefix`` as given above."""
+    return {item.name: values[f"{prefix}{item.name}"] for item in fields(parameter_class)}
 
 
 def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[str, Value]:

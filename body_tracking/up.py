@@ -30,6 +30,7 @@ from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
 from body_tracking.graph import GraphOptions, NodeSpec
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.parameters import (
     SECTION,
     Parameter,
@@ -142,15 +143,17 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
                 f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
             )
         sensors = sensors or there
-    return GraphOptions(
+    options = GraphOptions(
         sensors=sensors or graph.DEFAULT_SENSORS,
         bag=str(args.bag) if args.bag else "",
         record=str(args.record) if args.record else "",
         rate=args.rate,
         filter_name=args.filter or "",
+        convention=args.convention or "",
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
     )
+    return graph.with_file(options, args.params_file)
 
 
 def parameters_for(
@@ -484,6 +487,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="play the bag X times as fast (default 1)")
     parser.add_argument("--record", type=Path, metavar="BAG", help="record everything into this new folder")
     parser.add_argument("--filter", choices=FILTERS, help="which filter; overrides the parameters file")
+    parser.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles; overrides the file, too")
     parser.add_argument(
         "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
     )

@@ -12,7 +12,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from body_tracking import cli, graph
+from body_tracking.kinematics.conventions import CONVENTIONS, convention
 from body_tracking.kinematics.positional import ANGLE_NAMES
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import Qos
 
@@ -62,8 +64,20 @@ def services() -> str:
 
 
 def angles() -> str:
-    """The names of the joint angles."""
-    return ", ".join(f"`{name}`" for name in ANGLE_NAMES) + "\n"
+    """The names of the joint angles of each convention."""
+    model = UpperBody()
+    names = {name: convention(name, model).names for name in CONVENTIONS} | {graph.POSITIONAL: ANGLE_NAMES}
+    rows = [(f"`{name}`", ", ".join(f"`{angle}`" for angle in angles)) for name, angles in names.items()]
+    return table(("convention", "angles"), rows)
+
+
+def filters() -> str:
+    """What each filter means for the nodes around it."""
+    rows = [
+        (f"`{name}`", f"`{role.input}`", f"`{role.angles_input}`", f"`{role.convention}`")
+        for name, role in graph.ROLES.items()
+    ]
+    return table(("filter", "`input` of skeleton_filter", "`input` of joint_angles", "`convention`"), rows)
 
 
 def _default(value: Value) -> str:
@@ -101,7 +115,14 @@ def commands() -> str:
     return table(("command", "what it does"), _commands(cli.parser()))
 
 
-WRITERS = {"topics": topics, "services": services, "angles": angles, "parameters": parameters, "commands": commands}
+WRITERS = {
+    "topics": topics,
+    "services": services,
+    "filters": filters,
+    "angles": angles,
+    "parameters": parameters,
+    "commands": commands,
+}
 
 
 def readme() -> str:

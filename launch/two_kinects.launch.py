@@ -1,7 +1,9 @@
 """The graph of ``body_tracking up``, for ``ros2 launch``: two Kinects, or a bag in their place, to joint angles.
 
-ros2 launch body_tracking two_kinects.launch.py bag:=/path/to/bag record:=/path/to/new/bag filter:=lkf_zero_velocity
+ros2 launch body_tracking two_kinects.launch.py bag:=/path/to/bag record:=/path/to/new/bag filter:=ekf
 """
+
+from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, RegisterEventHandler, Shutdown
@@ -9,7 +11,7 @@ from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for
+from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for, with_file
 from body_tracking.parameters import to_ros
 
 ARGUMENTS = {
@@ -18,6 +20,7 @@ ARGUMENTS = {
     "rate": ("1.0", "play it this many times as fast"),
     "record": ("", "record everything into this new folder"),
     "filter": ("", "which filter; overrides the parameters file"),
+    "convention": ("", "of the joint angles; overrides the parameters file"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
@@ -50,9 +53,11 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         record=given["record"],
         rate=float(given["rate"]),
         filter_name=given["filter"],
+        convention=given["convention"],
         calibration_file=given["calibration"],
     )
-    nodes = [action(spec, given["params_file"]) for spec in nodes_for(options)]
+    file = Path(given["params_file"]) if given["params_file"] else None
+    nodes = [action(spec, given["params_file"]) for spec in nodes_for(with_file(options, file))]
     if given["bag"]:  # the player is the last one
         end = OnProcessExit(target_action=nodes[-1], on_exit=[Shutdown(reason="the bag has ended")])
         return [*nodes, RegisterEventHandler(end)]

@@ -1,27 +1,32 @@
-"""Filters: skeletons in, smoother skeletons with covariances and velocities out.
+"""Filters: skeletons in, smoother skeletons with covariances and velocities out; one of them on a body model.
 
-Knows ``skeleton.py`` and ``kinematics`` (how people move; later the body model of the extended filter); used by the
-nodes and the offline replay, which choose a filter by its name.
+Knows ``skeleton.py`` and ``kinematics`` (how people move, the body models); used by the nodes and the offline replay,
+which choose a filter by its name. The filters themselves are imported when one is made: scipy takes its time.
 """
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import fields
-from typing import Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
-from body_tracking.filters.linear import LINEAR_MODELS, FilterError, LinearKalmanFilter, LinearKalmanParameters
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import Skeleton
 
-__all__ = [
-    "FILTERS",
-    "FilterError",
-    "LinearKalmanFilter",
-    "LinearKalmanParameters",
-    "SkeletonFilter",
-    "make_filter",
-]
+DEFAULT_FILTER = "lkf_constant_velocity"
+"""The filter of nodes and commands that are told none."""
 
-FILTERS: tuple[str, ...] = LINEAR_MODELS
+_LINEAR: Final = ("linear", "LinearKalmanFilter", "LinearKalmanParameters", "")
+# name: module, class, class of its parameters, prefix of their names where several filters' stand together
+_FILTERS: Final = {
+    "lkf_zero_velocity": _LINEAR,
+    "lkf_constant_velocity": _LINEAR,
+    "ekf": ("ekf", "ExtendedKalmanFilter", "EkfParameters", "ekf."),
+    "schlagenhauf_ekf": ("schlagenhauf", "SchlagenhaufKalmanFilter", "SchlagenhaufParameters", "schlagenhauf_ekf."),
+}
+
+FILTERS: Final = tuple(_FILTERS)
 """The names that :func:`make_filter` knows."""
 
 
@@ -37,19 +42,57 @@ class SkeletonFilter(Protocol):
         """Forget the person; the counters stay."""
 
 
-def make_filter(name: str, **parameters: float) -> SkeletonFilter:
+@runtime_checkable
+class ModelFilter(SkeletonFilter, Protocol):
+    """A filter on a body model, which takes each sensor's frames by themselves and knows what is to be expected."""
+
+    model: UpperBody
+
+    def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
+        """Take one frame of one sensor, as above."""
+
+    @property
+    def estimate(self) -> ModelEstimate | None:
+        """The state of the model after the last frame; None before a first."""
+
+    def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
+        """What is to be expected at a later time; None where the person is lost."""
+
+
+def _from(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+
+
+def parameter_classes() -> dict[str, type[Any]]:
+    """The classes of all filters' parameters, by the prefix of their names where they stand together."""
+    return {prefix: _from(module, name) for module, _, name, prefix in _FILTERS.values()}
+
+
+def parameter_prefix(name: str) -> str:
+    """The prefix of the parameters of a filter; see :func:`parameter_classes`."""
+    return _FILTERS[name][3]
+
+
+def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
     """A filter by its name.
 
     Args:
         name: one of ``FILTERS``.
-        parameters: fields of the filter's parameter class (:class:`LinearKalmanParameters`).
+        parameters: fields of the filter's parameter class, without a prefix.
 
     Raises:
         FilterError: an unknown name, an unknown parameter, a value out of range.
     """
-    if name not in FILTERS:
-        raise FilterError(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
-    unknown = parameters.keys() - {item.name for item in fields(LinearKalmanParameters)}
+    if name not in _FILTERS:
+        error: type[Exception] = _from("linear", "FilterError")
+        raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
+    module, filter_name, parameters_name, _ = _FILTERS[name]
+    parameter_class = _from(module, parameters_name)
+    unknown = parameters.keys() - {item.name for item in fields(parameter_class)}
     if unknown:
-        raise FilterError(f"filter {name}: unknown parameter(s) {', '.join(sorted(unknown))}")
-    return LinearKalmanFilter(name, LinearKalmanParameters(**parameters))
+        error = _from("linear", "FilterError")
+        raise error(f"filter {name}: unknown parameter(s) {', '.join(sorted(unknown))}")
+    made = _from(module, filter_name)
+    settings = parameter_class(**parameters)
+    result: SkeletonFilter = made(name, settings) if module == "linear" else made(settings)
+    return result

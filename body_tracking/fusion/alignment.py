@@ -53,6 +53,7 @@ class _Sensor(Placement):
     def clear(self) -> None:
         self.last_ns: int | None = None  # in its own clock
         self.newest: _Seen | None = None
+        self.ahead = False  # its clock is not what it is taken for: the reference's frames came from its past
 
 
 class SensorAlignment:
@@ -125,6 +126,9 @@ class SensorAlignment:
         if pose is None:
             self.counters["uncalibrated"] += 1
             return None
+        if not self._in_step(sensor, source, stamp):
+            self.counters["other_clock"] += 1
+            return None
         source.forget_before(stamp - _KEEP)
         seen = _in_world(skeleton, stamp, pose)
         if source.newest is None or stamp > source.newest.stamp_ns:
@@ -144,6 +148,24 @@ class SensorAlignment:
             source.last_ns = stamp_ns
         else:
             self.counters["late"] += 1
+
+    def _in_step(self, sensor: str, source: _Sensor, stamp: int) -> bool:
+        """Whether a frame is of the time in which the reference sensor is, as far as that can be told.
+
+        A sensor that was started again may count from another beginning, and its frames would throw a filter from one
+        time to another until the calibration has found its clock again.
+        """
+        jump = CLOCK_JUMP * NANOSECONDS
+        if sensor == self.reference:
+            for other in self._sensors.values():
+                if other.newest is not None and other.newest.stamp_ns > stamp + jump:
+                    other.ahead, other.newest = True, None
+            return True
+        reference = self._sensors[self.reference].newest
+        if reference is None:
+            return True
+        source.ahead &= stamp > reference.stamp_ns + jump
+        return not source.ahead and stamp >= reference.stamp_ns - jump
 
     def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
         """The frame with left and right as they are believed from what all sensors see at that time."""

@@ -341,6 +341,23 @@ class LengthChanges:
         return True
 
 
+def state_estimate(
+    model: UpperBody, stamp_ns: int, frame_id: str, q: FloatArray, velocity: FloatArray, covariance: FloatArray
+) -> ModelEstimate:
+    """An estimate of the pose alone, as angles need it: of lengths nothing is known.
+
+    Args:
+        model: the body.
+        stamp_ns: capture time, nanoseconds.
+        frame_id: of the base.
+        q: (nq,) configuration.
+        velocity: (nv,) tangent velocity.
+        covariance: (2 nv, 2 nv) of both.
+    """
+    lengths = model.default_lengths()
+    return ModelEstimate(stamp_ns, frame_id, 0, q, velocity, covariance, lengths, np.full(len(lengths), np.inf))
+
+
 def segment_poses(estimate: ModelEstimate, model: UpperBody) -> tuple[FloatArray, FloatArray]:
     """(12, 3) origins and (12, 4) quaternions xyzw of the segments, in the estimate's frame."""
     posture = model.forward(estimate.q, estimate.lengths)

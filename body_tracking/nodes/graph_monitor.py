@@ -26,7 +26,7 @@ from body_tracking.messages import to_nanoseconds
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE
 
-_CHAIN = ("fusion", "skeleton_filter", "joint_angles")
+_CHAIN = ("skeleton_filter", "joint_angles")
 _FRESH = 3.0
 """Seconds for which a node's diagnostics count."""
 
@@ -53,6 +53,7 @@ class GraphMonitor:
         """Steady time at which the latest angles came, seconds."""
         self.angles = 0
         """How many angle messages have come."""
+        self._angles_topic = graph.joint_states_topic(body)
         self._statuses: dict[str, _Status] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -60,9 +61,7 @@ class GraphMonitor:
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
-        self._node.create_subscription(
-            JointState, graph.joint_states_topic(body), self._on_angles, to_profile(RELIABLE)
-        )
+        self._node.create_subscription(JointState, self._angles_topic, self._on_angles, to_profile(RELIABLE))
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -107,7 +106,7 @@ class GraphMonitor:
         if player is not None:
             parts[0] += f" (bag {float(player.values['position s']):.1f}/{float(player.values['duration s']):.1f} s)"
         parts.append(self._rates(options, fresh))
-        delay = self._delay(fresh)
+        delay = self._delay(options, fresh)
         if delay:
             parts.append(delay)
         calibration = fresh.get("calibration")
@@ -126,15 +125,17 @@ class GraphMonitor:
 
         sensors = " ".join(f"{name} {rate('fusion', f'in {graph.skeleton_topic(name)}')}" for name in options.sensors)
         fused = rate("fusion", f"out {graph.FUSED}")
-        angles = rate("joint_angles", f"in {graph.FILTERED}")
+        angles = rate("joint_angles", f"out {self._angles_topic}")
         return f"{sensors}, fused {fused}, angles {angles} Hz"
 
     @staticmethod
-    def _delay(fresh: Mapping[str, _Status]) -> str:
+    def _delay(options: GraphOptions, fresh: Mapping[str, _Status]) -> str:
         """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
-        values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in _CHAIN]
+        by_sensor = graph.role_of(options).input == graph.SENSORS_INPUT
+        chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)
+        values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in chain]
         known = [float(value) for value in values if value is not None]
-        return f"delay {sum(known):.1f} ms" if len(known) == len(_CHAIN) else ""
+        return f"delay {sum(known):.1f} ms" if len(known) == len(chain) else ""
 
     def summary(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:
         """What was done."""

@@ -1,4 +1,4 @@
-"""``/fused/skeleton`` to ``/filtered/skeleton``: smoother, with velocities, and predicted where nothing is seen."""
+"""``/fused/skeleton``, or every sensor's skeletons, to ``/filtered/skeleton`` and the state of the body's model."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -6,51 +6,186 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
+from typing import Any
 
-from sensor_msgs.msg import PointCloud2
+from geometry_msgs.msg import TransformStamped
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, TimeReference
+from std_msgs.msg import String
 
 from body_tracking import graph
-from body_tracking.cdr import encode_skeletons
-from body_tracking.filters import FILTERS, LinearKalmanParameters, make_filter
-from body_tracking.nodes.common import RELIABLE, GraphNode, run
-from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.skeleton import Skeleton
+from body_tracking.filtering import (
+    FILTER,
+    INPUT,
+    PREDICT_AFTER,
+    FilterSettings,
+    FilterStage,
+    filter_parameters,
+    filter_table,
+)
+from body_tracking.filters.prediction import PERIOD_NS
+from body_tracking.messages import time_reference_to_clock, transform_to_pose
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.common import (
+    BODY,
+    REFERENCE,
+    RELIABLE,
+    SENSORS,
+    STEADY,
+    WORLD_FRAME,
+    GraphNode,
+    run,
+)
+from body_tracking.parameters import Value
+from body_tracking.recording.qos import LATCHED, Qos
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.sensors import check_sensor_name
+from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 PARAMETERS = (
-    Parameter("filter", "lkf_constant_velocity", "which filter", choices=FILTERS, live=True),
-    *parameters_from(LinearKalmanParameters, live=True),
+    FILTER,
+    INPUT,
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    BODY,
+    PREDICT_AFTER,
+    *filter_table(),
     RELIABLE,
 )
 
 
 class SkeletonFilterNode(GraphNode):
-    """Filters one skeleton per message."""
+    """Feeds the filter and publishes what it makes."""
 
     NAME = "skeleton_filter"
     PARAMETERS = PARAMETERS
 
+    def __init__(self) -> None:
+        self.stage: FilterStage | None = None
+        self.inputs: list[Subscription] = []
+        self.outputs: dict[str, Publisher] = {}
+        self.sent_ns: int | None = None
+        super().__init__()
+
     def configure(self, values: Mapping[str, Value]) -> None:
         """A new filter starts from the next frame on."""
-        self.filter = make_filter(str(values["filter"]), **fields_of(LinearKalmanParameters, values))
+        given: dict[str, Any] = dict(values)
+        name = given["filter"]
+        settings = FilterSettings(
+            name,
+            filter_parameters(name, values),
+            given["input"],
+            tuple(check_sensor_name(sensor) for sensor in given["sensors"]),
+            given["reference"],
+            given["world_frame"],
+            graph.check_body(given["body"]),
+            given["predict_after"],
+        )
+        before, stage = self.stage, FilterStage(settings, self.publish, self.wanted)
+        if before is not None and before.by_sensor and stage.by_sensor:
+            stage.alignment = before.alignment  # latched poses come once
+        self.stage = stage
+        if before is not None:
+            self.advertise(values)
+            if before.by_sensor != stage.by_sensor:
+                self.connect(values)
 
     def start(self) -> None:
         """Connect."""
-        self.output = self.create_publisher(PointCloud2, graph.FILTERED, self.skeleton_qos())
-        self.listen_to_skeletons(graph.FUSED, self.on_fused)
+        self.advertise(self.values)
+        self.connect(self.values)
+        self.create_timer(PERIOD_NS / NANOSECONDS, self.on_timer, clock=STEADY)
+
+    def advertise(self, values: Mapping[str, Value]) -> None:
+        """Make the publishers that the filter needs, and that are not there yet."""
+        assert self.stage is not None
+        skeletons, body = self.skeleton_qos(), str(values["body"])
+        topics: dict[str, tuple[type[Any], Any]] = {graph.FILTERED: (PointCloud2, skeletons)}
+        if self.stage.models:
+            topics |= {
+                graph.MODEL_STATE: (JointState, skeletons),
+                graph.MODEL_STATE_STDDEV: (JointState, skeletons),
+                graph.MODEL_COVARIANCE: (Image, skeletons),
+                graph.segments_topic(body): (MultiDOFJointState, to_profile(RELIABLE_QOS)),
+                graph.urdf_topic(body): (String, to_profile(graph.URDF_QOS)),
+            }
+        for topic in topics.keys() - self.outputs.keys():
+            kind, qos = topics[topic]
+            self.outputs[topic] = self.create_publisher(kind, topic, qos)
+
+    def connect(self, values: Mapping[str, Value]) -> None:
+        """Listen to what the filter takes, and to nothing else."""
+        assert self.stage is not None
+        for subscription in self.inputs:
+            self.destroy_subscription(subscription)
+        if not self.stage.by_sensor:
+            self.inputs = [self.listen_to_skeletons(graph.FUSED, self.on_fused)]
+            return
+        given: dict[str, Any] = dict(values)
+        sensors = given["sensors"]
+        latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(sensors))))
+        self.inputs = [
+            self.listen(graph.CALIBRATION_CLOCK, TimeReference, latched, self.on_clock),
+            self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose),
+        ]
+        for sensor in sensors:
+            topic = graph.skeleton_topic(sensor)
+            self.inputs.append(self.listen_to_skeletons(topic, partial(self.on_sensor, sensor)))
+
+    def on_pose(self, message: Any, sent_ns: int) -> None:
+        """A sensor's pose."""
+        assert self.stage is not None
+        self.stage.set_pose(transform_to_pose(message))
+
+    def on_clock(self, message: Any, sent_ns: int) -> None:
+        """A sensor's clock."""
+        assert self.stage is not None
+        self.stage.set_clock(*time_reference_to_clock(message))
 
     def on_fused(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Filter and publish."""
-        filtered = self.filter.update(skeletons[0])
-        if filtered is not None:
-            self.send(self.output, encode_skeletons([filtered]), filtered.stamp_ns, sent_ns)
+        assert self.stage is not None
+        self.sent_ns = sent_ns
+        self.stage.on_fused(skeletons[0], self.now_ns())
+
+    def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        """Filter and publish."""
+        assert self.stage is not None
+        self.sent_ns = sent_ns
+        self.stage.on_sensor(sensor, skeletons, self.now_ns())
+
+    def on_timer(self) -> None:
+        """Publish what is to be expected where nothing comes."""
+        assert self.stage is not None
+        self.sent_ns = None
+        self.stage.poll(self.now_ns())
+
+    def wanted(self, topic: str) -> bool:
+        """Whether anybody listens."""
+        return bool(self.outputs[topic].get_subscription_count())
+
+    def publish(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
+        """One message of the filter."""
+        if topic == graph.FILTERED:
+            self.send(self.outputs[topic], cdr, stamp_ns, self.sent_ns)
+        else:
+            self.outputs[topic].publish(cdr)
 
     def time_jumped_back(self, topic: str) -> None:
-        """Start anew."""
-        self.filter.reset()
+        """Start anew; of a sensor, the stage finds out what that means for the others."""
+        assert self.stage is not None
+        if topic == graph.FUSED:
+            self.stage.reset()
+        else:
+            self.stage.sensor_jumped_back(topic.removeprefix("/").removesuffix(graph.SKELETON_SUFFIX))
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """The filter's counters."""
-        return 0, str(self.values["filter"]), dict(self.filter.counters)
+        assert self.stage is not None
+        return 0, str(self.values["filter"]), dict(self.stage.counters)
 
 
 def main() -> None:

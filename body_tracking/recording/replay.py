@@ -20,16 +20,17 @@ from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.filters import FILTERS, LinearKalmanParameters
+from body_tracking.filtering import ANGLES, FILTER, INPUT, PREDICT_AFTER, filter_parameters, filter_table
+from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
-from body_tracking.parameters import Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.recording.stages import DEFAULT_FILTER, ReplaySettings, Sink, Upstream, start_downstream
+from body_tracking.recording.stages import JUMP_BACK_NS, ReplaySettings, Sink, Upstream, start_downstream
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
-_JUMP_BACK_NS = NANOSECONDS
 _P = TypeVar("_P")
 
 
@@ -99,7 +100,7 @@ def skeletons_of(
             counters[f"malformed {raw.topic}"] += 1
             continue
         stamp = skeletons[0].stamp_ns
-        if stamp < last.get(sensor, stamp) - _JUMP_BACK_NS:
+        if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
             counters["time jumps"] += 1
             subjects[sensor].reset()
         last[sensor] = stamp
@@ -157,8 +158,12 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             upstream = Upstream(settings, downstream)
             progress = Progress(bag.start_ns, bag.end_ns)
             beside = _Passed(bag, truth, downstream)
+            started = False
             for sensor, skeleton, log_time_ns, cdr in skeletons_of(bag, topics, counters):
                 beside.until(log_time_ns)
+                if not started:
+                    started = True
+                    upstream.start(log_time_ns)
                 downstream.take(graph.skeleton_topic(sensor), cdr, log_time_ns)
                 upstream.push(sensor, skeleton, log_time_ns)
                 progress.at(log_time_ns)
@@ -222,14 +227,20 @@ def parameters_for(
     Raises:
         ParameterError: a file that is none, a value of the wrong type or out of range, an unknown name.
     """
-    table = parameters_from(parameter_class)
+    checked, others = values_for(node, parameters_from(parameter_class), file, own)
+    return parameter_class(**fields_of(parameter_class, checked)), others
+
+
+def values_for(
+    node: str, table: Sequence[Parameter], file: Path | None, own: Mapping[str, Value]
+) -> tuple[dict[str, Value], dict[str, object]]:
+    """The same for a table of parameters: the value of each, and the others as given."""
     given: dict[str, object] = {}
     for pattern, values in read_file(file).items() if file is not None else ():
         if matches(pattern, f"/{node}"):
             given |= values
     others = {name: value for name, value in given.items() if name in own}
-    checked = check_all(table, {name: value for name, value in given.items() if name not in own})
-    return parameter_class(**fields_of(parameter_class, checked)), others
+    return check_all(table, {name: value for name, value in given.items() if name not in own}), others
 
 
 _SHARED: dict[str, Value] = {
@@ -246,15 +257,24 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     file = args.params_file
     calibration, _ = parameters_for("calibration", CalibrationParameters, file, {**_SHARED, "calibration_file": ""})
     fusion, shared = parameters_for("fusion", FusionParameters, file, _SHARED)
-    filtering, own = parameters_for("skeleton_filter", LinearKalmanParameters, file, {**_SHARED, "filter": ""})
+    own = {**_SHARED, "body": ""}
+    filtering, _ = values_for("skeleton_filter", (FILTER, INPUT, PREDICT_AFTER, *filter_table()), file, own)
+    values_for("joint_angles", ANGLES, file, own)
+    # What one node is told and another must know: from the command line, else from the file.
+    chosen = graph.with_file(graph.GraphOptions(filter_name=args.filter or "", convention=args.convention or ""), file)
+    filter_name = chosen.filter_name or DEFAULT_FILTER
     return ReplaySettings(
         tuple(args.sensors.split(",")) if args.sensors else (),
         args.reference or str(shared.get("reference", "")),
-        args.filter or str(own.get("filter", DEFAULT_FILTER)),
+        filter_name,
+        chosen.filter_input or graph.AUTO,
+        float(str(filtering["predict_after"])),
+        chosen.convention or graph.AUTO,
+        chosen.angles_input or graph.AUTO,
         args.body,
         calibration,
         fusion,
-        {name: getattr(filtering, name) for name in LinearKalmanParameters.__slots__},
+        filter_parameters(filter_name, filtering),
         args.calibration,
     )
 
@@ -272,6 +292,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
     command.add_argument("--filter", choices=FILTERS, help=f"default: {DEFAULT_FILTER}")
+    command.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles (default: by the filter)")
     command.add_argument("--sensors", metavar="A,B", help="use these, the first as reference (default: all in the bag)")
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
     command.add_argument("--calibration", type=Path, metavar="FILE", help="start from this calibration (YAML)")

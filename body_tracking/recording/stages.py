@@ -19,25 +19,38 @@ from typing import Any, Protocol
 from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load
-from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
-from body_tracking.filters import make_filter
+from body_tracking.cdr import (
+    decode_covariance,
+    decode_model_state,
+    decode_skeletons,
+    encode_angles,
+    encode_skeletons,
+)
+from body_tracking.filtering import DEFAULT_PREDICT_AFTER, FilterSettings, FilterStage
+from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion.fusion import Fusion, FusionParameters
-from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.tracking import AngleStream, state_estimate
 from body_tracking.messages import (
+    IMAGE,
     JOINT_STATE,
     POINT_CLOUD,
+    SEGMENTS,
+    STRING,
     TIME_REFERENCE,
     TRANSFORM,
     clock_to_time_reference,
+    cloud_to_skeletons,
     pose_to_transform,
     time_reference_to_clock,
     transform_to_pose,
 )
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, serialize
-from body_tracking.skeleton import Skeleton
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, deserialize, serialize
+from body_tracking.skeleton import NANOSECONDS, Skeleton
 
-DEFAULT_FILTER = "lkf_constant_velocity"
+JUMP_BACK_NS = NANOSECONDS
+"""A stamp of a sensor further behind the one before than this is a backward jump of time."""
 
 _BATCH = 128
 """Messages that go through the pipe at once: each trip costs as much as several of them."""
@@ -51,6 +64,10 @@ class ReplaySettings:
         sensors: the first is the reference unless ``reference`` says otherwise.
         reference: or empty.
         filter_name: one of the filters.
+        filter_input: what it filters; ``graph.AUTO`` for what is its own.
+        predict_after: seconds without a frame after which predicted ones are made.
+        convention: of the joint angles; ``graph.AUTO`` for the filter's own.
+        angles_input: what they are made of; ``graph.AUTO`` for what is the filter's own.
         body: the id in topics and names of angles.
         calibration: parameters of the calibration.
         fusion: parameters of the fusion.
@@ -61,11 +78,42 @@ class ReplaySettings:
     sensors: tuple[str, ...]
     reference: str = ""
     filter_name: str = DEFAULT_FILTER
+    filter_input: str = graph.AUTO
+    predict_after: float = DEFAULT_PREDICT_AFTER
+    convention: str = graph.AUTO
+    angles_input: str = graph.AUTO
     body: str = graph.DEFAULT_BODY
     calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
     fusion: FusionParameters = field(default_factory=FusionParameters)
     filter_parameters: Mapping[str, Any] = field(default_factory=dict)
     calibration_file: Path | None = None
+
+    def role(self) -> graph.FilterRole:
+        """What the filter is to do.
+
+        Raises:
+            GraphError: it cannot.
+        """
+        return graph.role_of(
+            graph.GraphOptions(
+                filter_name=self.filter_name,
+                filter_input=self.filter_input,
+                convention=self.convention,
+                angles_input=self.angles_input,
+            )
+        )
+
+    def filter_settings(self) -> FilterSettings:
+        """Those of the filter's stage."""
+        return FilterSettings(
+            self.filter_name,
+            self.filter_parameters,
+            self.filter_input,
+            self.sensors,
+            self.reference,
+            body=self.body,
+            predict_after=self.predict_after,
+        )
 
 
 class Sink(Protocol):
@@ -90,13 +138,13 @@ class Upstream:
             self.calibration.load(load(settings.calibration_file))
         self.fusion = Fusion(settings.sensors, settings.fusion, reference)
         self._sink = sink
-        self._started = False
+
+    def start(self, log_time_ns: int) -> None:
+        """What is known before the first frame."""
+        self._calibrated(self.calibration.current_update(), log_time_ns)
 
     def push(self, sensor: str, skeleton: Skeleton, log_time_ns: int) -> None:
         """One frame of one sensor."""
-        if not self._started:
-            self._started = True
-            self._calibrated(self.calibration.current_update(), log_time_ns)
         for update in self.calibration.push(sensor, skeleton, log_time_ns):
             self._calibrated(update, log_time_ns)
         for fused in self.fusion.push(sensor, skeleton, log_time_ns):
@@ -135,7 +183,7 @@ class Written:
 
 
 class Downstream:
-    """Writes every message, and filters the fused skeletons and turns them to angles.
+    """Writes every message, filters what the filter takes, and turns that to angles.
 
     Args:
         settings: what to run.
@@ -146,12 +194,20 @@ class Downstream:
     Raises:
         BagError: ``out`` cannot be written.
         FilterError: the filter or its parameters make no sense.
+        GraphError: the filter cannot do what it was asked for.
     """
 
     def __init__(
         self, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], *, overwrite: bool
     ) -> None:
-        self._filter = make_filter(settings.filter_name, **settings.filter_parameters)
+        role = settings.role()
+        self._filter = FilterStage(settings.filter_settings(), self._filtered)
+        self._angles = AngleStream(role.convention)
+        self._of_model = role.angles_input == graph.MODEL_INPUT
+        self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in settings.sensors}
+        self._last_ns: dict[str, int] = {}
+        self._model_state = b""
+        self._now_ns = 0
         self._body = settings.body
         self._states = graph.joint_states_topic(settings.body)
         self._stddevs = graph.joint_states_stddev_topic(settings.body)
@@ -165,27 +221,62 @@ class Downstream:
             self._states: (JOINT_STATE, RELIABLE),
             self._stddevs: (JOINT_STATE, RELIABLE),
         }
+        if self._filter.models:
+            published |= {
+                graph.MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
+                graph.MODEL_STATE_STDDEV: (JOINT_STATE, SENSOR_DATA),
+                graph.MODEL_COVARIANCE: (IMAGE, SENSOR_DATA),
+                graph.segments_topic(settings.body): (SEGMENTS, RELIABLE),
+                graph.urdf_topic(settings.body): (STRING, graph.URDF_QOS),
+            }
         for topic, (type_name, qos) in {**topics, **published}.items():
             self._writer.add_topic(topic, type_name, qos)
 
     def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
         """One serialised message."""
         self._writer.write(topic, cdr, log_time_ns)
-        if topic == graph.FUSED:
-            self._fused(cdr, log_time_ns)
-
-    def _fused(self, cdr: bytes, log_time_ns: int) -> None:
         # Through messages, as in the live graph: skeletons travel in single precision.
-        filtered = self._filter.update(_decoded(cdr))
-        if filtered is None:
-            return
-        published = encode_skeletons([filtered])
-        self._writer.write(graph.FILTERED, published, log_time_ns)
-        arrived = _decoded(published)
-        states, stddevs = encode_angles(positional_angles(arrived), self._body, arrived.frame_id)
-        self._writer.write(self._states, states, log_time_ns)
-        self._writer.write(self._stddevs, stddevs, log_time_ns)
-        self._frames += 1
+        self._now_ns = log_time_ns
+        if not self._filter.by_sensor:
+            if topic == graph.FUSED:
+                self._filter.on_fused(_decoded(cdr)[0], log_time_ns)
+        elif topic in self._sensors:
+            self._seen(self._sensors[topic], _decoded(cdr), log_time_ns)
+        elif topic == graph.CALIBRATION_CLOCK:
+            self._filter.set_clock(*time_reference_to_clock(deserialize(TIME_REFERENCE, cdr)))
+        elif topic == graph.CALIBRATION:
+            self._filter.set_pose(transform_to_pose(deserialize(TRANSFORM, cdr)))
+
+    def _seen(self, sensor: str, skeletons: tuple[Skeleton, ...], log_time_ns: int) -> None:
+        stamp = skeletons[0].stamp_ns
+        if stamp < self._last_ns.get(sensor, stamp) - JUMP_BACK_NS:
+            self._filter.sensor_jumped_back(sensor)
+        self._last_ns[sensor] = stamp
+        self._filter.on_sensor(sensor, skeletons, log_time_ns)
+
+    def _filtered(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
+        """What the filter publishes."""
+        self._writer.write(topic, cdr, self._now_ns)
+        if topic == graph.FILTERED and not self._of_model:
+            (arrived,) = _decoded(cdr)
+            self._publish(self._angles.of_skeleton(arrived), arrived.frame_id)
+        elif topic == graph.MODEL_STATE:
+            self._model_state = cdr
+        elif topic == graph.MODEL_COVARIANCE and self._of_model:
+            model = self._angles.model
+            state, covariance = decode_model_state(self._model_state, model), decode_covariance(cdr, model)
+            assert state is not None
+            assert covariance is not None
+            _, frame_id, q, velocity = state
+            estimate = state_estimate(model, stamp_ns, frame_id, q, velocity, covariance[1])
+            self._publish(self._angles.of_estimate(estimate), frame_id)
+
+    def _publish(self, angles: JointAngles | None, frame_id: str) -> None:
+        if angles is not None:
+            states, stddevs = encode_angles(angles, self._body, frame_id)
+            self._writer.write(self._states, states, self._now_ns)
+            self._writer.write(self._stddevs, stddevs, self._now_ns)
+            self._frames += 1
 
     def finish(self) -> Written:
         """Close the bag; one without angles is removed again."""
@@ -200,10 +291,8 @@ class Downstream:
         self._writer.discard()
 
 
-def _decoded(cdr: bytes) -> Skeleton:
-    skeletons = decode_skeletons(cdr)
-    assert skeletons is not None
-    return skeletons[0]
+def _decoded(cdr: bytes) -> tuple[Skeleton, ...]:
+    return decode_skeletons(cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, cdr))
 
 
 class ForkedDownstream:
@@ -292,6 +381,7 @@ def start_downstream(
     Raises:
         BagError: ``out`` cannot be written.
         FilterError: the filter or its parameters make no sense.
+        GraphError: the filter cannot do what it was asked for.
     """
     if hasattr(os, "fork") and len(os.sched_getaffinity(0)) > 1 and threading.active_count() == 1:
         return ForkedDownstream(settings, out, topics, overwrite=overwrite)

@@ -14,8 +14,15 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
-from body_tracking.filters import FILTERS, FilterError, LinearKalmanFilter, LinearKalmanParameters, make_filter
-from body_tracking.filters.linear import CONSTANT_VELOCITY, ZERO_VELOCITY
+from body_tracking.filters import make_filter
+from body_tracking.filters.linear import (
+    CONSTANT_VELOCITY,
+    LINEAR_MODELS,
+    ZERO_VELOCITY,
+    FilterError,
+    LinearKalmanFilter,
+    LinearKalmanParameters,
+)
 from body_tracking.kinematics.motion import joint_densities
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
@@ -48,7 +55,7 @@ def run(
     return [result for result in results if result is not None]
 
 
-@pytest.mark.parametrize("model", FILTERS)
+@pytest.mark.parametrize("model", LINEAR_MODELS)
 def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
     """Random covariances, uneven time steps, joints that come and go; every state and covariance to 1e-12."""
     rng = np.random.default_rng(1)
@@ -94,7 +101,7 @@ def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
                 assert_allclose(result.velocities[joint], single.x[3:, 0], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("model", FILTERS)
+@pytest.mark.parametrize("model", LINEAR_MODELS)
 @given(split=st.floats(0.05, 0.95), step_ms=st.integers(10, 400))
 @settings(max_examples=25, deadline=None)
 def test_two_part_steps_of_prediction_equal_the_whole(model: str, split: float, step_ms: int) -> None:
@@ -127,7 +134,7 @@ def random_motion(tracker: LinearKalmanFilter, rng: np.random.Generator, frames:
     return np.asarray(BODY + np.cumsum(velocity * step + kicks[..., 0], axis=0))
 
 
-@pytest.mark.parametrize("model", FILTERS)
+@pytest.mark.parametrize("model", LINEAR_MODELS)
 def test_innovations_of_data_that_fits_the_model_are_chi_square(model: str) -> None:
     """NIS of white noise on a motion of the assumed density: the mean within its 99.9 % band, few beyond the gate."""
     rng = np.random.default_rng(2)
@@ -231,7 +238,7 @@ def test_the_slow_part_of_the_noise_opens_the_gate_and_stays_in_the_covariance()
     assert tracker.counters["rejected"] == 0
 
 
-@pytest.mark.parametrize("model", FILTERS)
+@pytest.mark.parametrize("model", LINEAR_MODELS)
 def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
     tracker = LinearKalmanFilter(model)
     start = 100 * NANOSECONDS
@@ -252,7 +259,7 @@ def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
     assert_allclose(other.positions, BODY + 2.0)
 
 
-@pytest.mark.parametrize("model", FILTERS)
+@pytest.mark.parametrize("model", LINEAR_MODELS)
 @given(
     positions=arrays(np.float64, (N_JOINTS, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
     states=arrays(np.uint8, (N_JOINTS,), elements=st.integers(0, 2)),
@@ -304,7 +311,7 @@ def test_a_steady_motion_is_followed_without_lag() -> None:
 
 
 def test_names_and_parameters_are_checked() -> None:
-    assert {make_filter(name, gate_probability=0.99).counters["frames"] for name in FILTERS} == {0}
+    assert {make_filter(name, gate_probability=0.99).counters["frames"] for name in LINEAR_MODELS} == {0}
     with pytest.raises(FilterError, match="unknown filter 'ekg'"):
         make_filter("ekg")
     with pytest.raises(FilterError, match="unknown parameter"):

@@ -124,6 +124,23 @@ def test_a_clock_that_jumps_back_starts_anew_and_poses_hold() -> None:
     assert_allclose(pushed(made, "kinect2", seen("kinect2", 0.5)).positions, truth(np.array([0.5]))[0], atol=1e-9)
 
 
+@pytest.mark.parametrize("off", [-5.0, 5.0])
+def test_a_sensor_that_counts_from_another_beginning_is_left_out_until_its_clock_is_known(off: float) -> None:
+    made = alignment()
+    taken = []
+    for number in range(60):
+        time = 10.0 + number * FRAME
+        pushed(made, "kinect1", seen("kinect1", time))
+        other = seen("kinect2", time + 0.011)
+        if number >= 20:
+            other = replace(other, stamp_ns=other.stamp_ns + round(off * NANOSECONDS))
+        if number == 40:
+            made.set_clock("kinect2", round(time * NANOSECONDS), ClockModel(OFFSET_NS + round(off * NANOSECONDS)))
+        taken.append(made.push("kinect2", other) is not None)
+    # Of one from the past that is clear at once, of one from the future when the reference's next frame comes.
+    assert taken == [True] * 20 + [off > 0.0] + [False] * 19 + [True] * 20
+
+
 def test_a_late_frame_goes_on_as_it_is() -> None:
     made = alignment()
     pushed(made, "kinect1", seen("kinect1", 1.0))
