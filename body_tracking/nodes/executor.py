@@ -107,40 +107,42 @@ class LeanExecutor(SingleThreadedExecutor):
                 wait_set.wait(-1)
                 if not self._context.ok():
                     return
-                executed = _execute_timers(timers, wait_set) + _execute_subscriptions(subscriptions, wait_set)
+                executed = _execute_timers(timers)
+                for subscription, taken in _take_all(subscriptions, wait_set):
+                    executed += 1 + _execute_timers(timers)
+                    if self._stopped:
+                        return
+                    only_message = subscription._callback_type is _MESSAGE_ONLY
+                    subscription.callback(*(taken[:1] if only_message else taken))
                 if not executed and not self._changed:
                     self._spin_once_impl(0)
 
 
-def _execute_subscriptions(subscriptions: list[Any], wait_set: Any) -> int:
-    """Take one message of each topic that has any, and handle them in the order in which they were sent.
+def _take_all(subscriptions: list[Any], wait_set: Any) -> list[tuple[Any, Any]]:
+    """All messages that are there, each with its subscription, in the order in which they were sent.
 
-    Two sensors' frames that wait together are then handled as an offline run reads them from the recording.
+    However far a node lags behind, it then handles several sensors' frames as an offline run reads them from the
+    recording.
     """
-    ready = wait_set.get_ready_entities("subscription")
-    executed = 0
     arrived: list[tuple[int, int, Any]] = []
-    for index, subscription in enumerate(subscriptions if ready else ()):
-        handle = subscription.handle
-        if handle.pointer not in ready:
-            continue
-        executed += 1
-        taken = handle.take_message(subscription.msg_type, subscription.raw)
-        if taken is not None:
-            arrived.append((taken[1]["source_timestamp"], index, taken))
+    found = bool(wait_set.get_ready_entities("subscription"))
+    # Until a look at every topic finds nothing: what was sent before a message that is taken has come before it, but
+    # maybe after its own topic was looked at.
+    while found:
+        found = False
+        for index, subscription in enumerate(subscriptions):
+            while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+                found = True
+                arrived.append((taken[1]["source_timestamp"], index, taken))
     arrived.sort(key=lambda each: each[:2])
-    for _, index, taken in arrived:
-        subscription = subscriptions[index]
-        subscription.callback(*(taken[:1] if subscription._callback_type is _MESSAGE_ONLY else taken))
-    return executed
+    return [(subscriptions[index], taken) for _, index, taken in arrived]
 
 
-def _execute_timers(timers: list[Timer], wait_set: Any) -> int:
-    ready = wait_set.get_ready_entities("timer")
+def _execute_timers(timers: list[Timer]) -> int:
     executed = 0
-    for timer in timers if ready else ():
-        # A timer that was cancelled meanwhile is still among those that woke us.
-        if timer.handle.pointer in ready and timer.handle.is_timer_ready():
+    for timer in timers:
+        # One that is cancelled is not ready.
+        if timer.handle.is_timer_ready():
             executed += 1
             timer.handle.call_timer()
             timer.callback()

@@ -92,6 +92,24 @@ def test_messages_timers_and_services_are_served_while_others_come_and_go(node: 
     assert spinning.ended is ExternalShutdownException
 
 
+def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy.node.Node) -> None:
+    handled: list[int] = []
+    topics = ("one", "two", "three")
+    publishers = [node.create_publisher(String, topic, 100) for topic in topics]
+    for topic in topics:
+        node.create_subscription(String, topic, lambda message: handled.append(int(message.data)), 100)
+    assert until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
+    # Not in turn: some topics have more to tell, and first others.
+    order = random.Random(3).choices(range(3), weights=(1, 3, 6), k=120)
+    for number, topic in enumerate(order):
+        publishers[topic].publish(String(data=str(number)))
+    spinning = Spinning(node)
+    assert until(lambda: len(handled) == len(order))
+    assert handled == list(range(len(order)))
+    rclpy.shutdown()
+    spinning.thread.join(10.0)
+
+
 def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
     spinning = Spinning(node)
     time.sleep(0.3)
