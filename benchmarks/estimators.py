@@ -4,8 +4,7 @@ The truth is made with ``upper_body`` itself: people of random proportions whose
 curves within ranges of motion, on a base that sways and turns. Every estimator is given the true segment lengths, and
 the peers their true first pose as well. A peer is shown as it comes, and with the settings that a search found to give
 the least angle error when the truth is known, for each scenario anew (``peers/tuned.json``; ``--search`` repeats it).
-biorbd is shown once more with both axial rotations of the spine locked, which leaves it nothing undetermined: what it
-estimates of the other angles then is its best.
+biorbd is shown once more with both axial rotations of the spine locked at zero, which leaves nothing undetermined.
 
 Columns: RMSE of all 26 joint angles; of the 22 that the points determine (see ``UNOBSERVED`` of the model); of the
 hidden arm's 7 angles while it is hidden; RMS distance of the 19 points from the truth; jitter; median processor time of
