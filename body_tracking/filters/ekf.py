@@ -60,7 +60,7 @@ _THIRD_DIFFERENCE_SPAN = 0.25
 """Seconds beyond which four frames in a row show motion, not noise."""
 _MEDIAN_OF_CHI2_3 = 0.7887
 """Median of the mean of three squared normal deviates."""
-_NOISE_FRAMES = 120.0
+_NOISE_FRAMES = 600.0
 """Frames over which the white noise of a point is averaged."""
 _POOL = 8.0
 """Frames from which on a point's own noise counts alone."""
@@ -75,6 +75,7 @@ _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
+_SHORTEST_STEP = 0.005
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 6.0, 4.0
@@ -84,6 +85,10 @@ _UNKNOWN = 0.85
 """Share of the range's deviation from which an angle counts as unknown."""
 _LIMIT_STDDEV = 3.0
 """Degrees: how softly limits push back, each time."""
+_HARD_STDDEV = 0.2
+_PROJECTIONS = 3
+_FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
+"""An estimate farther beyond a range than the first is brought back to the second."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
@@ -128,13 +133,13 @@ class EkfParameters:
         12.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
     )
     density_rate: float = _parameter(
-        0.3, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
+        0.1, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
     )
     white_stddev: float = _parameter(
         0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
     )
     slow_scale: float = _parameter(
-        0.02,
+        0.0,
         "variance of a sensor's slow errors before it is learnt, as a share of the measurement model's",
         "1",
         0.0,
@@ -293,6 +298,7 @@ class ExtendedKalmanFilter:
                 "measured",
                 "rejected",
                 "restarts",
+                "branches",
                 "repeated_stamps",
                 "late_frames",
                 "too_late",
@@ -371,7 +377,7 @@ class ExtendedKalmanFilter:
         state = self._state
         if state is None or stamp_ns - int(state.used_ns.max()) > self.parameters.predict_for * NANOSECONDS:
             return None
-        state = self._predicted(state, stamp_ns)
+        state = self._within(self._predicted(state, stamp_ns))
         empty = Skeleton(
             stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body
         )
@@ -449,7 +455,7 @@ class ExtendedKalmanFilter:
             state = self._reacquired(state, measurement)
         elif state.strain > _STRAINED:
             state = self._straightened(state, measurement)
-        return self._bounded(state)
+        return self._within(self._bounded(state))
 
     def _predicted(self, state: _State, stamp_ns: int) -> _State:
         """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
@@ -518,7 +524,8 @@ class ExtendedKalmanFilter:
         sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
         lines = self.model.linearise(state.q, state.lengths)
         observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
-        innovation = (measurement.positions - lines.posture.positions).reshape(-1)
+        curvature = self.model.curvature(lines, state.covariance[self._tangent, self._tangent])
+        innovation = (measurement.positions - lines.posture.positions - curvature).reshape(-1)
 
         cross_covariance = state.covariance[:, : self._observed] @ observation.T
         seen = observation @ cross_covariance[: self._observed]
@@ -533,7 +540,9 @@ class ExtendedKalmanFilter:
                 seen += both + both.T
                 cross_covariance = cross_covariance + sensor.cross @ basis.T
         s = seen.copy()
-        s[rows, rows] += np.repeat(sensor.white, 3)
+        # A normal error x makes x^2 / 2 of mean m and of variance 2 m^2, and it stays for the filter's memory.
+        persistent = 2.0 * max(1.0, _WHITENESS_TIME / max(dt, _SHORTEST_STEP))
+        s[rows, rows] += np.repeat(sensor.white, 3) + persistent * curvature.reshape(-1) ** 2
         diagonal = np.arange(self._points)
         own = s.reshape(self._points, 3, self._points, 3)[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
@@ -982,12 +991,56 @@ class ExtendedKalmanFilter:
         known = np.sqrt(state.covariance.diagonal()[self._lengths]).max() < self.parameters.settle_stddev
         settled = state.settled or bool(known) or state.tracked > self.parameters.settle_time
         state = replace(state, since_prior=0.0, settled=settled)
+        branch = self.ranges.nearest_branch(state.q)
+        if branch is not None:
+            return self._turned(state, *branch)
         if unknown.any():
             state = self._told(state, gradients[unknown], -values[unknown], noise[unknown])
         beyond = excess != 0.0
         if beyond.any():
             state = self._pushed_back(state, gradients[:-1][beyond], excess[beyond])
         return state
+
+    def _turned(self, state: _State, q: FloatArray, signs: FloatArray) -> _State:
+        """The same state told by another configuration, whose tangent has other signs (32,)."""
+        self.counters["branches"] += 1
+        both = np.concatenate([signs, np.ones(self._nl), signs])
+        sensors = {
+            name: sensor if sensor.cross is None else replace(sensor, cross=sensor.cross * both[:, None])
+            for name, sensor in state.sensors.items()
+        }
+        return replace(
+            state,
+            q=q,
+            velocity=state.velocity * signs,
+            covariance=state.covariance * both * both[:, None],
+            moved=state.moved * signs,
+            sensors=sensors,
+        )
+
+    def _within(self, state: _State) -> _State:
+        """The nearest state, by the covariance, that is not far beyond any range of motion.
+
+        Softly a range pushes back ten times a second; a velocity that runs on while nothing is seen, or a measurement
+        that no body can follow, is stopped here at once.
+        """
+        for _ in range(_PROJECTIONS):
+            excess = self.ranges.excess(state.q)
+            size = np.abs(excess)
+            far = size > _FAR_BEYOND
+            if not far.any():
+                return state
+            gradients = self.ranges.soft_coordinates(state.q).gradients[far]
+            observation = np.zeros((len(gradients), self._nv))
+            observation[:, 6:] = gradients
+            back = excess[far] * (1.0 - _BACK_TO / size[far])
+            state = self._pushed_back(state, observation, back, _HARD_STDDEV)
+            velocity = state.velocity.copy()
+            rate = gradients @ velocity[6:]
+            outward = rate * excess[far] > 0.0
+            velocity[6:] -= gradients.T @ np.where(outward, rate, 0.0)
+            state = replace(state, velocity=velocity)
+        return replace(state, q=self.ranges.clipped(state.q, _FAR_BEYOND))
 
     def _told(self, state: _State, observation: FloatArray, error: FloatArray, noise: FloatArray) -> _State:
         """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,)."""
@@ -1012,14 +1065,16 @@ class ExtendedKalmanFilter:
         }
         return self._moved(replace(state, covariance=covariance, sensors=sensors), white @ gain)
 
-    def _pushed_back(self, state: _State, observation: FloatArray, excess: FloatArray) -> _State:
+    def _pushed_back(
+        self, state: _State, observation: FloatArray, excess: FloatArray, stddev: float = _LIMIT_STDDEV
+    ) -> _State:
         """The nearest state, by the covariance, within the limits; softly (Simon 2010, projection of the estimate).
 
         The covariance stays: that an angle is within its limits does not tell where.
         """
         cross_covariance = state.covariance[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent]
-        s[np.arange(len(s)), np.arange(len(s))] += np.radians(_LIMIT_STDDEV) ** 2
+        s[np.arange(len(s)), np.arange(len(s))] += np.radians(stddev) ** 2
         return self._moved(state, -cross_covariance @ np.linalg.solve(s, excess))
 
     def _moved(self, state: _State, correction: FloatArray) -> _State:

@@ -155,6 +155,10 @@ class InverseKinematics:
                 damping *= 10.0
                 if damping > 1e8:
                     break
+        branch = self.ranges.nearest_branch(q)
+        if branch is not None:
+            q = branch[0]
+            normal = self._normal_equations(q, target, weights, lengths)[0]
         fitted = self.model.forward(q, lengths).positions
         residuals = np.where(measured[:, None], positions - fitted, np.nan)
         covariance = np.linalg.inv(normal).astype(np.float64)

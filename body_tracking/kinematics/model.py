@@ -1,8 +1,8 @@
 """What every body model offers, whatever body it is: the interface that filters and conversions are written against.
 
-The words are those of Pinocchio: a configuration ``q`` of size ``nq`` holds quaternions (x, y, z, w) where a rotation is
-free, a tangent vector ``v`` of size ``nv`` is a small change of it. Everything takes leading dimensions, of instants or
-people. World: x forward, y left, z up (REP-103), metres, radians.
+The words are those of Pinocchio: a configuration ``q`` of size ``nq`` holds quaternions (x, y, z, w) where a rotation
+is free, a tangent vector ``v`` of size ``nv`` is a small change of it. Everything takes leading dimensions, of instants
+or people. World: x forward, y left, z up (REP-103), metres, radians.
 """
 
 from __future__ import annotations

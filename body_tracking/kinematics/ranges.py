@@ -51,6 +51,20 @@ _REACH["right"] = _REACH["left"] * [1.0, -1.0, 1.0]
 """Where the centre of the reach is, in the clavicle's frame: horizontally, half forward and half to the side."""
 
 
+_HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
+"""Quaternion xyzw of half a turn about z."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Arm:
+    """Where configuration and tangent hold the angles of one arm."""
+
+    elbow_q: int
+    elbow_v: int
+    pronation_q: int
+    shoulder_v: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftCoordinates:
     """The quantities that ranges are about, at one configuration.
@@ -96,6 +110,16 @@ class Ranges:
         self._quaternions: IntArray = np.array(
             [[model.quaternion_of(f"upper_arm_{side}").start + k for k in range(4)] for side in _REACH], dtype=np.intp
         )
+        place = {names[v]: int(q) for v, q in zip(model.scalar_v, model.scalar_q, strict=True)}
+        self._arms = {
+            side: _Arm(
+                place[f"elbow_flexion_{side}"],
+                names.index(f"elbow_flexion_{side}"),
+                place[f"forearm_pronation_{side}"],
+                names.index(f"shoulder_x_{side}"),
+            )
+            for side in _REACH
+        }
         hanging = np.array([0.0, 0.0, -1.0])
         self._to_centre: FloatArray = so3.quat_inverse(
             so3.exp(np.array([0.5 * np.pi * np.cross(hanging, reach) for reach in _REACH.values()]))
@@ -103,10 +127,8 @@ class Ranges:
 
     def soft_coordinates(self, q: FloatArray) -> SoftCoordinates:
         """The bounded quantities of configurations (..., nq)."""
-        values = np.empty((*q.shape[:-1], len(self.low)))
-        values[..., self._scalar_soft] = q[..., self._model.scalar_q]
-        turned = so3.log(so3.quat_multiply(self._to_centre, q[..., self._quaternions]))
-        values[..., self._soft] = turned
+        values = self._values(q)
+        turned = values[..., self._soft]
         gradients = np.zeros((*values.shape, len(self.low)))
         gradients[...] = np.eye(len(self.low))
         jacobian = so3.right_jacobian_inverse(turned)
@@ -114,12 +136,18 @@ class Ranges:
             gradients[..., rows[:, None], rows] = jacobian[..., side, :, :]
         return SoftCoordinates(values, gradients)
 
+    def _values(self, q: FloatArray) -> FloatArray:
+        values = np.empty((*q.shape[:-1], len(self.low)))
+        values[..., self._scalar_soft] = q[..., self._model.scalar_q]
+        values[..., self._soft] = so3.log(so3.quat_multiply(self._to_centre, q[..., self._quaternions]))
+        return values
+
     def excess(self, q: FloatArray) -> FloatArray:
         """(..., 26) radians by which configurations (..., nq) leave the ranges; 0 inside.
 
         The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
         """
-        return self.excess_of(self.soft_coordinates(q).values)
+        return self.excess_of(self._values(q))
 
     def excess_of(self, values: FloatArray) -> FloatArray:
         """The same of the values (..., 26) of :class:`SoftCoordinates`."""
@@ -130,3 +158,49 @@ class Ranges:
             over = np.maximum(size - np.radians(SHOULDER_SWING), 0.0)
             excess[..., rows[:2]] = swing * (over / np.maximum(size, 1e-12))
         return excess
+
+    def clipped(self, q: FloatArray, margin: float) -> FloatArray:
+        """(nq,) a configuration with all that turns about axes at most a margin (radians) beyond its range."""
+        rows = self._model.scalar_v - 6
+        clipped = q.copy()
+        clipped[self._model.scalar_q] = np.clip(
+            q[self._model.scalar_q], self.low[rows] - margin, self.high[rows] + margin
+        )
+        return clipped
+
+    def nearest_branch(self, q: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """The same posture told by angles that leave the ranges less.
+
+        An upper arm turned by half a turn about itself, the elbow bent the other way and the forearm turned by half a
+        turn put everything where it was. A fit to points can come out in either branch; the ranges tell them apart.
+
+        Args:
+            q: (nq,) one configuration.
+
+        Returns:
+            The other configuration, and (nv,) factors 1 or -1 that turn its tangent into the old one's; None where the
+            present branch is as good.
+        """
+        found = q
+        signs = np.ones(self._model.nv)
+        for side, arm in self._arms.items():
+            if found[arm.elbow_q] >= 0.0 and abs(found[arm.pronation_q]) <= np.pi:
+                continue
+            other = found.copy()
+            other[arm.pronation_q] = np.remainder(found[arm.pronation_q] + np.pi, 2.0 * np.pi) - np.pi
+            candidates = [(other, False)]
+            if found[arm.elbow_q] < 0.0:
+                flipped = other.copy()
+                upper_arm = self._model.quaternion_of(f"upper_arm_{side}")
+                flipped[upper_arm] = so3.quat_multiply(found[upper_arm], _HALF_TURN)
+                flipped[arm.elbow_q] = -found[arm.elbow_q]
+                flipped[arm.pronation_q] = np.remainder(found[arm.pronation_q], 2.0 * np.pi) - np.pi
+                candidates.append((flipped, True))
+            least = np.abs(self.excess(found)).sum()
+            for candidate, turned in candidates:
+                outside = np.abs(self.excess(candidate)).sum()
+                if outside < least - 1e-9:
+                    found, least = candidate, outside
+                    if turned:
+                        signs[[arm.shoulder_v, arm.shoulder_v + 1, arm.elbow_v]] *= -1.0
+        return None if found is q else (found, signs)

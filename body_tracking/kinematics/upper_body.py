@@ -248,6 +248,11 @@ class UpperBody:
             segment for segment, part in enumerate(self.segment_coordinates) for _ in range(part.start, part.stop)
         ]
         self._centre_segment: IntArray = np.array(carrier, dtype=np.intp)
+        # of each pair of coordinates the second derivative has the earlier axis outside; of a ball's both by half
+        same = self._centre_segment[:, None] == self._centre_segment
+        ball = same & np.isin(self._centre_segment, ball_segments)
+        later = np.triu(np.ones((self.nv - 3, self.nv - 3)), 1)
+        self._pairs = np.where(ball, 0.5, later) * (1.0 - np.eye(self.nv - 3)) + 0.5 * np.eye(self.nv - 3)
 
     def _place_directions(self, scalar_segments: list[int], ball_segments: list[int]) -> None:
         """Where the axis of each rotational coordinate is a column, or its opposite, of a rotation in world.
@@ -358,6 +363,25 @@ class UpperBody:
         np.multiply(columns[..., None, :, :], self._turns, out=turning[..., 3:])
         by_lengths = self._counts[:, None, :] * along.swapaxes(-1, -2)[..., None, :, :]
         return Linearisation(posture, jacobian, by_lengths, turning)
+
+    def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
+        """Where the points are on average, beside where they are at the mean of the configuration.
+
+        A point that swings about a joint stays behind its tangent: to second order by half the sum over all pairs of
+        coordinates of their covariance and the point's second derivative, axis x (derivative by the later one).
+
+        Args:
+            lines: the linearisation at the mean, of one configuration.
+            covariance: (32, 32) of the tangent.
+
+        Returns:
+            (19, 3) metres.
+        """
+        axes = lines.rotation_jacobian[self._centre_segment, :, np.arange(3, self.nv)]
+        behind = lines.jacobian[..., 3:] @ (covariance[3:, 3:] * self._pairs).T * -self._minus_moves
+        swung = np.ascontiguousarray(behind.swapaxes(1, 2)).reshape(len(behind), -1)
+        result: FloatArray = swung @ so3.skew(axes).swapaxes(1, 2).reshape(-1, 3)
+        return result
 
     def _frames(self, q: FloatArray) -> FloatArray:
         """(..., 14, 3, 3) rotations in world: of the segments, then of the middle axes of the joints with three."""
