@@ -1,0 +1,584 @@
+"""The extended filter follows people it was never told of, knows how well, and survives what sensors do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.upper_body import UNOBSERVED
+from body_tracking.simulation.random_people import (
+    ARMS,
+    EVERYTHING,
+    MODEL,
+    START_NS,
+    Dropout,
+    MeasurementErrors,
+    Observation,
+    RandomMotion,
+    RandomPerson,
+    Truth,
+    capture_times,
+    observe,
+    truth_of,
+)
+from body_tracking.skeleton import (
+    MIRROR,
+    N_JOINTS,
+    NANOSECONDS,
+    FloatArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
+
+POINTS = MODEL.joints
+OBSERVED = np.array([number for number, name in enumerate(MODEL.coordinate_names) if name not in UNOBSERVED])
+NOISE = 0.02
+START_FRAMES = 4
+"""The first output comes with this frame of a sensor."""
+SETTLED = 1.0
+"""Seconds after which the filter knows noise, pose and velocities."""
+
+
+def somebody(seed: int, seconds: float, rate: float = 30.0, tempo: float | None = None) -> Truth:
+    rng = np.random.default_rng(seed)
+    person = RandomPerson.draw(rng)
+    return truth_of(person, RandomMotion(rng, seconds, tempo), capture_times(seconds, rng, rate))
+
+
+def measured(truth: Truth, noise: float = NOISE, seed: int = 0, **errors: object) -> Observation:
+    return observe(truth, MeasurementErrors(noise, **errors), np.random.default_rng(seed))  # type: ignore[arg-type]
+
+
+def run(estimator: ExtendedKalmanFilter, skeletons: Iterable[Skeleton], sensor: str = "") -> list[Skeleton | None]:
+    return [estimator.update(skeleton, sensor) for skeleton in skeletons]
+
+
+def errors_of(outputs: Sequence[Skeleton | None], truth: Truth, after: float = SETTLED) -> FloatArray:
+    """(n, 19) metres between the output and the truth, of the frames with an output after so many seconds."""
+    frames = [k for k, output in enumerate(outputs) if output is not None and truth.times[k] >= after]
+    positions = np.stack([output.positions[POINTS] for k in frames if (output := outputs[k]) is not None])
+    errors: FloatArray = np.linalg.norm(positions - truth.positions[frames], axis=-1)
+    return errors
+
+
+def rms(errors: FloatArray) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def known(estimator: ExtendedKalmanFilter) -> ModelEstimate:
+    estimate = estimator.estimate
+    assert estimate is not None
+    return estimate
+
+
+def stddevs(skeleton: Skeleton) -> FloatArray:
+    """(19,) metres: greatest standard deviation over the axes."""
+    assert skeleton.covariances is not None
+    result: FloatArray = np.sqrt(np.linalg.eigvalsh(skeleton.covariances[POINTS])[:, -1])
+    return result
+
+
+def assert_same(one: ModelEstimate, other: ModelEstimate, tolerance: float) -> None:
+    assert one.stamp_ns == other.stamp_ns
+    for name in ("q", "velocity", "covariance", "lengths", "lengths_stddev"):
+        assert_allclose(getattr(one, name), getattr(other, name), rtol=0.0, atol=tolerance, err_msg=name)
+
+
+def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFilter) -> None:
+    """No NaN, no infinity, no variance below zero."""
+    for output in outputs:
+        if output is not None:
+            assert output.covariances is not None and output.velocities is not None
+            assert np.isfinite(output.positions[POINTS]).all() and np.isfinite(output.velocities[POINTS]).all()
+            assert np.isfinite(output.covariances[POINTS]).all()
+            assert (np.linalg.eigvalsh(output.covariances[POINTS]) > 0.0).all()
+    estimate = estimator.estimate
+    if estimate is not None:
+        for name in ("q", "velocity", "covariance", "lengths", "lengths_stddev"):
+            assert np.isfinite(getattr(estimate, name)).all(), name
+        assert (estimate.covariance.diagonal() > 0.0).all() and (estimate.lengths > 0.0).all()
+
+
+# --- following
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.05])
+def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -> None:
+    truth = somebody(1, 6.0)
+    observation = measured(truth, noise)
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, observation.skeletons)
+    assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(len(outputs))]
+    raw = np.sqrt(3.0) * noise
+    assert rms(errors_of(outputs, truth)) < 0.9 * raw
+    last = outputs[-1]
+    assert last is not None and last.velocities is not None
+    assert_array_equal(last.states[POINTS], TrackingState.TRACKED)
+    others = np.setdiff1d(np.arange(N_JOINTS), POINTS)
+    assert_array_equal(last.states[others], TrackingState.NOT_TRACKED)
+    assert_sound(outputs, estimator)
+
+
+def test_its_uncertainty_is_true() -> None:
+    """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees."""
+    for_angles, for_points, for_lengths = [], [], []
+    for seed in range(5):
+        truth = somebody(20 + seed, 6.0)
+        observation = measured(truth, 0.01 + 0.005 * seed, seed)
+        estimator = ExtendedKalmanFilter()
+        for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
+            output = estimator.update(skeleton)
+            if output is None or truth.times[k] < SETTLED:
+                continue
+            estimate = known(estimator)
+            error = MODEL.difference(estimate.q, truth.q[k])[OBSERVED]
+            for_angles.append(error @ np.linalg.solve(estimate.covariance[np.ix_(OBSERVED, OBSERVED)], error))
+            assert output.covariances is not None
+            off = truth.positions[k] - output.positions[POINTS]
+            for_points.append(np.einsum("pi,pij,pj->p", off, np.linalg.inv(output.covariances[POINTS]), off).mean())
+        estimate = known(estimator)
+        for_lengths.append((((truth.lengths - estimate.lengths) / estimate.lengths_stddev) ** 2).mean())
+    assert 0.5 < np.mean(for_angles) / len(OBSERVED) < 1.6, np.mean(for_angles) / len(OBSERVED)
+    assert 0.5 < np.mean(for_points) / 3.0 < 1.6, np.mean(for_points) / 3.0
+    assert 0.3 < np.mean(for_lengths) < 2.5, for_lengths
+
+
+def test_innovations_are_as_large_as_expected() -> None:
+    truth = somebody(30, 6.0)
+    estimator = ExtendedKalmanFilter()
+    distance, dimension = 0.0, 0
+    for skeleton, time in zip(measured(truth).skeletons, truth.times, strict=True):
+        estimator.update(skeleton)
+        if time >= SETTLED:
+            distance += estimator.innovation_distance
+            dimension += estimator.innovation_dimension
+    assert dimension > 0.95 * 57 * (truth.times >= SETTLED).sum()
+    assert 0.8 < distance / dimension < 1.25
+
+
+def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
+    truth = somebody(2, 8.0)
+    estimator = ExtendedKalmanFilter(EkfParameters(settle_time=4.0))
+    found = []
+    bones = {
+        "upper_arm_left": (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
+        "forearm_right": (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
+        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
+        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
+        "clavicle_right": (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
+        "head": (Joint.NECK, Joint.HEAD),
+    }
+    for skeleton in measured(truth).skeletons:
+        output = estimator.update(skeleton)
+        if output is None:
+            continue
+        estimate = known(estimator)
+        assert_allclose(
+            output.positions[POINTS], MODEL.forward(estimate.q, estimate.lengths).positions, rtol=0.0, atol=1e-12
+        )
+        for name, (start, end) in bones.items():
+            length = np.linalg.norm(output.positions[end] - output.positions[start])
+            assert_allclose(length, estimate.lengths[MODEL.length_names.index(name)], rtol=0.0, atol=1e-9)
+        found.append((skeleton.stamp_ns, estimate.lengths))
+    settled = np.stack([lengths for stamp_ns, lengths in found if stamp_ns > START_NS + 4.2 * NANOSECONDS])
+    assert len(settled) > 100
+    assert np.abs(settled - settled[0]).max() < 1e-9
+    assert np.abs(settled[0] - found[0][1]).max() > 1e-3  # they had been learnt before
+    assert np.abs(settled[0] - truth.lengths).max() < 0.5 * np.abs(found[0][1] - truth.lengths).max()
+
+
+def test_it_does_not_depend_on_the_origin_of_world() -> None:
+    truth = somebody(3, 3.0)
+    origin = np.array([-3.0, 5.0, 0.7])
+    here, there = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for skeleton in measured(truth, outliers=0.02).skeletons:
+        one = here.update(skeleton)
+        other = there.update(replace(skeleton, positions=skeleton.positions + origin))
+        if one is not None and other is not None:
+            assert_allclose(other.positions[POINTS], one.positions[POINTS] + origin, rtol=0.0, atol=1e-6)
+    assert here.counters == there.counters
+
+
+def test_it_knows_no_left_and_right() -> None:
+    """A mirrored person gets the mirrored estimate."""
+    truth = somebody(4, 3.0)
+    mirror = np.array([1.0, -1.0, 1.0])
+    straight, mirrored = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for skeleton in measured(truth, outliers=0.02).skeletons:
+        one = straight.update(skeleton)
+        other = mirrored.update(replace(skeleton.mirrored(), positions=skeleton.positions[MIRROR] * mirror))
+        if one is not None and other is not None:
+            assert_allclose(other.positions[MIRROR][POINTS] * mirror, one.positions[POINTS], rtol=0.0, atol=1e-6)
+    assert straight.counters == mirrored.counters
+
+
+# --- two sensors
+
+
+def test_two_sensors_are_better_than_either_and_the_better_one_counts_more() -> None:
+    """At 20 and 40 mm the plain mean of both would be worse than the better one alone."""
+    results = []
+    for seed in range(4):
+        rng = np.random.default_rng(40 + seed)
+        person, motion = RandomPerson.draw(rng), RandomMotion(rng, 5.0)
+        times = capture_times(5.0, rng, 25.0)
+        sensors: dict[str, tuple[Skeleton, ...]] = {}
+        true: dict[int, FloatArray] = {}
+        for name, delay, noise in (("good", 0.0, 0.02), ("poor", 0.013, 0.04)):
+            truth = truth_of(person, motion, times + delay)
+            sensors[name] = observe(truth, MeasurementErrors(noise), rng).skeletons
+            true |= {each.stamp_ns: at for each, at in zip(sensors[name], truth.positions, strict=True)}
+        row = []
+        for used in (("good",), ("poor",), ("good", "poor")):
+            frames = sorted(
+                ((skeleton, name) for name in used for skeleton in sensors[name]), key=lambda each: each[0].stamp_ns
+            )
+            estimator = ExtendedKalmanFilter()
+            squares = []
+            for skeleton, name in frames:
+                output = estimator.update(skeleton, name)
+                if output is not None and skeleton.stamp_ns > START_NS + SETTLED * NANOSECONDS:
+                    off = output.positions[POINTS] - true[skeleton.stamp_ns]
+                    squares.append((off**2).sum(axis=1).mean())
+            row.append(np.mean(squares))
+        results.append(row)
+    good, poor, both = np.sqrt(np.mean(results, axis=0))
+    assert both < good < poor
+
+
+# --- time
+
+
+def delayed(skeletons: Sequence[Skeleton], longest: float, seed: int, after: int = 15) -> list[Skeleton]:
+    """As they arrive, each late by up to so many seconds; the first few in order."""
+    late = np.random.default_rng(seed).uniform(0.0, longest, len(skeletons))
+    late[:after] = 0.0
+    arrival = [skeleton.stamp_ns + delay * NANOSECONDS for skeleton, delay in zip(skeletons, late, strict=True)]
+    return [skeletons[k] for k in np.argsort(arrival, kind="stable")]
+
+
+def test_late_frames_count_as_if_they_had_come_in_order() -> None:
+    truth = somebody(5, 3.0)
+    skeletons = measured(truth, outliers=0.03).skeletons
+    shuffled = delayed(skeletons, 0.19, 1)
+    in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(in_order, skeletons)
+    outputs = run(late, shuffled)
+    assert late.counters["late_frames"] > 20 and late.counters["too_late"] == 0
+    assert sum(output is None for output in outputs[START_FRAMES:]) == late.counters["late_frames"]
+    assert_same(known(in_order), known(late), 1e-9)
+
+
+def test_late_frames_of_several_sensors_count_as_if_they_had_come_in_order() -> None:
+    rng = np.random.default_rng(6)
+    person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
+    frames = []
+    for number, noise in enumerate((0.01, 0.03)):
+        truth = truth_of(person, motion, capture_times(2.0, rng, 20.0) + 0.017 * number)
+        frames += [(skeleton, f"kinect{number}") for skeleton in measured(truth, noise, number).skeletons]
+    frames.sort(key=lambda each: each[0].stamp_ns)
+    in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for skeleton, name in frames:
+        in_order.update(skeleton, name)
+    name_of = {skeleton.stamp_ns: name for skeleton, name in frames}
+    for skeleton in delayed([skeleton for skeleton, _ in frames], 0.15, 2):
+        late.update(skeleton, name_of[skeleton.stamp_ns])
+    assert late.counters["late_frames"] > 10 and late.counters["too_late"] == 0
+    assert_same(known(in_order), known(late), 1e-9)
+
+
+def test_what_is_too_late_is_dropped_and_counted() -> None:
+    skeletons = measured(somebody(7, 2.0)).skeletons
+    held, others = skeletons[40], [*skeletons[:40], *skeletons[41:50]]
+    estimator = ExtendedKalmanFilter()
+    run(estimator, others)
+    before = known(estimator)
+    assert estimator.update(held) is None  # 0.3 s after its time
+    assert estimator.counters["too_late"] == 1
+    assert_same(before, known(estimator), 0.0)
+
+
+def test_a_repeated_frame_counts_once() -> None:
+    skeletons = measured(somebody(8, 1.0)).skeletons
+    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(once, skeletons)
+    run(twice, skeletons[:START_FRAMES])
+    outputs = run(twice, [skeleton for skeleton in skeletons[START_FRAMES:] for _ in (0, 1)])
+    assert twice.counters["repeated_stamps"] == len(skeletons) - START_FRAMES
+    assert [output is None for output in outputs] == [k % 2 == 1 for k in range(len(outputs))]
+    assert_same(known(once), known(twice), 1e-12)
+
+
+def test_a_start_in_another_order_is_the_same_start() -> None:
+    skeletons = measured(somebody(8, 1.0)).skeletons
+    in_order, shuffled = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(in_order, skeletons)
+    run(shuffled, [skeletons[k] for k in (1, 0, 3, 2)] + list(skeletons[4:]))
+    assert_same(known(in_order), known(shuffled), 1e-9)
+
+
+def test_a_jump_back_in_time_starts_anew_and_is_counted_once() -> None:
+    skeletons = measured(somebody(9, 4.0)).skeletons
+    estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(estimator, skeletons[60:])
+    outputs = run(estimator, skeletons[:30])
+    run(fresh, skeletons[:30])
+    assert estimator.counters["backward_jumps"] == 1
+    assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(30)]
+    assert_same(known(estimator), known(fresh), 1e-12)
+
+
+def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
+    truth = somebody(10, 9.0)
+    observation = measured(truth, gaps=((3.0, 7.0),))
+    estimator = ExtendedKalmanFilter()
+    outputs: list[Skeleton | None] = [None] * len(truth.times)
+    lengths = []
+    for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
+        outputs[k] = estimator.update(skeleton)
+        if estimator.estimate is not None:
+            lengths.append((truth.times[k], known(estimator).lengths))
+    assert estimator.counters["gaps"] == 1
+    before = [each for time, each in lengths if time < 3.0][-1]
+    after = next(each for time, each in lengths if time > 7.0)
+    assert_allclose(after, before, rtol=0.0, atol=1e-12)
+    assert rms(errors_of(outputs, truth, 7.3)) < np.sqrt(3.0) * NOISE
+
+
+def test_another_frame_of_reference_starts_anew() -> None:
+    skeletons = measured(somebody(11, 2.0)).skeletons
+    estimator = ExtendedKalmanFilter()
+    run(estimator, skeletons[:30])
+    moved = [
+        replace(skeleton, frame_id="odom", positions=skeleton.positions + [10.0, 0.0, 0.0]) for skeleton in skeletons
+    ]
+    outputs = run(estimator, moved[30:])
+    assert estimator.counters["frame_changes"] == 1
+    assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(30)]
+    assert outputs[-1] is not None and outputs[-1].frame_id == "odom" == known(estimator).frame_id
+    assert_sound(outputs, estimator)
+
+
+def test_a_reset_forgets_the_person_but_not_the_counters() -> None:
+    skeletons = measured(somebody(12, 1.0)).skeletons
+    estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    assert estimator.estimate is None and estimator.predict(START_NS) is None
+    run(estimator, measured(somebody(13, 1.0)).skeletons)
+    counted = dict(estimator.counters)
+    estimator.reset()
+    assert estimator.estimate is None and estimator.counters == counted
+    run(estimator, skeletons)
+    run(fresh, skeletons)
+    assert_same(known(estimator), known(fresh), 0.0)
+
+
+# --- prediction
+
+
+def test_a_prediction_grows_uncertain_ends_and_changes_nothing() -> None:
+    skeletons = measured(somebody(14, 2.0)).skeletons
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, skeletons)
+    before, last = known(estimator), outputs[-1]
+    assert last is not None
+    spread = [stddevs(last)]
+    limit = estimator.parameters.predict_for
+    for ahead in (0.05, 0.1, 0.3, 1.0, 0.99 * limit):
+        stamp_ns = before.stamp_ns + round(ahead * NANOSECONDS)
+        predicted = estimator.predict(stamp_ns)
+        assert predicted is not None
+        skeleton, estimate = predicted
+        assert skeleton.stamp_ns == estimate.stamp_ns == stamp_ns
+        assert_array_equal(skeleton.states[POINTS], TrackingState.INFERRED)
+        spread.append(stddevs(skeleton))
+    assert (np.diff(np.stack(spread), axis=0) > 0.0).all()
+    assert estimator.predict(before.stamp_ns + round(1.01 * limit * NANOSECONDS)) is None
+    assert_same(before, known(estimator), 0.0)
+
+
+def test_a_prediction_continues_the_movement() -> None:
+    """Of somebody who moves evenly: better than to stay where he was."""
+    rng = np.random.default_rng(15)
+    lengths = RandomPerson.draw(rng).lengths
+    rate = np.zeros(MODEL.nv)
+    rate[[0, 5]] = 0.5, 0.8  # m/s forward, rad/s about the vertical
+    times = capture_times(2.5, rng)
+    q = MODEL.integrate(MODEL.neutral(), times[:, None] * rate)
+    positions = MODEL.forward(q, lengths).positions
+    truth = Truth(times, q, np.tile(rate, (len(times), 1)), lengths, positions, np.zeros(positions.shape[:2]))
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, measured(truth, 0.01).skeletons[:60])
+    last, predicted = outputs[-1], estimator.predict(START_NS + round(times[66] * NANOSECONDS))
+    assert last is not None and predicted is not None
+    stay, go_on = (rms(each.positions[POINTS] - truth.positions[66]) for each in (last, predicted[0]))
+    assert go_on < 0.5 * stay
+
+
+def test_an_arm_that_is_missing_is_predicted_and_comes_back() -> None:
+    truth = somebody(16, 4.0, tempo=0.6)
+    lost = np.isin(POINTS, ARMS["LEFT"])
+    during = (truth.times >= 2.0) & (truth.times < 2.5)
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, measured(truth, dropouts=(Dropout(2.0, 2.5, ARMS["LEFT"]),)).skeletons)
+    spread = []
+    for k, output in enumerate(outputs[START_FRAMES:], START_FRAMES):
+        assert output is not None
+        expected = np.where(lost & during[k], TrackingState.INFERRED, TrackingState.TRACKED)
+        if truth.times[k] < 3.0:
+            assert_array_equal(output.states[POINTS], expected)
+        if during[k]:
+            spread.append(stddevs(output)[lost])
+    before = outputs[int(np.flatnonzero(during)[0]) - 1]
+    assert before is not None
+    grown = np.stack([stddevs(before)[lost], *spread])
+    assert (np.diff(grown, axis=0) > 0.0).all() and (grown[-1] > 3.0 * grown[0]).all()
+    assert rms(errors_of(outputs, truth, 2.7)) < np.sqrt(3.0) * NOISE
+    assert_sound(outputs, estimator)
+
+
+def test_frames_without_anybody_are_predicted() -> None:
+    truth = somebody(17, 3.0)
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, measured(truth, dropouts=(Dropout(1.5, 2.0, EVERYTHING),)).skeletons)
+    blind = [output for k, output in enumerate(outputs) if 1.5 <= truth.times[k] < 2.0]
+    assert len(blind) > 10
+    spread = []
+    for output in blind:
+        assert output is not None
+        assert_array_equal(output.states[POINTS], TrackingState.INFERRED)
+        spread.append(stddevs(output))
+    assert (np.diff(np.stack(spread), axis=0) > 0.0).all()
+    assert rms(errors_of(outputs, truth, 2.2)) < np.sqrt(3.0) * NOISE
+
+
+# --- bad data
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) -> None:
+    truth = somebody(50 + seed, 1.5)
+    rng = np.random.default_rng(seed)
+    wrong = np.zeros(MODEL.nv)
+    wrong[6:] = np.radians(rng.uniform(-60.0, 60.0, MODEL.nv - 6))
+    estimator = ExtendedKalmanFilter()
+    estimator.start(MODEL.integrate(truth.q[0], wrong), stamp_ns=START_NS)
+    outputs = run(estimator, measured(truth, seed=seed).skeletons)
+    assert outputs[1] is not None  # a start that is given needs no frames
+    assert rms(errors_of(outputs, truth, 1.0)) < np.sqrt(3.0) * NOISE + 0.01
+
+
+def test_outliers_hardly_matter() -> None:
+    """5 % of the points are off by up to 1 m."""
+    clean: list[float] = []
+    bad: list[float] = []
+    for seed in range(2):
+        truth = somebody(60 + seed, 5.0)
+        for errors, share in ((clean, 0.0), (bad, 0.05)):
+            estimator = ExtendedKalmanFilter()
+            outputs = run(estimator, measured(truth, seed=seed, outliers=share).skeletons)
+            errors.append(rms(errors_of(outputs, truth)))
+            if share:
+                assert estimator.counters["rejected"] > 0.7 * share * 19 * len(outputs)
+    assert np.mean(bad) < 1.4 * np.mean(clean)
+    assert max(bad) < np.sqrt(3.0) * NOISE
+
+
+DAMAGES = (
+    "nan_positions",
+    "infinite_positions",
+    "far_positions",
+    "everything_nan",
+    "nothing_tracked",
+    "nan_covariances",
+    "zero_covariances",
+    "negative_covariances",
+    "infinite_covariances",
+    "huge_covariances",
+    "tiny_covariances",
+)
+
+
+def damaged(skeleton: Skeleton, damage: str, rng: np.random.Generator) -> Skeleton:
+    some = rng.random(N_JOINTS) < 0.3
+    positions, states = skeleton.positions.copy(), skeleton.states.copy()
+    values = {
+        "nan_positions": np.nan,
+        "infinite_positions": -np.inf,
+        "far_positions": rng.choice([150.0, -1e6, 1e300]),
+        "nan_covariances": np.nan,
+        "zero_covariances": 0.0,
+        "negative_covariances": -1e-3,
+        "infinite_covariances": np.inf,
+        "huge_covariances": 1e12,
+        "tiny_covariances": 1e-15,
+    }
+    if damage.endswith("covariances"):
+        covariances = np.tile(NOISE**2 * np.eye(3), (N_JOINTS, 1, 1))
+        covariances[some] *= values[damage] / NOISE**2
+        return replace(skeleton, covariances=covariances)
+    if damage == "everything_nan":
+        positions[:] = np.nan
+    elif damage == "nothing_tracked":
+        states[:] = TrackingState.NOT_TRACKED
+    else:
+        positions[some, rng.integers(3)] = values[damage]
+    return replace(skeleton, positions=positions, states=states)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_numbers_do_no_harm(damage: str) -> None:
+    """In every third frame, from the first one on; the frames between are enough."""
+    truth = somebody(70, 2.5)
+    rng = np.random.default_rng(1)
+    estimator = ExtendedKalmanFilter()
+    skeletons = [
+        damaged(skeleton, damage, rng) if k % 3 == 0 else skeleton
+        for k, skeleton in enumerate(measured(truth).skeletons)
+    ]
+    outputs = run(estimator, skeletons)
+    assert_sound(outputs, estimator)
+    assert rms(errors_of(outputs, truth)) < np.sqrt(3.0) * NOISE
+
+
+def test_without_a_trunk_there_is_no_start() -> None:
+    truth = somebody(71, 1.5)
+    trunk = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, measured(truth, dropouts=(Dropout(0.0, 0.7, trunk),)).skeletons)
+    early = [output for k, output in enumerate(outputs) if truth.times[k] < 0.7]
+    assert all(output is None for output in early)
+    assert estimator.counters["no_trunk"] > 0
+    assert outputs[-1] is not None
+    assert rms(errors_of(outputs, truth, 1.2)) < np.sqrt(3.0) * NOISE
+
+
+def test_a_person_who_is_nowhere_is_never_found() -> None:
+    nobody = Skeleton(START_NS, "world", np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8))
+    estimator = ExtendedKalmanFilter()
+    outputs = run(estimator, [replace(nobody, stamp_ns=START_NS + k * NANOSECONDS // 30) for k in range(30)])
+    assert outputs == [None] * 30 and estimator.estimate is None
+    assert estimator.counters["no_trunk"] > 0
+
+
+# --- parameters
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(EkfParameters)])
+def test_parameters_out_of_range_are_refused(name: str) -> None:
+    item = next(each for each in fields(EkfParameters) if each.name == name)
+    low, high = item.metadata["min"], item.metadata["max"]
+    assert low <= item.default <= high and item.metadata["doc"] and item.metadata["unit"]
+    for bad in (low - 1e-6 * max(1.0, abs(low)), 1.000001 * high, np.nan, np.inf, True, "1", None):
+        with pytest.raises(FilterError, match=name):
+            EkfParameters(**{name: bad})  # type: ignore[arg-type]
+    for good in (low, high):
+        EkfParameters(**{name: good})
