@@ -89,11 +89,15 @@ _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
+_START_INFLATION = 2.0
+"""A fit to one frame is not linear in its noise; its errors are larger than its linearisation says."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
-_STRAINED = 30.0
-"""Squared Mahalanobis distance of a mean innovation that no filter in the right pose comes to (1e-6 by chance)."""
+_STRAINED = 16.0
+"""Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to."""
+_MISFIT = 0.015
+"""Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
@@ -127,10 +131,10 @@ class EkfParameters:
         1e4,
     )
     density_limb: float = _parameter(
-        12.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
+        6.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
     )
     density_hand: float = _parameter(
-        12.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
+        6.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
     )
     density_rate: float = _parameter(
         0.1, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
@@ -206,8 +210,8 @@ class _SensorState:
         positions: (k, 19, 3) their points, NaN where not used.
         white: (19,) variance of the white noise per axis, square metres.
         weight: (19,) how many differences stand behind it.
-        slow: scale of the slow variance.
-        slow_information: of its estimate.
+        slow: (2,) scales of the slow variance: of points by themselves, of limbs.
+        slow_information: (2,) of their estimates.
         cross: (85, 61) covariance of the state with the slow errors, these in units of their deviation; None for zero.
     """
 
@@ -215,8 +219,8 @@ class _SensorState:
     positions: FloatArray
     white: FloatArray
     weight: FloatArray
-    slow: float
-    slow_information: float
+    slow: FloatArray
+    slow_information: FloatArray
     cross: FloatArray | None
 
 
@@ -594,12 +598,13 @@ class ExtendedKalmanFilter:
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
 
-        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows, basis)
-        if own_cross is not None and slow_scale != sensor.slow:
+        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows)
+        if own_cross is not None and slow_scale is not sensor.slow:
             # What the slow errors did to the state so far is as much smaller as they are.
-            ratio = slow_scale / sensor.slow
-            covariance -= (1.0 - ratio) * (own_cross @ own_cross.T)
-            own_cross *= math.sqrt(ratio)
+            before_that = np.maximum(sensor.slow, _NEGLIGIBLE_SLOW)
+            ratio = self._per_error(np.where(sensor.slow > _NEGLIGIBLE_SLOW, slow_scale / before_that, 1.0))
+            covariance -= (own_cross * (1.0 - ratio)) @ own_cross.T
+            own_cross *= np.sqrt(ratio)
         sensors[measurement.sensor] = replace(
             self._seen_by(sensor, measurement, used), cross=own_cross, slow=slow_scale, slow_information=information
         )
@@ -648,7 +653,13 @@ class ExtendedKalmanFilter:
         p = self.parameters
         white = np.full(self._points, p.white_stddev**2)
         return _SensorState(
-            (), np.empty((0, self._points, 3)), white, np.full(self._points, 0.5), p.slow_scale, 4.0, None
+            (),
+            np.empty((0, self._points, 3)),
+            white,
+            np.full(self._points, 0.5),
+            np.full(2, p.slow_scale),
+            np.full(2, 4.0),
+            None,
         )
 
     def _seen_by(self, sensor: _SensorState, measurement: _Measurement, used: BoolArray) -> _SensorState:
@@ -693,40 +704,46 @@ class ExtendedKalmanFilter:
         factor: FloatArray,
         white: FloatArray,
         rows: IntArray,
-        basis: FloatArray | None,
-    ) -> tuple[float, float]:
-        """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance; with its information."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance; with its information."""
         if sensor.weight.max() < 2.0 * _POOL:
             return sensor.slow, sensor.slow_information  # what is white is not known yet, and would be taken for slow
         if measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
             return sensor.slow, sensor.slow_information  # it changes slowly, and takes a while to compute
-        scale = sensor.slow
-        if basis is None:
-            scale, basis = 1.0, self._slow_basis(1.0, measurement, measurement.positions)
-            assert basis is not None
-        half, _ = dtrtrs(factor, basis[rows] / math.sqrt(scale), lower=1)
+        half, _ = dtrtrs(factor, self._unit_basis(measurement, measurement.positions)[rows], lower=1)
         likely = white @ half
         gram = half.T @ half
         expected = gram.diagonal()
-        score = 0.5 * float((np.minimum(likely**2, _SLOW_BOUND * expected) - expected).sum())
-        information = 0.5 * float((gram * gram).sum())
+        points = 3 * self._points
+        score = 0.5 * (np.minimum(likely**2, _SLOW_BOUND * expected) - expected)
+        squared = gram * gram
+        scores = np.array([score[:points].sum(), score[points:].sum()])
+        information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
         passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
-        return float(np.clip(sensor.slow + score / total, 0.0, _MAX_SLOW)), total
+        return np.clip(sensor.slow + scores / total, 0.0, _MAX_SLOW), total
 
-    def _slow_basis(self, scale: float, measurement: _Measurement, positions: FloatArray) -> FloatArray | None:
-        """(57, 61) displacement of the points by each slow error of unit variance; None where these are negligible.
+    def _per_error(self, scales: FloatArray) -> FloatArray:
+        """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
+        return np.repeat(scales, (3 * self._points, len(self._limbs)))
+
+    def _slow_basis(self, scales: FloatArray, measurement: _Measurement, positions: FloatArray) -> FloatArray | None:
+        """(57, 61) displacement of the points by each slow error of unit variance; None where these are negligible."""
+        if scales.max() < _NEGLIGIBLE_SLOW:
+            return None
+        return self._unit_basis(measurement, positions) * np.sqrt(self._per_error(scales))
+
+    def _unit_basis(self, measurement: _Measurement, positions: FloatArray) -> FloatArray:
+        """The same at unit scale.
 
         Each point is off by itself, and the upper arms and forearms are too long or too short in some poses, with all
         that hangs on them: along a limb a depth sensor finds its joints by a tenth of the length nearer or farther.
         """
-        if scale < _NEGLIGIBLE_SLOW:
-            return None
         basis = np.zeros((3 * self._points, 3 * self._points + len(self._limbs)))
         diagonal = np.arange(3 * self._points)
-        basis[diagonal, diagonal] = np.repeat(np.sqrt(scale * measurement.model_variance), 3)
+        basis[diagonal, diagonal] = np.repeat(np.sqrt(measurement.model_variance), 3)
         starts, ends, beyond = self._limb_points
-        along = (_STRETCH * math.sqrt(scale)) * (positions[ends] - positions[starts])
+        along = _STRETCH * (positions[ends] - positions[starts])
         basis[:, 3 * self._points :] = (beyond[:, None, :] * along.T).reshape(-1, len(self._limbs))
         return basis
 
@@ -800,7 +817,7 @@ class ExtendedKalmanFilter:
         weighted = by_tangent * np.repeat(weights, 3)[:, None]
         information = weighted.T @ by_tangent
         information[np.arange(self._nv), np.arange(self._nv)] += self._rest_information
-        tangent = np.linalg.inv(information)
+        tangent = _START_INFLATION * np.linalg.inv(information)
         # the fit took the lengths for true: their errors are in the pose
         from_lengths = -tangent @ (weighted.T @ by_length)
         lengths_covariance = (
@@ -868,8 +885,10 @@ class ExtendedKalmanFilter:
         lean = state.lean + step[:, None] * innovation - (measured / np.maximum(weight, 1.0))[:, None] * state.lean
         # variance of a faded mean of white innovations with this weight
         worth = np.minimum(weight * (1.0 + fade) / 2.0, weight)
-        solved = np.linalg.solve(covariance, lean[:, :, None])[:, :, 0]
-        strain = np.where(weight > _LEAN_FRAMES, worth * (lean * solved).sum(axis=1), 0.0)
+        # a body is no model: what is off by less than this needs no other pose
+        spread = covariance / np.maximum(worth, 1.0)[:, None, None] + _MISFIT**2 * np.eye(3)
+        solved = np.linalg.solve(spread, lean[:, :, None])[:, :, 0]
+        strain = np.where(weight > _LEAN_FRAMES, (lean * solved).sum(axis=1), 0.0)
         return lean, weight, float(strain.max())
 
     def _straightened(self, state: _State, measurement: _Measurement) -> _State:
@@ -882,15 +901,16 @@ class ExtendedKalmanFilter:
         posture = self.model.forward(state.q, state.lengths)
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
-        finite = np.isfinite(stddev)
-        stddev = np.where(finite, stddev / np.sqrt(np.maximum(state.leaning, 1.0)), np.inf)
+        stddev = np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2)
         state = replace(state, lean=np.zeros_like(state.lean), leaning=np.zeros(self._points), strain=0.0)
         return self._restarted(state, points, stddev, _MUCH_BETTER)
 
     def _point_stddev(self, measurement: _Measurement, sensors: Mapping[str, _SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
         sensor = sensors.get(measurement.sensor) or self._unknown_sensor()
-        return np.where(measurement.measured, np.sqrt(sensor.white + sensor.slow * measurement.model_variance), np.inf)
+        return np.where(
+            measurement.measured, np.sqrt(sensor.white + sensor.slow[0] * measurement.model_variance), np.inf
+        )
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
         """(21,) average proportions at the size of the person that is seen."""
