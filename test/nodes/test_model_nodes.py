@@ -1,0 +1,309 @@
+"""The extended filter and its joint angles as processes over DDS: what they publish, survive, and say in a silence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from rclpy.serialization import deserialize_message  # noqa: E402
+from running import RELIABLE, Running  # noqa: E402
+from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, TimeReference  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from body_tracking import graph  # noqa: E402
+from body_tracking.kinematics.tracking import AngleStream, state_estimate  # noqa: E402
+from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
+from body_tracking.messages import (  # noqa: E402
+    cloud_to_skeletons,
+    image_to_covariance,
+    joint_state_to_model,
+    to_nanoseconds,
+)
+from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
+from body_tracking.skeleton import NANOSECONDS, Joint, Skeleton, TrackingState  # noqa: E402
+
+BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MODEL = UpperBody()
+SENSORS = ("kinect1", "kinect2")
+STATE, COVARIANCE = graph.MODEL_STATE, graph.MODEL_COVARIANCE
+
+
+class Tracking(Running):
+    """Filter and angles; the test is sensors and calibration, with a shipped recording and its true calibration."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.start("joint_angles", reliable=True, input="model_state", convention="isb")
+        self.start_filter()
+        with BagReader(BAG) as reader:
+            self.frames = [
+                (each.topic, each.cdr, each.log_time_ns)
+                for each in reader.messages([graph.skeleton_topic(sensor) for sensor in SENSORS])
+            ]
+            calibration = {
+                "/ground_truth/calibration": TransformStamped,
+                "/ground_truth/calibration/clock": TimeReference,
+            }
+            self.calibration = [
+                (each.topic, deserialize_message(each.cdr, calibration[each.topic]))
+                for each in reader.messages(calibration)
+            ]
+        self.at = 0
+        self.publishers = {
+            graph.skeleton_topic(sensor): self.node.create_publisher(
+                PointCloud2, graph.skeleton_topic(sensor), RELIABLE
+            )
+            for sensor in SENSORS
+        }
+        self.poses = self.node.create_publisher(TransformStamped, graph.CALIBRATION, LATCHED)
+        self.clocks = self.node.create_publisher(TimeReference, graph.CALIBRATION_CLOCK, LATCHED)
+        self.skeletons = self.collect(PointCloud2, graph.FILTERED)
+        self.states = self.collect(JointState, STATE)
+        self.stddevs = self.collect(JointState, graph.MODEL_STATE_STDDEV)
+        self.covariances = self.collect(Image, COVARIANCE)
+        self.segments = self.collect(MultiDOFJointState, graph.segments_topic("body1"))
+        self.angles = self.collect(JointState, graph.joint_states_topic("body1"))
+        self.deviations = self.collect(JointState, graph.joint_states_stddev_topic("body1"))
+
+    def start_filter(self) -> None:
+        self.start("skeleton_filter", reliable=True, filter="ekf", predict_after=0.3)
+
+    def calibrate(self) -> None:
+        """The truth, once, from the beginning on."""
+        clock = next(message for topic, message in self.calibration if topic.endswith("clock"))
+        self.clocks.publish(clock)
+        for topic, message in self.calibration:
+            if not topic.endswith("clock"):
+                self.poses.publish(message)
+
+    def heard(self) -> bool:
+        """Whether the filter listens to both sensors, and the calibration has reached it."""
+        return all(publisher.get_subscription_count() == 1 for publisher in self.publishers.values())
+
+    def play(self, count: int) -> None:
+        """The next frames of the recording, faster than they were."""
+        for topic, cdr, _ in self.frames[self.at : self.at + count]:
+            self.publishers[topic].publish(cdr)
+            self.executor.spin_once(timeout_sec=0.01)
+        self.at += count
+
+    def cut_short(self) -> None:
+        """Forget what was collected."""
+        for messages in (self.skeletons, self.states, self.stddevs, self.covariances, self.segments, self.angles):
+            messages.clear()
+        self.deviations.clear()
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tracking]:
+    with Tracking(tmp_path_factory.mktemp("tracking")) as running:
+        assert running.until(running.heard)
+        yield running
+
+
+def stamps(messages: list[Any]) -> list[int]:
+    return [to_nanoseconds(message.header.stamp) for message in messages]
+
+
+def test_before_the_calibration_nothing_comes_and_then_each_sensors_frames(tracking: Tracking) -> None:
+    tracking.play(10)
+    assert tracking.until(lambda: "10" in tracking.diagnostics.get("skeleton_filter", {}).get("received", ""))
+    assert tracking.until(lambda: tracking.diagnostics["skeleton_filter"].get("alignment uncalibrated") == "10"), (
+        tracking.diagnostics
+    )
+    assert not tracking.skeletons
+    tracking.calibrate()
+    tracking.until(lambda: False, timeout=1.0)
+    tracking.play(60)
+    everything = (tracking.skeletons, tracking.states, tracking.stddevs, tracking.covariances, tracking.segments)
+    everything += (tracking.angles, tracking.deviations)
+    # Predicted ones follow: at some moment all have come.
+    assert tracking.until(
+        lambda: len(tracking.angles) >= 30 and len({tuple(stamps(messages)) for messages in everything}) == 1
+    )
+
+
+def test_the_messages_tell_of_one_and_the_same_state(tracking: Tracking) -> None:
+    for cloud, state, deviation, image, segments in list(
+        zip(
+            tracking.skeletons, tracking.states, tracking.stddevs, tracking.covariances, tracking.segments, strict=False
+        )
+    )[-5:]:
+        stamp_ns, frame_id, q, _ = joint_state_to_model(state, MODEL)
+        assert frame_id == cloud.header.frame_id == segments.header.frame_id == "world"
+        (skeleton,) = cloud_to_skeletons(cloud)
+        other = [joint for joint in Joint if joint.name.startswith(("KNEE", "ANKLE", "FOOT"))]
+        assert (skeleton.states[other] == TrackingState.NOT_TRACKED).all()
+        assert (image.height, image.width, image.step, image.encoding) == (64, 32, 128, "32FC1")
+        stamp, covariance = image_to_covariance(image, MODEL)
+        assert stamp == stamp_ns
+        np.testing.assert_allclose(
+            np.sqrt(covariance.diagonal()), [*deviation.position, *deviation.velocity], rtol=1e-5
+        )
+        # Base and segments: the state says where they are.
+        np.testing.assert_allclose(q[:3], skeleton.positions[Joint.SPINE_BASE], atol=1e-5)
+        assert tuple(segments.joint_names) == MODEL.segment_names
+        forearm = segments.transforms[MODEL.segment_names.index("forearm_left")].translation
+        np.testing.assert_allclose([forearm.x, forearm.y, forearm.z], skeleton.positions[Joint.ELBOW_LEFT], atol=1e-5)
+
+
+def test_the_angles_are_those_of_the_states_one_after_the_other(tracking: Tracking) -> None:
+    stream = AngleStream("isb")
+    count = min(map(len, (tracking.states, tracking.covariances, tracking.angles, tracking.deviations)))
+    assert count >= 30
+    for state, image, values, deviations in zip(
+        *(each[:count] for each in (tracking.states, tracking.covariances, tracking.angles, tracking.deviations)),
+        strict=True,
+    ):
+        stamp_ns, frame_id, q, velocity = joint_state_to_model(state, MODEL)
+        _, covariance = image_to_covariance(image, MODEL)
+        expected = stream.of_estimate(state_estimate(MODEL, stamp_ns, frame_id, q, velocity, covariance))
+        assert values.name == deviations.name == [f"{name}_body1" for name in expected.names]
+        np.testing.assert_array_equal(values.position, expected.position)
+        np.testing.assert_array_equal(values.velocity, expected.velocity)
+        np.testing.assert_array_equal(deviations.position, expected.position_stddev)
+        np.testing.assert_array_equal(deviations.velocity, expected.velocity_stddev)
+        assert np.isfinite(expected.position).all()
+
+
+def test_who_comes_late_gets_the_persons_model(tracking: Tracking) -> None:
+    models = tracking.collect(String, graph.urdf_topic("body1"), LATCHED)
+    assert tracking.until(lambda: models)
+    robot = ElementTree.fromstring(models[-1].data)
+    assert robot.tag == "robot"
+    assert any(joint.get("name") == "elbow_flexion_left_body1" for joint in robot.iter("joint"))
+
+
+def test_in_a_silence_it_says_what_is_to_be_expected_until_it_does_not_know(tracking: Tracking) -> None:
+    tracking.cut_short()
+    tracking.play(40)
+
+    def predicted_ones() -> list[Skeleton]:
+        """Those after the last in which a sensor saw something."""
+        seen = [cloud_to_skeletons(cloud)[0] for cloud in tracking.skeletons]
+        real = [number for number, each in enumerate(seen) if (each.states == TrackingState.TRACKED).any()]
+        return seen[real[-1] + 1 :] if real else []
+
+    # 30 a second, from 0.3 s to the 2 s that the filter allows itself
+    assert tracking.until(lambda: len(predicted_ones()) >= 45)
+    tracking.until(lambda: False, timeout=1.0)
+    predicted = predicted_ones()
+    assert 45 <= len(predicted) <= 55
+    assert all((each.states <= TrackingState.INFERRED).all() for each in predicted)
+    np.testing.assert_allclose(np.diff([each.stamp_ns for each in predicted]), NANOSECONDS / 30, atol=2)
+    expected = [each.stamp_ns for each in predicted]
+    assert tracking.until(lambda: stamps(tracking.angles)[-len(expected) :] == expected)
+    assert int(tracking.diagnostics["skeleton_filter"]["predicted frames"]) >= len(predicted)
+    assert predicted[0].covariances is not None
+    assert predicted[-1].covariances is not None
+    hand = Joint.HAND_LEFT
+    assert np.trace(predicted[-1].covariances[hand]) > 2.0 * np.trace(predicted[0].covariances[hand])
+    tracking.cut_short()
+    tracking.play(20)
+    assert tracking.until(lambda: tracking.angles)
+
+
+def test_a_filter_that_was_killed_goes_on_with_the_calibration_of_before(tracking: Tracking) -> None:
+    process = tracking.processes["skeleton_filter"]
+    process.kill()
+    process.wait()
+    tracking.until(lambda: False, timeout=0.5)
+    tracking.cut_short()
+    tracking.start_filter()
+    assert tracking.until(lambda: all(p.get_subscription_count() >= 1 for p in tracking.publishers.values()), 30.0)
+
+    def back() -> bool:
+        tracking.play(2)
+        return bool(tracking.angles)
+
+    assert tracking.until(back)
+
+
+def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tracking) -> None:
+    tracking.until(lambda: False, timeout=0.5)
+    state, image = tracking.states[-1], tracking.covariances[-1]
+    states = tracking.node.create_publisher(JointState, STATE, RELIABLE)
+    images = tracking.node.create_publisher(Image, COVARIANCE, RELIABLE)
+    assert tracking.until(lambda: states.get_subscription_count() and images.get_subscription_count())
+
+    def with_numbers(**changes: Any) -> JointState:
+        fields = {"header": state.header, "name": state.name, "position": state.position, "velocity": state.velocity}
+        return JointState(**(fields | changes))
+
+    def with_data(data: bytes, **changes: Any) -> Image:
+        fields = {"header": image.header, "height": 64, "width": 32, "step": 128, "encoding": "32FC1", "data": data}
+        return Image(**(fields | changes))
+
+    bad_states: list[Any] = [
+        with_numbers(name=state.name[:-1]),
+        with_numbers(name=["nose", *state.name[1:]]),
+        with_numbers(position=[float("nan")] * 32),
+        with_numbers(velocity=[]),
+        b"\x00\x01\x00\x00garbage",
+    ]
+    bad_images: list[Any] = [
+        with_data(bytes(image.data)[:-4]),
+        with_data(bytes(image.data), height=32, width=64),
+        with_data(bytes(image.data), encoding="mono8"),
+        with_data(np.full(2048, np.nan, "<f4").tobytes()),
+        b"\x00\x01\x00\x00garbage",
+    ]
+    before = int(tracking.diagnostics["joint_angles"].get("malformed", 0))
+    for message in bad_states:
+        states.publish(message)
+    for message in bad_images:
+        images.publish(message)
+    count = len(bad_states) + len(bad_images)
+    assert tracking.until(lambda: int(tracking.diagnostics["joint_angles"].get("malformed", 0)) == before + count)
+    assert f"{STATE}: malformed message ignored" in tracking.log("joint_angles")
+    assert f"{COVARIANCE}: malformed message ignored" in tracking.log("joint_angles")
+    tracking.cut_short()
+    tracking.play(10)
+    assert tracking.until(lambda: tracking.angles)
+
+
+def set_parameter(tracking: Tracking, node: str, name: str, value: ParameterValue) -> tuple[bool, str]:
+    client = tracking.node.create_client(SetParameters, f"/{node}/set_parameters")
+    assert client.wait_for_service(10.0)
+    future = client.call_async(SetParameters.Request(parameters=[Parameter(name=name, value=value)]))
+    assert tracking.until(future.done)
+    result = future.result().results[0]
+    return result.successful, result.reason
+
+
+def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> None:
+    done, reason = set_parameter(
+        tracking, "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=0.0)
+    )
+    assert not done
+    assert "ekf.velocity_time" in reason
+    assert set_parameter(tracking, "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=2.0))[0]
+    assert set_parameter(tracking, "joint_angles", "convention", ParameterValue(type=4, string_value="rep155"))[0]
+    tracking.until(lambda: False, timeout=0.5)
+    tracking.cut_short()
+    tracking.play(20)
+    # With the poses that the filter had before: they do not come again.
+    assert tracking.until(lambda: tracking.angles and "waist_body1" in tracking.angles[-1].name)
+    # A linear filter takes what the fusion makes; nobody makes anything here.
+    linear = ParameterValue(type=4, string_value="lkf_constant_velocity")
+    assert set_parameter(tracking, "skeleton_filter", "filter", linear)[0]
+    assert tracking.until(lambda: all(p.get_subscription_count() == 0 for p in tracking.publishers.values()))
+    extended = ParameterValue(type=4, string_value="ekf")
+    assert set_parameter(tracking, "skeleton_filter", "filter", extended)[0]
+    assert tracking.until(tracking.heard)
+    tracking.until(lambda: False, timeout=0.5)
+    tracking.cut_short()
+    tracking.play(20)
+    assert tracking.until(lambda: tracking.angles)
