@@ -11,6 +11,7 @@ import yaml
 
 from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
+from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
 from body_tracking.recording.rosbag2 import is_known
 
@@ -22,6 +23,8 @@ VARIANTS = [
     GraphOptions(sensors=("a", "b", "c"), record="somewhere"),
     GraphOptions(bag="bag", filter_name="lkf_zero_velocity", calibration_file="c.yaml", reliable=True),
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
+    GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
+    GraphOptions(filter_name="schlagenhauf_ekf"),
 ]
 
 
@@ -49,6 +52,47 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
     # Calibration, fusion and recorder listen to the sensors.
     assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
+
+
+def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
+    assert set(graph.ROLES) == set(FILTERS)
+    for name, role in graph.ROLES.items():
+        specs = named(nodes_for(GraphOptions(bag="bag", record="r", filter_name=name)))
+        angles = specs["joint_angles"].parameters
+        assert (angles["input"], angles["convention"]) == (role.angles_input, role.convention)
+        # A node of its own, asked for nothing, goes by the default filter.
+        if name == DEFAULT_FILTER:
+            assert graph.angles_for(graph.AUTO, graph.AUTO) == (role.convention, role.angles_input)
+        # Calibration, fusion, recorder, and the filter where it listens to sensors.
+        listeners = 4 if role.input == graph.SENSORS_INPUT else 3
+        wanted = specs["bag_player"].parameters["wait_for_subscribers"]
+        assert wanted == (f"/kinect1/skeleton:{listeners}", f"/kinect2/skeleton:{listeners}")
+        after = specs["bag_player"].after
+        assert after[graph.FUSED] == (1 if role.input == graph.SENSORS_INPUT else 2)
+        listened = (
+            (graph.MODEL_STATE, graph.MODEL_COVARIANCE) if role.angles_input == "model_state" else (graph.FILTERED,)
+        )
+        assert all(after[topic] == 2 for topic in listened)
+        assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_angles_of_positions_need_no_model() -> None:
+    options = GraphOptions(filter_name="ekf", convention="positional")
+    assert named(nodes_for(options))["joint_angles"].parameters["input"] == "skeleton"
+    assert graph.angles_for("positional", "model_state") == ("positional", "skeleton")
+    assert graph.angles_for(graph.AUTO, "model_state") == ("model", "model_state")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        GraphOptions(filter_name="lkf_zero_velocity", filter_input="sensors"),
+        GraphOptions(filter_name="schlagenhauf_ekf", angles_input="model_state"),
+    ],
+)
+def test_a_filter_is_not_asked_for_what_it_cannot_do(options: GraphOptions) -> None:
+    with pytest.raises(graph.GraphError, match=f"filter {options.filter_name}"):
+        nodes_for(options)
 
 
 @pytest.mark.parametrize("options", VARIANTS)

@@ -89,13 +89,19 @@ def test_a_dataclass_becomes_parameters_and_back() -> None:
     )
     values = check_all((*table, *TABLE), {"speed": 2})
     assert Settings(**fields_of(Settings, values)) == Settings(speed=2.0)
+    prefixed = parameters_from(Settings, prefix="one.")
+    assert [item.name for item in prefixed] == ["one.speed", "one.method", "one.plain"]
+    values = check_all((*table, *prefixed), {"speed": 2, "one.speed": 3})
+    assert Settings(**fields_of(Settings, values, prefix="one.")) == Settings(speed=3.0)
 
 
 def test_the_written_file_reads_as_the_defaults(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
-    file.write_text(as_yaml({"node": TABLE, "other": TABLE[:1]}))
+    dotted = (Parameter("a.b", 1.0, "a part of a part"),)
+    file.write_text(as_yaml({"node": TABLE, "other": TABLE[:1], "dotted": dotted}))
     sections = read_file(file)
-    assert set(sections) == {"/node", "/other"}
+    assert set(sections) == {"/node", "/other", "/dotted"}
+    assert sections["/dotted"] == {"a.b": 1.0}
     assert check_all(TABLE, sections["/node"]) == check_all(TABLE, {})
     for parameter in TABLE:
         assert parameter.doc in file.read_text()

@@ -10,13 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from body_tracking import cli, graph
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import JOINT_STATE, to_nanoseconds
+from body_tracking.kinematics.conventions import convention
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.messages import JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, to_nanoseconds
 from body_tracking.parameters import ParameterError
 from body_tracking.recording import replay as replay_module
 from body_tracking.recording.replay import ReplayError, replay
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.recording.stages import Downstream, ForkedDownstream, ReplaySettings
+from body_tracking.skeleton import NANOSECONDS, Joint, TrackingState
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
@@ -69,6 +73,64 @@ def test_one_process_and_two_give_the_same_messages(
     report = replay(BAG, tmp_path / "out", ReplaySettings(()))
     assert contents(tmp_path / "out") == contents(replayed)
     assert report.counters["filter frames"] == report.frames
+
+
+MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.MODEL_COVARIANCE, graph.segments_topic("body1"))
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("extended") / "out"
+    replay(BAG, out, ReplaySettings((), filter_name="ekf", convention="isb"))
+    return out
+
+
+def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed: Path) -> None:
+    with BagReader(extended) as bag, BagReader(replayed) as linear:
+        counts = {topic: info.count for topic, info in bag.topics.items()}
+        assert not set(MODEL_TOPICS) & set(linear.topics)
+        first = deserialize(JOINT_STATE, next(iter(bag.messages([ANGLES]))).cdr)
+        frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
+    for topic in (*MODEL_TOPICS, ANGLES, f"{ANGLES}_stddev"):
+        assert counts[topic] == counts["/filtered/skeleton"] > 400
+    assert 1 <= counts[graph.urdf_topic("body1")] <= 15  # at most once a second
+    assert tuple(first.name) == tuple(f"{name}_body1" for name in convention("isb", UpperBody()).names)
+    # Two sensors out of step, each frame at its own time: more than the reference sensor has, and in order.
+    stamps = np.array([each.stamp_ns for each in frames])
+    assert (np.diff(stamps) > 0).all()
+
+
+@pytest.mark.parametrize("filter_name", ["lkf_constant_velocity", "schlagenhauf_ekf"])
+def test_every_filter_gives_the_angles_of_a_model(tmp_path: Path, filter_name: str) -> None:
+    report = replay(BAG, tmp_path / "out", ReplaySettings((), filter_name=filter_name, convention="model"))
+    with BagReader(tmp_path / "out") as bag:
+        assert bag.topics[ANGLES].count == bag.topics["/filtered/skeleton"].count == report.frames > 300
+        last = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([ANGLES])][-1]
+        stddev = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([f"{ANGLES}_stddev"])][-1]
+    known = dict(zip(last.name, stddev.position, strict=True))
+    assert known["elbow_flexion_left_body1"] < np.radians(30.0)
+    assert np.isfinite(last.position).all()
+
+
+def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Path) -> None:
+    with BagReader(BAG) as bag, BagWriter(tmp_path / "gap") as writer:
+        topics = [topic for topic in bag.topics if topic.startswith("/kinect")]
+        start, end = bag.start_ns + 8 * NANOSECONDS, bag.start_ns + 9 * NANOSECONDS
+        for topic in topics:
+            writer.add_topic(topic, bag.topics[topic].type_name)
+        for raw in bag.messages(topics):
+            if not start <= raw.log_time_ns < end:
+                writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+    report = replay(tmp_path / "gap", tmp_path / "out", ReplaySettings((), filter_name="ekf"))
+    with BagReader(tmp_path / "out") as bag:
+        frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
+        assert bag.topics[ANGLES].count == len(frames)
+    predicted = [each for each in frames if (each.states <= TrackingState.INFERRED).all()]
+    # From 0.1 s after the last frame on, 30 a second, until the next one.
+    assert 26 <= len(predicted) <= 29
+    assert report.counters["filter predicted frames"] == len(predicted)
+    spread = [np.trace(each.covariances, axis1=1, axis2=2)[Joint.HAND_LEFT] for each in predicted]
+    assert (np.diff(spread) > 0.0).all()
 
 
 def test_the_angles_follow_the_truth(replayed: Path) -> None:
@@ -166,18 +228,23 @@ def test_a_failure_of_the_second_stage_is_told_and_leaves_no_bag(tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
-def test_parameters_are_checked_before_anything_runs(tmp_path: Path) -> None:
+def test_parameters_are_checked_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for text, message in (
         ("fusion: {ros__parameters: {gait: 3.0}}", "did you mean 'gate'"),
         ("calibration: {ros__parameters: {method: best}}", "method"),
         ("skeleton_filter: {ros__parameters: {white_noise_share: 7.0}}", "white_noise_share"),
+        ("skeleton_filter: {ros__parameters: {filter: ekf, ekf: {velocity_tim: 7.0}}}", "'ekf.velocity_time'"),
+        ("skeleton_filter: {ros__parameters: {filter: ekg}}", "expected one of"),
+        ("joint_angles: {ros__parameters: {convention: isp}}", "expected one of"),
+        ("joint_angles: {ros__parameters: {convention: isb, input: model_state}}", "has no model of the body"),
     ):
         file = tmp_path / "parameters.yaml"
         file.write_text(text)
-        done = command("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
-        assert done.returncode == 2
-        assert message in done.stderr
-        assert done.stderr.count("\n") == 1
+        arguments = ("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
+        assert cli.main([str(word) for word in arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
     assert command("replay", BAG, "-o", tmp_path / "out", "--filter", "ukf").returncode == 2
     done = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")
     assert "kinect7" in done.stderr
