@@ -116,17 +116,28 @@ def angles_in(path: Path, topic: str) -> dict[int, Any]:
     return {to_nanoseconds(message.header.stamp): np.array(message.position) for message in messages}
 
 
+@pytest.mark.parametrize("filter_name", ["lkf_constant_velocity", "ekf"])
 def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
-    up: Callable[..., Up], tmp_path: Path
+    up: Callable[..., Up], tmp_path: Path, filter_name: str
 ) -> None:
-    # How long to wait for a late frame is the one decision by the wall clock; wait for as long as it takes.
+    # How long to wait for a late frame, and for any before one is predicted, are the decisions by the wall clock; wait
+    # for as long as it takes.
     file = tmp_path / "parameters.yaml"
-    file.write_text("fusion: {ros__parameters: {max_wait: 1.0}}\n")
+    file.write_text(
+        "fusion: {ros__parameters: {max_wait: 1.0}}\n"
+        f"skeleton_filter: {{ros__parameters: {{filter: {filter_name}, predict_after: 1000.0}}}}\n"
+    )
     graph_up = up("--bag", BAG, "--record", tmp_path / "live", "--reliable", "--params-file", file)
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
     assert graph_up.process.returncode == 0, graph_up.text()
     assert "frames of joint angles" in graph_up.text()
-    replay(BAG, tmp_path / "offline", ReplaySettings(("kinect1", "kinect2"), fusion=FusionParameters(max_wait=1.0)))
+    settings = ReplaySettings(
+        ("kinect1", "kinect2"),
+        filter_name=filter_name,
+        predict_after=1000.0,
+        fusion=FusionParameters(max_wait=1.0),
+    )
+    replay(BAG, tmp_path / "offline", settings)
     for topic in (ANGLES, STDDEVS):
         live, offline = angles_in(tmp_path / "live", topic), angles_in(tmp_path / "offline", topic)
         assert len(live) > 350
@@ -135,11 +146,17 @@ def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
             np.testing.assert_allclose(values, offline[stamp], rtol=0.0, atol=1e-6)
     # Each angle is known at some time; the rotation of the arms while they are straight (T-pose) is not.
     finite = np.isfinite(np.array(list(live.values())))
-    assert finite.any(axis=0).all()
     assert not finite.all()
     with BagReader(tmp_path / "live") as reader:
         assert reader.whole
         assert reader.topics[graph.skeleton_topic("kinect1")].count == 423
+        if filter_name != "ekf":
+            assert finite.any(axis=0).all()
+            assert graph.MODEL_STATE not in reader.topics
+            return
+        for topic in (graph.MODEL_STATE, graph.MODEL_COVARIANCE, graph.segments_topic("body1")):
+            assert reader.topics[topic].count == len(live)
+        assert reader.topics[graph.urdf_topic("body1")].count >= 1
 
 
 def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
@@ -231,6 +248,12 @@ def test_a_bag_that_is_none_or_has_no_skeletons(capsys: pytest.CaptureFixture[st
         ("fusoin: {ros__parameters: {silence: 1.0}}", "/fusoin: no such node"),
         ("fusion: {silence: 1.0}", "holds no ros__parameters"),
         ("fusion: [", "is not YAML"),
+        (
+            "skeleton_filter: {ros__parameters: {ekf.velocity_tim: 1.0}}",
+            "unknown parameter 'ekf.velocity_tim'; did you mean 'ekf.velocity_time'?",
+        ),
+        ("skeleton_filter: {ros__parameters: {filter: 3}}", "parameter 'filter': 3, expected a string"),
+        ("joint_angles: {ros__parameters: {convention: isp}}", "parameter 'convention': 'isp', expected one of"),
     ],
 )
 def test_a_parameters_file_with_a_mistake(
@@ -250,9 +273,38 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
     assert "reserved" in refusal(capsys, "--sensors", "fused")
     assert "twice" in refusal(capsys, "--sensors", "a,a")
+    file = tmp_path / "parameters.yaml"
+    file.write_text("joint_angles: {ros__parameters: {convention: isb, input: model_state}}")
+    assert "has no model of the body" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
+    file.write_text("skeleton_filter: {ros__parameters: {input: sensors}}")
+    assert "takes fused skeletons" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
 
 
 # --- parameters
+
+
+def test_the_filter_in_the_file_decides_what_joint_angles_listens_to(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    for content, expected in (
+        ("skeleton_filter: {ros__parameters: {filter: ekf}}", ("model_state", "model")),
+        ("/**: {ros__parameters: {filter: ekf, convention: auto}}", ("model_state", "model")),
+        (
+            "skeleton_filter: {ros__parameters: {filter: ekf, ekf: {velocity_time: 2}}}\n"
+            "joint_angles: {ros__parameters: {convention: isb, input: skeleton}}",
+            ("skeleton", "isb"),
+        ),
+        ("joint_angles: {ros__parameters: {convention: dh26}}", ("skeleton", "dh26")),
+    ):
+        file.write_text(content)
+        options = graph.with_file(GraphOptions(), file)
+        found = parameters_for(graph.nodes_for(options), file, absent=graph.all_nodes_for(options))
+        assert (found["joint_angles"]["input"], found["joint_angles"]["convention"]) == expected
+        if "velocity_time" in content:
+            assert found["skeleton_filter"]["ekf.velocity_time"] == 2.0
+    # The command line wins.
+    options = graph.with_file(GraphOptions(filter_name="lkf_zero_velocity", convention="rep155"), file)
+    found = parameters_for(graph.nodes_for(options), file)
+    assert (found["joint_angles"]["input"], found["joint_angles"]["convention"]) == ("skeleton", "rep155")
 
 
 def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
