@@ -61,10 +61,21 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(STAMP) ## measure the delay from capture to angle, and the calibration on real recordings
-	$(BIN)/python benchmarks/latency.py
-	@if [ -d "$${BODY_TRACKING_DATA:-../shared/data}/kinect_pairs" ]; then $(BIN)/python benchmarks/real_pairs.py; \
-	else echo "no real recordings here (BODY_TRACKING_DATA names their folder): benchmarks/real_pairs.py is left out"; fi
+bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (half an hour)
+	@data=$${BODY_TRACKING_DATA:-../shared/data}; missed=; \
+	run() { echo; echo "== $$*"; $(BIN)/python "$$@" || missed="$$missed $$1"; }; \
+	with() { folder=$$1; shift; if [ -d "$$data/$$folder" ]; then run "$$@"; \
+	  else echo; echo "== $$1 is left out: no $$data/$$folder (BODY_TRACKING_DATA names the folder of real recordings)"; fi; }; \
+	run benchmarks/latency.py; \
+	run benchmarks/thesis.py; \
+	run benchmarks/honesty.py --runs 40; \
+	run benchmarks/robustness.py --runs 100; \
+	with kinect_pairs benchmarks/real_pairs.py; \
+	with kinect_pairs benchmarks/real_people.py; \
+	with kinect_vs_vicon benchmarks/kinect_vs_vicon.py; \
+	if $(BIN)/python -c 'import biorbd, opensim' 2>/dev/null; then run benchmarks/estimators.py; \
+	else echo; echo "== benchmarks/estimators.py is left out: its peers come with: $(BIN)/pip install -e '.[peers]'"; fi; \
+	[ -z "$$missed" ] || { echo; echo "make bench: missed:$$missed" >&2; exit 1; }
 
 docs: $(STAMP) ## rewrite what the code defines: tables of README.md, config/
 	$(BIN)/python docs/update.py
