@@ -78,7 +78,7 @@ _WHITENESS_TIME = 0.25
 _SHORTEST_STEP = 0.005
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
-_DENSITY_DOWN, _DENSITY_UP = 6.0, 4.0
+_DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
 _UNKNOWN = 0.85
@@ -89,7 +89,7 @@ _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
-_START_INFLATION = 2.0
+_START_INFLATION = 4.0
 """A fit to one frame is not linear in its noise; its errors are larger than its linearisation says."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
@@ -131,10 +131,10 @@ class EkfParameters:
         1e4,
     )
     density_limb: float = _parameter(
-        6.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
+        3.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
     )
     density_hand: float = _parameter(
-        6.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
+        3.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
     )
     density_rate: float = _parameter(
         0.1, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
