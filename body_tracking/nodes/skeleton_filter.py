@@ -56,6 +56,9 @@ PARAMETERS = (
     RELIABLE,
 )
 
+_CALIBRATIONS = 1000
+"""Poses, and clocks, that may wait while the filter is busy; none is to be lost."""
+
 
 class SkeletonFilterNode(GraphNode):
     """Feeds the filter and publishes what it makes."""
@@ -126,7 +129,7 @@ class SkeletonFilterNode(GraphNode):
             return
         given: dict[str, Any] = dict(values)
         sensors = given["sensors"]
-        latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(sensors))))
+        latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, _CALIBRATIONS))
         self.inputs = [
             self.listen(graph.CALIBRATION_CLOCK, TimeReference, latched, self.on_clock),
             self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose),
