@@ -160,9 +160,15 @@ class Ranges:
         return excess
 
     def clipped(self, q: FloatArray, margin: float) -> FloatArray:
-        """(nq,) a configuration with all that turns about axes at most a margin (radians) beyond its range."""
+        """(nq,) a configuration whose angles and shoulders are at most a margin (radians) beyond their ranges."""
         rows = self._model.scalar_v - 6
         clipped = q.copy()
+        turned = self._values(q)[self._soft]
+        swing = np.sqrt((turned[:, :2] ** 2).sum(axis=1, keepdims=True))
+        turned[:, :2] *= np.minimum(1.0, (np.radians(SHOULDER_SWING) + margin) / np.maximum(swing, 1e-12))
+        twist = np.radians(SHOULDER_TWIST) + margin
+        turned[:, 2] = np.clip(turned[:, 2], -twist, twist)
+        clipped[self._quaternions] = so3.quat_multiply(so3.quat_inverse(self._to_centre), so3.exp(turned))
         clipped[self._model.scalar_q] = np.clip(
             q[self._model.scalar_q], self.low[rows] - margin, self.high[rows] + margin
         )
