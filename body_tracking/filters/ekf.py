@@ -70,33 +70,43 @@ _NEGLIGIBLE_SLOW = 1e-3
 _STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
 _SLOW_BOUND = 9.0
+_SIGNIFICANT = 2.0
+"""Standard deviations above zero from which a scale of slow errors is used."""
 _SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
-_SHORTEST_STEP = 0.005
+_PERSISTENCE = 1.0
+"""Frames for which an error of second order counts as one and the same."""
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
-_UNKNOWN = 0.85
-"""Share of the range's deviation from which an angle counts as unknown."""
+_DRAWN = 1.0
+_VAGUE = 0.5
+"""Share of the range's deviation from which an angle is drawn to the middle of its range."""
+_SPURIOUS = 0.35
+"""Share of what the ranges say below which the variance of an unobserved direction is taken to be false."""
+_SETTLE_AFTER = 0.3
+"""Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
+_NULL = 1e-6
+"""Singular value, as a share of the greatest, below which a direction moves no point."""
+_UNKNOWN = 1.0
+"""Share of the range's deviation above which no angle's gets."""
 _LIMIT_STDDEV = 3.0
 """Degrees: how softly limits push back, each time."""
 _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
-_START_INFLATION = 4.0
-"""A fit to one frame is not linear in its noise; its errors are larger than its linearisation says."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
 _STRAINED = 16.0
 """Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to."""
-_MISFIT = 0.015
+_MISFIT = 0.025
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
@@ -143,8 +153,8 @@ class EkfParameters:
         0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
     )
     slow_scale: float = _parameter(
-        0.0,
-        "variance of a sensor's slow errors before it is learnt, as a share of the measurement model's",
+        0.3,
+        "variance of the slow errors of a sensor that states covariances, as a share of these, before it is learnt",
         "1",
         0.0,
         9.0,
@@ -211,7 +221,8 @@ class _SensorState:
         white: (19,) variance of the white noise per axis, square metres.
         weight: (19,) how many differences stand behind it.
         slow: (2,) scales of the slow variance: of points by themselves, of limbs.
-        slow_information: (2,) of their estimates.
+        slow_estimate: (2,) their running estimates, of which only significant ones are used.
+        slow_information: (2,) of the estimates.
         cross: (85, 61) covariance of the state with the slow errors, these in units of their deviation; None for zero.
     """
 
@@ -220,6 +231,7 @@ class _SensorState:
     white: FloatArray
     weight: FloatArray
     slow: FloatArray
+    slow_estimate: FloatArray
     slow_information: FloatArray
     cross: FloatArray | None
 
@@ -244,6 +256,8 @@ class _State:
         since_prior: seconds since ranges of motion were last brought in.
         tracked: seconds since the start.
         settled: the lengths stay.
+        null: (k, 32) directions of the tangent that move no point.
+        fresh: started from a frame, without any after it.
     """
 
     stamp_ns: int
@@ -263,6 +277,8 @@ class _State:
     since_prior: float
     tracked: float
     settled: bool
+    null: FloatArray
+    fresh: bool = False
 
 
 class ExtendedKalmanFilter:
@@ -366,9 +382,11 @@ class ExtendedKalmanFilter:
             self._frame_id, self._body = skeleton.frame_id, skeleton.body
             self._state = self._begun(measurement)
             return None if self._state is None else self._output(self._state, skeleton)
+        self._body = skeleton.body
+        if state.sensors and state.fresh and state.stamp_ns == measurement.stamp_ns:
+            return self._output(state, skeleton)  # it was started from this frame, after a gap
         late = measurement.stamp_ns < state.stamp_ns
         self._state = self._replay(measurement) if late else self._remember(state, measurement)
-        self._body = skeleton.body
         return None if late else self._output(self._state, skeleton)
 
     @property
@@ -415,10 +433,12 @@ class ExtendedKalmanFilter:
             self.reset()
         elif elapsed > p.predict_for:
             self.counters["gaps"] += 1
-            self._state = self._first_state(measurement, state)
             self._history.clear()
-            return self._state is not None and self._state.stamp_ns != measurement.stamp_ns
-        elif last is not None and last.stamps and last.stamps[-1] == measurement.stamp_ns:
+            started = self._first_state(measurement, state)
+            if started is None:
+                return False  # what is known of person and sensors stays for the first frame that shows a trunk
+            self._state = started
+        elif self._is_known(measurement, last):
             self.counters["repeated_stamps"] += 1
             return False
         elif elapsed < -p.late_window:
@@ -428,6 +448,14 @@ class ExtendedKalmanFilter:
                 self.reset()
             return jump
         return True
+
+    def _is_known(self, measurement: _Measurement, last: _SensorState | None) -> bool:
+        """Whether this sensor's frame of this stamp was taken before."""
+        if last is not None and last.stamps and last.stamps[-1] == measurement.stamp_ns:
+            return True
+        return any(
+            (each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for _, each in self._history
+        )
 
     # --- time
 
@@ -511,6 +539,7 @@ class ExtendedKalmanFilter:
             sensors=sensors,
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
+            fresh=False,
         )
 
     def _turning_back(self, step: FloatArray) -> FloatArray:
@@ -525,7 +554,7 @@ class ExtendedKalmanFilter:
     def _corrected(self, state: _State, measurement: _Measurement) -> _State:
         """The Kalman update with the points that pass the gate; what was learnt of the sensor."""
         dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
-        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
+        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor(measurement)
         lines = self.model.linearise(state.q, state.lengths)
         observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
         curvature = self.model.curvature(lines, state.covariance[self._tangent, self._tangent])
@@ -544,18 +573,20 @@ class ExtendedKalmanFilter:
                 seen += both + both.T
                 cross_covariance = cross_covariance + sensor.cross @ basis.T
         s = seen.copy()
-        # A normal error x makes x^2 / 2 of mean m and of variance 2 m^2, and it stays for the filter's memory.
-        persistent = 2.0 * max(1.0, _WHITENESS_TIME / max(dt, _SHORTEST_STEP))
-        s[rows, rows] += np.repeat(sensor.white, 3) + persistent * curvature.reshape(-1) ** 2
+        # A normal error x makes x^2 / 2 of mean m and of variance 2 m^2, and it stays for some frames.
+        persistent = 2.0 * _PERSISTENCE
+        s[rows, rows] += np.repeat(sensor.white, 3)
         diagonal = np.arange(self._points)
-        own = s.reshape(self._points, 3, self._points, 3)[diagonal, :, diagonal]
+        blocks = s.reshape(self._points, 3, self._points, 3)
+        blocks[diagonal, :, diagonal] += persistent * curvature[:, :, None] * curvature[:, None, :]
+        own = blocks[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
         distances = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own), y)
         used = measurement.measured & (distances < self._gate)
         rejected = measurement.measured & ~used
         self.counters["measured"] += int(used.sum())
         self.counters["rejected"] += int(rejected.sum())
-        lean, leaning, strain = self._leaning(state, y, own, measurement.measured, distances, dt)
+        lean, leaning, strain = self._leaning(state, y, own, measurement.measured, distances, sensor.white, dt)
 
         if not used.all():
             rows = np.flatnonzero(np.repeat(used, 3))
@@ -582,6 +613,10 @@ class ExtendedKalmanFilter:
         if state.settled:
             correction[self._lengths] = 0.0
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
+        if len(state.null):
+            # what no point shows must not tremble with those that are seen
+            for part in (correction[self._tangent], correction[self._velocities]):
+                part -= (state.null @ part) @ state.null
         self.innovation_distance, self.innovation_dimension = float(white @ white), len(white)
 
         sensors = dict(state.sensors)
@@ -598,7 +633,7 @@ class ExtendedKalmanFilter:
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
 
-        slow_scale, information = self._slow_learnt(sensor, measurement, factor, white, rows)
+        slow_scale, slow_estimate, information = self._slow_learnt(sensor, measurement, factor, white, rows)
         if own_cross is not None and slow_scale is not sensor.slow:
             # What the slow errors did to the state so far is as much smaller as they are.
             before_that = np.maximum(sensor.slow, _NEGLIGIBLE_SLOW)
@@ -606,7 +641,11 @@ class ExtendedKalmanFilter:
             covariance -= (own_cross * (1.0 - ratio)) @ own_cross.T
             own_cross *= np.sqrt(ratio)
         sensors[measurement.sensor] = replace(
-            self._seen_by(sensor, measurement, used), cross=own_cross, slow=slow_scale, slow_information=information
+            self._seen_by(sensor, measurement, used),
+            cross=own_cross,
+            slow=slow_scale,
+            slow_estimate=slow_estimate,
+            slow_information=information,
         )
         return replace(
             state,
@@ -649,15 +688,18 @@ class ExtendedKalmanFilter:
 
     # --- learning
 
-    def _unknown_sensor(self) -> _SensorState:
+    def _unknown_sensor(self, measurement: _Measurement) -> _SensorState:
+        """What is taken of a sensor before it is known; slow errors of one that states how much it errs."""
         p = self.parameters
+        slow = p.slow_scale if measurement.skeleton.covariances is not None else 0.0
         white = np.full(self._points, p.white_stddev**2)
         return _SensorState(
             (),
             np.empty((0, self._points, 3)),
             white,
             np.full(self._points, 0.5),
-            np.full(2, p.slow_scale),
+            np.array([slow, 0.0]),
+            np.array([slow, 0.0]),
             np.full(2, 4.0),
             None,
         )
@@ -704,12 +746,17 @@ class ExtendedKalmanFilter:
         factor: FloatArray,
         white: FloatArray,
         rows: IntArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance; with its information."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance.
+
+        Returns:
+            (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
+        """
+        unchanged = sensor.slow, sensor.slow_estimate, sensor.slow_information
         if sensor.weight.max() < 2.0 * _POOL:
-            return sensor.slow, sensor.slow_information  # what is white is not known yet, and would be taken for slow
-        if measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
-            return sensor.slow, sensor.slow_information  # it changes slowly, and takes a while to compute
+            return unchanged  # what is white is not known yet, and would be taken for slow
+        if sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
+            return unchanged  # it changes slowly, and takes a while to compute
         half, _ = dtrtrs(factor, self._unit_basis(measurement, measurement.positions)[rows], lower=1)
         likely = white @ half
         gram = half.T @ half
@@ -721,7 +768,11 @@ class ExtendedKalmanFilter:
         information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
         passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
-        return np.clip(sensor.slow + scores / total, 0.0, _MAX_SLOW), total
+        # the mean of what each frame says, which may be less than nothing
+        estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
+        # an error is taken for real when it stands out: else every sensor would have a little of it
+        real = estimate * np.sqrt(total) > _SIGNIFICANT
+        return np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), estimate, total
 
     def _per_error(self, scales: FloatArray) -> FloatArray:
         """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
@@ -765,6 +816,9 @@ class ExtendedKalmanFilter:
         """The state after the first few frames, as many as tell a sensor's noise: without it the start is a guess."""
         if self._waiting and abs(measurement.stamp_ns - self._waiting[-1].stamp_ns) > _WAIT_NS:
             self._waiting.clear()
+        if any((each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for each in self._waiting):
+            self.counters["repeated_stamps"] += 1
+            return None
         self._waiting.append(measurement)
         self._waiting.sort(key=lambda each: each.stamp_ns)
         by_sensor = [each for each in self._waiting if each.sensor == measurement.sensor]
@@ -772,13 +826,10 @@ class ExtendedKalmanFilter:
             return None
         sensors: dict[str, _SensorState] = {}
         for each in self._waiting:
-            known = sensors.get(each.sensor) or self._unknown_sensor()
+            known = sensors.get(each.sensor) or self._unknown_sensor(each)
             sensors[each.sensor] = self._seen_by(known, each, each.measured)
         # only the noise is kept: the frames themselves are still to come
-        learnt = {
-            name: replace(sensor, stamps=(), positions=self._unknown_sensor().positions)
-            for name, sensor in sensors.items()
-        }
+        learnt = {name: replace(sensor, stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}
         first, *others = self._waiting
         self._waiting = []
         state = self._first_state(first, None, learnt)
@@ -800,9 +851,8 @@ class ExtendedKalmanFilter:
             self.counters["no_trunk"] += 1
             return None
         state = self._new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
-        if learnt is not None:
-            state = replace(state, sensors=learnt)
-        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor()
+        state = replace(state, fresh=True, sensors=state.sensors if learnt is None else learnt)
+        sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor(measurement)
         sensor = self._seen_by(replace(sensor, cross=None), measurement, measurement.measured)
         return replace(state, sensors={**state.sensors, measurement.sensor: sensor})
 
@@ -817,7 +867,7 @@ class ExtendedKalmanFilter:
         weighted = by_tangent * np.repeat(weights, 3)[:, None]
         information = weighted.T @ by_tangent
         information[np.arange(self._nv), np.arange(self._nv)] += self._rest_information
-        tangent = _START_INFLATION * np.linalg.inv(information)
+        tangent = np.linalg.inv(information)
         # the fit took the lengths for true: their errors are in the pose
         from_lengths = -tangent @ (weighted.T @ by_length)
         lengths_covariance = (
@@ -849,6 +899,7 @@ class ExtendedKalmanFilter:
             0.0,
             0.0 if previous is None else previous.tracked,
             False if previous is None else previous.settled,
+            np.empty((0, self._nv)),
         )
 
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
@@ -875,6 +926,7 @@ class ExtendedKalmanFilter:
         covariance: FloatArray,
         measured: BoolArray,
         distances: FloatArray,
+        white: FloatArray,
         dt: float,
     ) -> tuple[FloatArray, FloatArray, float]:
         """The faded mean of the innovations (19, 3), its weights (19,) and the strain."""
@@ -886,7 +938,8 @@ class ExtendedKalmanFilter:
         # variance of a faded mean of white innovations with this weight
         worth = np.minimum(weight * (1.0 + fade) / 2.0, weight)
         # a body is no model: what is off by less than this needs no other pose
-        spread = covariance / np.maximum(worth, 1.0)[:, None, None] + _MISFIT**2 * np.eye(3)
+        averaged = white * (1.0 - 1.0 / np.maximum(worth, 1.0))  # only what is white averages out
+        spread = covariance + (_MISFIT**2 - averaged)[:, None, None] * np.eye(3)
         solved = np.linalg.solve(spread, lean[:, :, None])[:, :, 0]
         strain = np.where(weight > _LEAN_FRAMES, (lean * solved).sum(axis=1), 0.0)
         return lean, weight, float(strain.max())
@@ -901,13 +954,13 @@ class ExtendedKalmanFilter:
         posture = self.model.forward(state.q, state.lengths)
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
-        stddev = np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2)
+        stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2), np.inf)
         state = replace(state, lean=np.zeros_like(state.lean), leaning=np.zeros(self._points), strain=0.0)
         return self._restarted(state, points, stddev, _MUCH_BETTER)
 
     def _point_stddev(self, measurement: _Measurement, sensors: Mapping[str, _SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
-        sensor = sensors.get(measurement.sensor) or self._unknown_sensor()
+        sensor = sensors.get(measurement.sensor) or self._unknown_sensor(measurement)
         return np.where(
             measurement.measured, np.sqrt(sensor.white + sensor.slow[0] * measurement.model_variance), np.inf
         )
@@ -1002,20 +1055,23 @@ class ExtendedKalmanFilter:
         stddev = np.append(self.ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
         tangent = state.covariance[self._tangent, self._tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
-        density = np.exp(state.log_density)[self._group]
-        spread = np.append(density[6:], density[6:][self._twist != 0.0].max()) * self.parameters.velocity_time**2
-        # A walk of this spread, told so much per second, comes to rest at the range's deviation. Told only where
-        # an angle is as good as unknown: elsewhere it would draw what is measured towards the middle.
-        unknown = variance > (_UNKNOWN * stddev) ** 2
-        noise = stddev**4 / (spread * state.since_prior)
+        # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that.
+        limit = (_UNKNOWN * stddev) ** 2
+        unknown = variance > limit
+        noise = variance * limit / np.maximum(variance - limit, 1e-12)
         known = np.sqrt(state.covariance.diagonal()[self._lengths]).max() < self.parameters.settle_stddev
-        settled = state.settled or bool(known) or state.tracked > self.parameters.settle_time
+        early = state.tracked < _SETTLE_AFTER * self.parameters.settle_time
+        settled = state.settled or (bool(known) and not early) or state.tracked > self.parameters.settle_time
         state = replace(state, since_prior=0.0, settled=settled)
         branch = self.ranges.nearest_branch(state.q)
         if branch is not None:
             return self._turned(state, *branch)
+        state = self._unsure(state)
         if unknown.any():
             state = self._told(state, gradients[unknown], -values[unknown], noise[unknown])
+        vague = variance > (_VAGUE * stddev) ** 2
+        if vague.any():
+            state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
         beyond = excess != 0.0
         if beyond.any():
             state = self._pushed_back(state, gradients[:-1][beyond], excess[beyond])
@@ -1037,6 +1093,39 @@ class ExtendedKalmanFilter:
             moved=state.moved * signs,
             sensors=sensors,
         )
+
+    def _unsure(self, state: _State) -> _State:
+        """Take back what the update believes to know of directions that no point shows.
+
+        The unobserved directions are those of the estimate, which trembles; the update takes their turning from
+        frame to frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is
+        brought back to what the ranges of motion say.
+        """
+        jacobian = self.model.linearise(state.q, state.lengths).jacobian.reshape(-1, self._nv)
+        _, singular, axes = np.linalg.svd(jacobian, full_matrices=False)
+        null = axes[singular < _NULL * singular[0]]
+        state = replace(state, null=null)
+        if not len(null):
+            return state
+        tangent = state.covariance[self._tangent, self._tangent]
+        known = np.linalg.inv(null @ np.linalg.solve(tangent, null.T))
+        allowed = _SPURIOUS * np.linalg.inv((null * self._rest_information) @ null.T)
+        size, directions = np.linalg.eigh(allowed - known)
+        missing = (directions * np.maximum(size, 0.0)) @ directions.T
+        covariance = state.covariance.copy()
+        covariance[self._tangent, self._tangent] += null.T @ missing @ null
+        return replace(state, covariance=covariance)
+
+    def _drawn(self, state: _State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> _State:
+        """The estimate drawn to the middle of the ranges, where nothing else holds it; the covariance stays.
+
+        Without this, an angle that nothing observes would wander with the noise of those that are.
+        """
+        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+        s = observation @ cross_covariance[self._tangent] + np.diag((_DRAWN * stddev) ** 2)
+        correction = -cross_covariance @ np.linalg.solve(s, values)
+        correction[self._velocities] = 0.0
+        return self._moved(state, correction)
 
     def _within(self, state: _State) -> _State:
         """The nearest state, by the covariance, that is not far beyond any range of motion.

@@ -1,8 +1,8 @@
 """Ranges of motion: soft limits of the angles of ``upper_body``, and what is known of an angle that nothing observes.
 
 A range is no wall: people differ, and the frames of a sensor's skeleton are not those of a goniometer. Limits push back
-softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one with the
-range's centre and standard deviation (that of a uniform distribution over the range).
+softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one about the
+range's centre, which is within the range 95 % of the time: people are seldom at their limits.
 
 Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
 motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
@@ -103,7 +103,7 @@ class Ranges:
         self.low: FloatArray = np.radians(low)
         self.high: FloatArray = np.radians(high)
         self.centre: FloatArray = 0.5 * (self.low + self.high)
-        self.stddev: FloatArray = (self.high - self.low) / np.sqrt(12.0)
+        self.stddev: FloatArray = (self.high - self.low) / 4.0
         self._scalar_soft = model.scalar_v - 6
         starts = [names.index(f"shoulder_x_{side}") for side in _REACH]
         self._soft: IntArray = (np.array(starts)[:, None] - 6 + np.arange(3)).astype(np.intp)
