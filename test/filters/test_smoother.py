@@ -252,8 +252,8 @@ def test_is_never_less_certain_of_an_angle_than_the_filter(noise: float) -> None
 
 @pytest.mark.parametrize("noise", [0.005, 0.02])
 def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: float) -> None:
-    # The pitch of the pelvis, and lumbar flexion with it, hang on a lever of 3 cm: with 20 mm of noise they are far from
-    # linear, and the smoother is too sure of them (truth in its 95 % band in 68 %); its docstring says so.
+    # The pitch of the pelvis, and lumbar flexion with it, hang on a lever of 3 cm: with 20 mm of noise they are far
+    # from linear, and the smoother is too sure of them (truth in its band in 68 %); its docstring says so.
     weak = (*UNOBSERVED, "base_ry", "lumbar_flexion")
     observed = np.array([name not in weak for name in MODEL.coordinate_names])
     errors: dict[str, list[FloatArray]] = {"filter": [], "lag": [], "full": []}
