@@ -216,7 +216,11 @@ class Playback:
                 times.append(steady_ns)
             else:
                 ahead_ns = (pending.log_time_ns - self._bag_ns) / self._rate
-                times.append(self._steady_ns + math.ceil(ahead_ns))
+                wake_ns = self._steady_ns + math.ceil(ahead_ns)
+                # Rounded once there and once back, the bag's time may still be a nanosecond short of the message.
+                while self.bag_time_ns(wake_ns) < pending.log_time_ns:
+                    wake_ns += 1
+                times.append(wake_ns)
         # Paused and without ticks only a call to resume changes anything.
         return max(steady_ns, min(times, default=steady_ns + NANOSECONDS))
 

@@ -87,6 +87,12 @@ def test_everything_comes_in_order_never_early_and_the_clock_with_it(reader, sto
         assert clock_ns <= following[1] and at_ns <= following[0]
 
 
+def test_ends_at_a_rate_at_which_time_rounds_down_there_and_back(reader, stored):
+    run = Run(Playback(reader, rate=0.35))
+    run.to_the_end()
+    assert run.stored == stored
+
+
 def test_without_delays_everything_comes_on_time(reader, stored):
     run = Run(Playback(reader, rate=2.0))
     run.to_the_end()
