@@ -11,7 +11,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     ARMS,
@@ -310,10 +312,9 @@ def test_a_repeated_frame_counts_once() -> None:
     skeletons = measured(somebody(8, 1.0)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     run(once, skeletons)
-    run(twice, skeletons[:START_FRAMES])
-    outputs = run(twice, [skeleton for skeleton in skeletons[START_FRAMES:] for _ in (0, 1)])
-    assert twice.counters["repeated_stamps"] == len(skeletons) - START_FRAMES
-    assert [output is None for output in outputs] == [k % 2 == 1 for k in range(len(outputs))]
+    outputs = run(twice, [skeleton for skeleton in skeletons for _ in (0, 1)])
+    assert twice.counters["repeated_stamps"] == len(skeletons)
+    assert all(output is None for output in outputs[2 * START_FRAMES - 1 :: 2])
     assert_same(known(once), known(twice), 1e-12)
 
 
@@ -582,3 +583,47 @@ def test_parameters_out_of_range_are_refused(name: str) -> None:
             EkfParameters(**{name: bad})  # type: ignore[arg-type]
     for good in (low, high):
         EkfParameters(**{name: good})
+
+
+def test_an_older_frame_that_is_repeated_counts_once() -> None:
+    skeletons = measured(somebody(8, 1.0)).skeletons
+    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(once, skeletons)
+    run(twice, skeletons)
+    assert twice.update(skeletons[-3]) is None
+    assert twice.counters["repeated_stamps"] == 1
+    assert_same(known(once), known(twice), 1e-12)
+
+
+def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
+    """Ten minutes take too long here; benchmarks/real_people.py has them."""
+    seed = 0
+    rng = np.random.default_rng(seed)
+    lengths = RandomPerson.draw(rng).lengths
+    times = capture_times(60.0, rng, 10.0)
+    tangent = np.zeros(MODEL.nv)
+    tangent[[MODEL.coordinate_names.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(25.0)
+    tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
+    q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
+    positions = MODEL.forward(q, lengths).positions
+    truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
+    ranges = Ranges(MODEL)
+    estimator = ExtendedKalmanFilter()
+    angles, learnt = [], []
+    for skeleton in measured(truth, seed=seed).skeletons:
+        if estimator.update(skeleton) is None:
+            continue
+        estimate = known(estimator)
+        told = angles_of(estimate, MODEL, "model")
+        columns = [told.names.index(name) for name in UNOBSERVED]
+        angles.append(told.position[columns])
+        learnt.append(estimate.lengths)
+        assert np.isinf(told.position_stddev[columns]).all()
+        tangents = np.array([MODEL.coordinate_names.index(name) for name in UNOBSERVED])
+        stated = np.sqrt(estimate.covariance.diagonal()[tangents])
+        assert (stated > 0.5 * ranges.stddev[tangents - 6]).all()
+    # averages over a second: the noise of one frame is no drift
+    averages = np.stack(angles)[: len(angles) // 10 * 10].reshape(-1, 10, len(UNOBSERVED)).mean(axis=1)
+    assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0
+    # at 30 s at the latest the lengths are settled
+    assert np.abs(np.stack(learnt[310:]) - learnt[-1]).max() < 1e-9
