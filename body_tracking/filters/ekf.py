@@ -106,7 +106,7 @@ _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
 _STRAINED = 16.0
 """Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to."""
-_MISFIT = 0.025
+_MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
@@ -857,7 +857,14 @@ class ExtendedKalmanFilter:
         return replace(state, sensors={**state.sensors, measurement.sensor: sensor})
 
     def _new_state(
-        self, stamp_ns: int, q: FloatArray, lengths: FloatArray, stddev: FloatArray, previous: _State | None
+        self,
+        stamp_ns: int,
+        q: FloatArray,
+        lengths: FloatArray,
+        stddev: FloatArray,
+        previous: _State | None,
+        *,
+        keep_lengths: bool = True,
     ) -> _State:
         """A state at rest at a pose, as uncertain as a fit to points of this deviation (19,) leaves it."""
         lines = self.model.linearise(q, lengths)
@@ -871,7 +878,9 @@ class ExtendedKalmanFilter:
         # the fit took the lengths for true: their errors are in the pose
         from_lengths = -tangent @ (weighted.T @ by_length)
         lengths_covariance = (
-            self._lengths_covariance if previous is None else (previous.covariance[self._lengths, self._lengths])
+            previous.covariance[self._lengths, self._lengths]
+            if previous is not None and keep_lengths
+            else self._lengths_covariance
         )
         covariance = np.zeros((self._size, self._size))
         t, n, v = self._tangent, self._lengths, self._velocities
@@ -906,15 +915,30 @@ class ExtendedKalmanFilter:
         """Start the pose anew where another one fits the rejected points much better."""
         points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
-        return self._restarted(replace(state, rejected_for=np.zeros(self._points)), points, stddev, _MUCH_BETTER)
+        state = replace(state, rejected_for=np.zeros(self._points))
+        started = self._restarted(state, points, stddev, _MUCH_BETTER)
+        if started is not state or state.settled:
+            return started
+        # No pose fits: lengths that came from a wrong start would shut the right points out for ever.
+        covariance = state.covariance.copy()
+        covariance[self._lengths, self._lengths] += self._lengths_covariance
+        return replace(state, covariance=covariance)
 
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
         try:
             fit = self.inverse.solve(points, stddev, state.lengths)
+            # lengths that were learnt in a wrong pose are wrong, too
+            lengths = self._lengths_of(points)
+            fresh = self.inverse.solve(points, stddev, lengths, fit.q)
         except ModelError:
             return state
-        if fit.cost > share * self.inverse.cost(state.q, points, stddev, state.lengths):
+        present = self.inverse.cost(state.q, points, stddev, state.lengths)
+        if fresh.cost < share * min(fit.cost, present):
+            self.counters["restarts"] += 1
+            state = replace(state, settled=False, tracked=0.0)
+            return self._new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
+        if fit.cost > share * present:
             return state
         self.counters["restarts"] += 1
         return self._new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
