@@ -54,8 +54,8 @@ _WAIT_NS = NANOSECONDS // 2
 _FLOOR = 1e-3
 """Metres: no sensor's white noise is taken for less."""
 _MAX_COORDINATE = 100.0
-_MAX_SLOW = 9.0
-"""Greatest scale of the slow variance; three times the deviation of the measurement model."""
+_MAX_SLOW = np.array([9.0, 1.0])
+"""Greatest scales of the slow variance: of points three times the model's deviation, of limbs as it is stated."""
 _THIRD_DIFFERENCE_SPAN = 0.25
 """Seconds beyond which four frames in a row show motion, not noise."""
 _MEDIAN_OF_CHI2_3 = 0.7887
@@ -101,6 +101,8 @@ _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
+_WHOLE = 15
+"""Points that a frame must show to tell a person's size from."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
@@ -917,7 +919,7 @@ class ExtendedKalmanFilter:
         stddev = self._point_stddev(measurement, state.sensors)
         state = replace(state, rejected_for=np.zeros(self._points))
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
-        if started is not state or state.settled:
+        if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
         # No pose fits: lengths that came from a wrong start would shut the right points out for ever.
         covariance = state.covariance.copy()
@@ -934,7 +936,8 @@ class ExtendedKalmanFilter:
         except ModelError:
             return state
         present = self.inverse.cost(state.q, points, stddev, state.lengths)
-        if fresh.cost < share * min(fit.cost, present):
+        whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
+        if whole and fresh.cost < share * min(fit.cost, present):
             self.counters["restarts"] += 1
             state = replace(state, settled=False, tracked=0.0)
             return self._new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
