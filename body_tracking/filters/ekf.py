@@ -101,6 +101,8 @@ _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
+_REST_NS = NANOSECONDS // 4
+"""At least so long from one search for another pose to the next."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
 _MUCH_BETTER = 0.5
@@ -260,6 +262,7 @@ class _State:
         settled: the lengths stay.
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
+        attempted_ns: when another pose was looked for last.
     """
 
     stamp_ns: int
@@ -281,6 +284,7 @@ class _State:
     settled: bool
     null: FloatArray
     fresh: bool = False
+    attempted_ns: int = 0
 
 
 class ExtendedKalmanFilter:
@@ -485,10 +489,12 @@ class ExtendedKalmanFilter:
     def _step(self, state: _State, measurement: _Measurement) -> _State:
         state = self._predicted(state, measurement.stamp_ns)
         state = self._corrected(state, measurement)
-        if state.rejected_for.max() > self.parameters.reacquire_after:
-            state = self._reacquired(state, measurement)
-        elif state.strain > _STRAINED:
-            state = self._straightened(state, measurement)
+        # another pose takes ten times as long to look for as a frame to filter
+        if state.stamp_ns - state.attempted_ns > _REST_NS:
+            if state.rejected_for.max() > self.parameters.reacquire_after:
+                state = replace(self._reacquired(state, measurement), attempted_ns=state.stamp_ns)
+            elif state.strain > _STRAINED:
+                state = replace(self._straightened(state, measurement), attempted_ns=state.stamp_ns)
         return self._within(self._bounded(state))
 
     def _predicted(self, state: _State, stamp_ns: int) -> _State:
