@@ -383,7 +383,7 @@ def start_downstream(
         FilterError: the filter or its parameters make no sense.
         GraphError: the filter cannot do what it was asked for.
     """
-    # A forked process that ran the extended filter was seen to crash in compiled code (signal 11), about once in ten.
+    # A forked process that ran the extended filter was seen to crash in compiled code (signal 11).
     forkable = settings.filter_name != "ekf" and hasattr(os, "fork") and threading.active_count() == 1
     if forkable and len(os.sched_getaffinity(0)) > 1:
         return ForkedDownstream(settings, out, topics, overwrite=overwrite)
