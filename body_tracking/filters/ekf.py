@@ -20,13 +20,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.stats import chi2
 
-from body_tracking.filters.linear import FilterError
+from body_tracking.filters.linear import check_fields
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import InverseKinematics
@@ -77,14 +77,11 @@ _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
-_PERSISTENCE = 1.0
-"""Frames for which an error of second order counts as one and the same."""
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
-_DRAWN = 1.0
 _VAGUE = 0.5
 """Share of the range's deviation from which an angle is drawn to the middle of its range."""
 _SPURIOUS = 0.35
@@ -93,8 +90,6 @@ _SETTLE_AFTER = 0.3
 """Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
 _NULL = 1e-6
 """Singular value, as a share of the greatest, below which a direction moves no point."""
-_UNKNOWN = 1.0
-"""Share of the range's deviation above which no angle's gets."""
 _LIMIT_STDDEV = 3.0
 """Degrees: how softly limits push back, each time."""
 _HARD_STDDEV = 0.2
@@ -188,10 +183,7 @@ class EkfParameters:
     )
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
-            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-                raise FilterError(f"filter parameter {item.name}: {value!r}, expected a number from {low} to {high}")
+        check_fields(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,7 +212,7 @@ class _SensorState:
     """What the filter has learnt of a sensor.
 
     Attributes:
-        stamps: seconds of its last (at most 3) frames, relative to the newest.
+        stamps: nanoseconds of its last (at most 3) frames.
         positions: (k, 19, 3) their points, NaN where not used.
         white: (19,) variance of the white noise per axis, square metres.
         weight: (19,) how many differences stand behind it.
@@ -332,6 +324,7 @@ class ExtendedKalmanFilter:
                 "gaps",
                 "frame_changes",
                 "no_trunk",
+                "broken_covariances",
             ),
             0,
         )
@@ -346,7 +339,6 @@ class ExtendedKalmanFilter:
         self._body = 0
         self._history: list[tuple[_State, _Measurement]] = []
         self._waiting: list[_Measurement] = []
-        self._jacobian: FloatArray | None = None
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
 
@@ -409,7 +401,6 @@ class ExtendedKalmanFilter:
         empty = Skeleton(
             stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body
         )
-        self._jacobian = None
         return self._output(state, empty), self._estimate(state)
 
     # --- input
@@ -488,6 +479,23 @@ class ExtendedKalmanFilter:
 
     def _step(self, state: _State, measurement: _Measurement) -> _State:
         state = self._predicted(state, measurement.stamp_ns)
+        try:
+            return self._taken(state, measurement)
+        except np.linalg.LinAlgError:
+            # Rounding, or numbers beyond all measure, have made of the covariance what is none: nothing of it is kept.
+            self.counters["broken_covariances"] += 1
+            learnt = {name: replace(sensor, cross=None) for name, sensor in state.sensors.items()}
+            unseen = np.full(self._points, np.inf)
+            return self._first_state(measurement, None, learnt) or replace(
+                self._new_state(state.stamp_ns, state.q, state.lengths, unseen, None), sensors=learnt
+            )
+
+    def _taken(self, state: _State, measurement: _Measurement) -> _State:
+        """A state of the measurement's time, corrected by it.
+
+        Raises:
+            LinAlgError: its covariance is none.
+        """
         state = self._corrected(state, measurement)
         # another pose takes ten times as long to look for as a frame to filter
         if state.stamp_ns - state.attempted_ns > _REST_NS:
@@ -574,19 +582,18 @@ class ExtendedKalmanFilter:
         shared = None
         rows = np.arange(3 * self._points)
         if basis is not None:
-            seen = seen + basis @ basis.T
+            seen += basis @ basis.T
             if sensor.cross is not None:
                 shared = observation @ sensor.cross[: self._observed]
                 both = shared @ basis.T
                 seen += both + both.T
                 cross_covariance = cross_covariance + sensor.cross @ basis.T
-        s = seen.copy()
-        # A normal error x makes x^2 / 2 of mean m and of variance 2 m^2, and it stays for some frames.
-        persistent = 2.0 * _PERSISTENCE
+        s = seen
         s[rows, rows] += np.repeat(sensor.white, 3)
         diagonal = np.arange(self._points)
         blocks = s.reshape(self._points, 3, self._points, 3)
-        blocks[diagonal, :, diagonal] += persistent * curvature[:, :, None] * curvature[:, None, :]
+        # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
+        blocks[diagonal, :, diagonal] += 2.0 * curvature[:, :, None] * curvature[:, None, :]
         own = blocks[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
         distances = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own), y)
@@ -613,7 +620,7 @@ class ExtendedKalmanFilter:
                 strain=strain,
             )
 
-        factor, _ = dpotrf(s, lower=1, clean=1)
+        factor = _cholesky(s)
         gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)  # (k, 85): L^-1 (P H^T)^T
         white, _ = dtrtrs(factor, innovation, lower=1)
         correction = white @ gain
@@ -1056,11 +1063,6 @@ class ExtendedKalmanFilter:
         self._rest_information[6:] = 1.0 / self.ranges.stddev**2
         self._velocity_variance = np.full(self._nv, _FIRST_TURN_RATE**2)
         self._velocity_variance[:3] = _FIRST_SPEED**2
-        twist = np.zeros(self._nv - 6)
-        names = self.model.coordinate_names[6:]
-        lumbar, thoracic = (names.index(f"{part}_axial") for part in ("lumbar", "thoracic"))
-        twist[lumbar], twist[thoracic] = 1.0, -self.ranges.high[lumbar] / self.ranges.high[thoracic]
-        self._twist = twist
         path = {Joint(joint): number for number, joint in enumerate(self.model.joints)}
         bones = [(path[a], path[b]) for a, b in BONES if a in path and b in path]
         self._bones = np.array([a for a, _ in bones], dtype=np.intp), np.array([b for _, b in bones], dtype=np.intp)
@@ -1083,13 +1085,13 @@ class ExtendedKalmanFilter:
         excess = self.ranges.excess_of(soft.values)
         gradients = np.zeros((self._nv - 5, self._nv))
         gradients[:-1, 6:] = soft.gradients
-        gradients[-1, 6:] = self._twist @ soft.gradients
-        values = np.append(soft.values - self.ranges.centre, self._twist @ soft.values)
+        gradients[-1, 6:] = self.ranges.twist @ soft.gradients
+        values = np.append(soft.values - self.ranges.centre, self.ranges.twist @ soft.values)
         stddev = np.append(self.ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
         tangent = state.covariance[self._tangent, self._tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
         # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that.
-        limit = (_UNKNOWN * stddev) ** 2
+        limit = stddev**2
         unknown = variance > limit
         noise = variance * limit / np.maximum(variance - limit, 1e-12)
         known = np.sqrt(state.covariance.diagonal()[self._lengths]).max() < self.parameters.settle_stddev
@@ -1155,7 +1157,7 @@ class ExtendedKalmanFilter:
         Without this, an angle that nothing observes would wander with the noise of those that are.
         """
         cross_covariance = state.covariance[:, self._tangent] @ observation.T
-        s = observation @ cross_covariance[self._tangent] + np.diag((_DRAWN * stddev) ** 2)
+        s = observation @ cross_covariance[self._tangent] + np.diag(stddev**2)
         correction = -cross_covariance @ np.linalg.solve(s, values)
         correction[self._velocities] = 0.0
         return self._moved(state, correction)
@@ -1188,7 +1190,7 @@ class ExtendedKalmanFilter:
         """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,)."""
         cross_covariance = state.covariance[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(noise)
-        factor, _ = dpotrf(s, lower=1, clean=1)
+        factor = _cholesky(s)
         gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
         white, _ = dtrtrs(factor, error, lower=1)
         covariance = state.covariance - gain.T @ gain
@@ -1264,6 +1266,19 @@ class ExtendedKalmanFilter:
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
+
+
+def _cholesky(matrix: FloatArray) -> FloatArray:
+    """The lower factor; numpy's takes three times as long on one so small.
+
+    Raises:
+        LinAlgError: the matrix is not positive definite, or not finite.
+    """
+    factor: FloatArray
+    factor, failed = dpotrf(matrix, lower=1, clean=1)
+    if failed or not math.isfinite(float(factor.trace())):
+        raise np.linalg.LinAlgError("not positive definite")
+    return factor
 
 
 def _third_difference(stamps: Sequence[int]) -> FloatArray:

@@ -13,6 +13,7 @@ gain, the rest is carried along and added to the covariance that is handed out; 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 from filterpy.common import Q_continuous_white_noise
@@ -24,6 +25,9 @@ from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
@@ -38,6 +42,20 @@ _EYE3 = np.eye(3)
 
 class FilterError(BodyTrackingError):
     """A filter was asked for by an unknown name or with parameters that make no sense."""
+
+
+def check_fields(parameters: DataclassInstance) -> None:
+    """Check numbers of a dataclass by the ``min`` and ``max`` in their fields' metadata.
+
+    Raises:
+        FilterError: one is out of its range, or no number, or not a whole one where the default is.
+    """
+    for item in fields(parameters):
+        value, low, high = getattr(parameters, item.name), item.metadata["min"], item.metadata["max"]
+        whole = isinstance(item.default, int)
+        if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not low <= value <= high:
+            expected = f"a {'whole ' if whole else ''}number from {low} to {high}"
+            raise FilterError(f"filter parameter {item.name}: {value!r}, expected {expected}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,10 +200,7 @@ class LinearKalmanParameters:
     )
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
-            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-                raise FilterError(f"filter parameter {item.name}: {value!r}, expected a number from {low} to {high}")
+        check_fields(self)
 
 
 class LinearKalmanFilter:

@@ -14,12 +14,12 @@ what it believes, covariances that are singular along the segments included. ``f
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from body_tracking.filters.linear import FilterError
+from body_tracking.filters.linear import check_fields
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.measurement import left_right_axes
 from body_tracking.skeleton import (
@@ -127,13 +127,7 @@ class SchlagenhaufParameters:
     )
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
-            whole = isinstance(item.default, int)
-            kind = int if whole else int | float
-            if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
-                expected = f"a {'whole ' if whole else ''}number from {low} to {high}"
-                raise FilterError(f"filter parameter {item.name}: {value!r}, expected {expected}")
+        check_fields(self)
 
 
 class SchlagenhaufKalmanFilter:

@@ -57,12 +57,6 @@ class InverseKinematics:
         self._column = {name: number for number, name in enumerate(names)}
         scalars = [names[v] for v in model.scalar_v]
         self._scalar = {name: int(model.scalar_q[number]) for number, name in enumerate(scalars)}
-        self._twist = np.zeros(model.nv)
-        lumbar, thoracic = (self._column[f"{part}_axial"] for part in ("lumbar", "thoracic"))
-        # each takes of the twist what its range allows
-        self._twist[lumbar] = 1.0 / self.ranges.high[lumbar - 6]
-        self._twist[thoracic] = -1.0 / self.ranges.high[thoracic - 6]
-        self._twist /= np.abs(self._twist).max()
 
     def start(self, positions: FloatArray) -> FloatArray:
         """A configuration in closed form, from the directions between the points; no lengths are needed.
@@ -192,10 +186,10 @@ class InverseKinematics:
         inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)
         normal[6:, 6:] += inner
         gradient[6:] -= soft.gradients.T @ (prior * off + limit * over)
-        twist = float(self._twist[6:] @ soft.values)
+        twist = float(self.ranges.twist @ soft.values)
         sharing = 1.0 / np.radians(TWIST_SHARING_STDDEV) ** 2
-        normal += sharing * np.outer(self._twist, self._twist)
-        gradient -= sharing * twist * self._twist
+        normal[6:, 6:] += sharing * np.outer(self.ranges.twist, self.ranges.twist)
+        gradient[6:] -= sharing * twist * self.ranges.twist
         # the base is anywhere; with too few points it still must be somewhere
         normal[np.arange(6), np.arange(6)] += 1e-4
         cost += 0.5 * float((prior * off**2 + limit * over**2).sum() + sharing * twist**2)

@@ -86,6 +86,7 @@ class Ranges:
         low, high: (26,) radians, of :class:`SoftCoordinates`.
         centre, stddev: (26,) radians: what is known of a coordinate by its range.
         coordinates: the slice of the tangent vector that they are about.
+        twist: (26,) how far lumbar and thoracic axial rotation depart from sharing a twist by their ranges.
     """
 
     def __init__(self, model: UpperBody) -> None:
@@ -104,6 +105,9 @@ class Ranges:
         self.high: FloatArray = np.radians(high)
         self.centre: FloatArray = 0.5 * (self.low + self.high)
         self.stddev: FloatArray = (self.high - self.low) / 4.0
+        self.twist: FloatArray = np.zeros(model.nv - 6)
+        lumbar, thoracic = (names[6:].index(f"{part}_axial") for part in ("lumbar", "thoracic"))
+        self.twist[lumbar], self.twist[thoracic] = 1.0, -high[lumbar] / high[thoracic]
         self._scalar_soft = model.scalar_v - 6
         starts = [names.index(f"shoulder_x_{side}") for side in _REACH]
         self._soft: IntArray = (np.array(starts)[:, None] - 6 + np.arange(3)).astype(np.intp)

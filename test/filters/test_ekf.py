@@ -627,3 +627,15 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0
     # at 30 s at the latest the lengths are settled
     assert np.abs(np.stack(learnt[910:]) - learnt[-1]).max() < 1e-9
+
+
+def test_a_covariance_that_is_none_any_more_starts_the_pose_anew() -> None:
+    skeletons = measured(somebody(8, 2.0)).skeletons
+    estimator = ExtendedKalmanFilter()
+    run(estimator, skeletons[:20])
+    assert estimator._state is not None
+    estimator._state = replace(estimator._state, covariance=-estimator._state.covariance)
+    outputs = run(estimator, skeletons[20:])
+    assert estimator.counters["broken_covariances"] == 1
+    assert all(output is not None and np.isfinite(output.positions[POINTS]).all() for output in outputs)
+    assert (known(estimator).covariance.diagonal() > 0.0).all()
