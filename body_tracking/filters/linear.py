@@ -12,8 +12,8 @@ gain, the rest is carried along and added to the covariance that is handed out; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from filterpy.common import Q_continuous_white_noise
@@ -25,9 +25,6 @@ from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
@@ -44,7 +41,13 @@ class FilterError(BodyTrackingError):
     """A filter was asked for by an unknown name or with parameters that make no sense."""
 
 
-def check_fields(parameters: DataclassInstance) -> None:
+class Parameters(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+def check_fields(parameters: Parameters) -> None:
     """Check numbers of a dataclass by the ``min`` and ``max`` in their fields' metadata.
 
     Raises:

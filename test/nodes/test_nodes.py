@@ -317,6 +317,7 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
 def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     with Running(tmp_path) as running:
+        poses = running.collect(TransformStamped, graph.CALIBRATION, LATCHED)
         running.start("calibration", reliable=True, calibration_file=file)
         running.start(
             "bag_player",
@@ -326,6 +327,8 @@ def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
             wait_for_subscribers='["/kinect1/skeleton", "/kinect2/skeleton"]',
         )
         assert running.until(lambda: running.processes["bag_player"].poll() is not None, timeout=30.0)
+        # The player has sent everything, the calibration may still be at work on it.
+        assert running.until(lambda: any("kinect2" in pose.child_frame_id for pose in poses), timeout=30.0)
         assert stop(running.processes["calibration"]) == 0
     result = load(file)
     assert result.reference == "kinect1"
