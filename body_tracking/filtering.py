@@ -157,12 +157,14 @@ class FilterStage:
         self._publish = publish
         self._wanted = wanted if wanted is not None else lambda topic: True
         self._predicted = 0
+        self._received = dict.fromkeys(settings.sensors, 0)
 
     @property
     def counters(self) -> dict[str, int]:
         """What happened since the construction."""
         counters = dict(self._filter.counters)
         if self.alignment is not None:
+            counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
             counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
@@ -196,6 +198,7 @@ class FilterStage:
             skeletons: the bodies in it, in the sensor's own frame and clock.
             now_ns: as above.
         """
+        self._received[sensor] += 1
         subject = self._subjects[sensor].pick(skeletons)
         if subject is None or self.alignment is None or self._model_filter is None:
             return

@@ -58,8 +58,8 @@ _MAX_SLOW = np.array([9.0, 1.0])
 """Greatest scales of the slow variance: of points three times the model's deviation, of limbs as it is stated."""
 _THIRD_DIFFERENCE_SPAN = 0.25
 """Seconds beyond which four frames in a row show motion, not noise."""
-_MEDIAN_OF_CHI2_3 = 0.7887
-"""Median of the mean of three squared normal deviates."""
+_CORRELATED = 2.31
+"""So many third differences in a row, which overlap, tell of a variance as much as one and those after it, apart."""
 _NOISE_FRAMES = 600.0
 """Frames over which the white noise of a point is averaged."""
 _POOL = 8.0
@@ -215,7 +215,8 @@ class _SensorState:
         stamps: nanoseconds of its last (at most 3) frames.
         positions: (k, 19, 3) their points, NaN where not used.
         white: (19,) variance of the white noise per axis, square metres.
-        weight: (19,) how many differences stand behind it.
+        differences: (19,) mean of the squared differences of each point alone.
+        weight: (19,) how many of these there were.
         slow: (2,) scales of the slow variance: of points by themselves, of limbs.
         slow_estimate: (2,) their running estimates, of which only significant ones are used.
         slow_information: (2,) of the estimates.
@@ -225,6 +226,7 @@ class _SensorState:
     stamps: tuple[int, ...]
     positions: FloatArray
     white: FloatArray
+    differences: FloatArray
     weight: FloatArray
     slow: FloatArray
     slow_estimate: FloatArray
@@ -712,7 +714,8 @@ class ExtendedKalmanFilter:
             (),
             np.empty((0, self._points, 3)),
             white,
-            np.full(self._points, 0.5),
+            np.zeros(self._points),
+            np.zeros(self._points),
             np.array([slow, 0.0]),
             np.array([slow, 0.0]),
             np.full(2, 4.0),
@@ -723,36 +726,35 @@ class ExtendedKalmanFilter:
         """The variance of the white noise, from the third differences of the points that passed the gate."""
         points = np.where(used[:, None], measurement.positions, np.nan)
         stamps, frames = sensor.stamps, sensor.positions
-        white, weight = sensor.white, sensor.weight
         if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
             factors = _third_difference((*stamps, measurement.stamp_ns))
             difference = (factors[:3] @ frames.reshape(3, -1)).reshape(-1, 3) + factors[3] * points
             squared = (difference * difference).mean(axis=1)
             known = squared >= 0.0  # not NaN
             if known.any():
-                white, weight = self._white_learnt(white, weight, squared, known)
+                sensor = self._white_learnt(sensor, squared, known)
         frames = np.concatenate([frames[-2:], points[None]])
-        return replace(
-            sensor, stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames, white=white, weight=weight
-        )
+        return replace(sensor, stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames)
 
-    def _white_learnt(
-        self, white: FloatArray, weight: FloatArray, squared: FloatArray, known: BoolArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """(19,) variances and weights, with one more squared difference (19,) of the known points."""
-        fewest = float(weight.min())
-        bound = white
-        if fewest < 2.0 * _POOL:
+    def _white_learnt(self, sensor: _SensorState, squared: FloatArray, known: BoolArray) -> _SensorState:
+        """The sensor's noise with one more squared difference (19,) of the known points."""
+        weight, differences = sensor.weight, sensor.differences
+        early = float(weight.min()) < 2.0 * _POOL
+        bound = differences
+        if early:
             # what all points say together keeps one that was not seen yet from any value
-            pooled = float(np.median(squared[known])) / _MEDIAN_OF_CHI2_3
-            bound = np.maximum(white, pooled)
+            bound = np.maximum(bound, _typical(squared[known], 1.0))
         kept = np.minimum(weight, _NOISE_FRAMES)
-        mean = (kept * white + np.minimum(squared, _OUTLYING * bound)) / (kept + 1.0)
-        if fewest < 2.0 * _POOL:
+        differences = np.where(
+            known, (kept * differences + np.minimum(squared, _OUTLYING * bound)) / (kept + 1.0), differences
+        )
+        weight = np.where(known, kept + 1.0, weight)
+        white = differences
+        if early:
+            seen = weight > 0.0
             share = np.maximum(1.0 - weight / (2.0 * _POOL), 0.0)
-            mean += share * (np.median(mean[known]) - mean)
-        white = np.maximum(np.where(known, mean, white), _FLOOR**2)
-        return white, np.where(known, kept + 1.0, weight)
+            white = differences + share * (_typical(differences[seen], float(np.median(weight[seen]))) - differences)
+        return replace(sensor, white=np.maximum(white, _FLOOR**2), differences=differences, weight=weight)
 
     def _slow_learnt(
         self,
@@ -1279,6 +1281,13 @@ def _cholesky(matrix: FloatArray) -> FloatArray:
     if failed or not math.isfinite(float(factor.trace())):
         raise np.linalg.LinAlgError("not positive definite")
     return factor
+
+
+def _typical(variances: FloatArray, weight: float) -> float:
+    """What several variances say together, each the mean of so many squared third differences, some of outliers."""
+    freedom = _DIMENSIONS * (1.0 + (weight - 1.0) / _CORRELATED)
+    # Wilson and Hilferty 1931: the median of chi-square over its mean
+    return float(np.median(variances)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
 
 
 def _third_difference(stamps: Sequence[int]) -> FloatArray:

@@ -1,0 +1,396 @@
+"""Four sensors of 30 Hz live through the graph: what is lost, what each node costs, and how late its output is.
+
+A person is simulated as for the shipped bags, in their three motions, seen by four Kinects that run on clocks of their
+own and deliver after different times, so that many frames come after later ones of other sensors. ``body_tracking up``
+plays them at their times through four sensor nodes, the filter ``ekf`` takes each frame by itself, best effort as by
+default.
+
+All is measured from outside: frames by the recording and by what the nodes say in ``/diagnostics``, processor time by
+the system's account of each process over the steady part, delays by the capture stamps of what this process receives.
+Delays count from capture, with the time that the sensor took to deliver (``delay`` in the table of sensors), and from
+delivery. A frame that comes after a later one has no output of its own: the filter takes the later ones again with it.
+
+The bars: no frame that a sensor delivered is lost or refused, and the filter takes less than 30 % of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+
+import numpy as np
+import psutil
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+
+from body_tracking import graph
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality, level_pose
+from body_tracking.calibration.storage import save
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.parameters import SECTION
+from body_tracking.recording.qos import RELIABLE
+from body_tracking.sensors import RecordedFrame
+from body_tracking.simulation.bags import (
+    DISTANCE,
+    RECEIVED_FROM_NS,
+    START_NS,
+    SimulatedRecording,
+    layout,
+    true_positions,
+    write_bag,
+)
+from body_tracking.simulation.figure import Pose
+from body_tracking.simulation.motions import MOTIONS, Motion
+from body_tracking.simulation.sensors import Errors, SimulatedSensor
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+FILTER = "ekf"
+LIMIT = 0.30
+"""Share of one core that the filter node may take."""
+
+SETTLE, TAIL = 7.0, 2.5
+"""Seconds before the steady part, in which person and sensors become known, and after it."""
+
+START_AFTER = 8.0
+"""Seconds until the sensors deliver: every node is there by then."""
+
+SEED = 4
+_BLEND = 0.5
+"""Seconds before and after the end of a motion in which it turns into the next; both are in a T-pose."""
+
+_DELAYS = ((0.022, 0.003), (0.034, 0.004), (0.028, 0.003), (0.045, 0.006))
+"""Seconds that each sensor takes to deliver: at least, and more on average."""
+
+# Frames that the filter was given and did not take, by its counters.
+_REFUSED = ("too_late", "repeated_stamps", "alignment uncalibrated", "alignment other_clock", "malformed", "refused")
+_STAMP = struct.Struct("<iI")
+
+
+# --- the recording
+
+
+def sensors() -> tuple[SimulatedSensor, ...]:
+    """The two sensors of the shipped bags, one in front of the person and one far to the side of the first."""
+    known = layout()
+    others = (
+        _facing("kinect3", 225.0, 2.4, 0.25, ClockModel(1_414_213_562, -21.0, START_NS), 0.0071),
+        _facing("kinect4", 145.0, 2.2, -0.1, ClockModel(-577_215_664, 55.0, START_NS), 0.0263),
+    )
+    return tuple(
+        replace(sensor, errors=Errors(delay=least, delay_jitter=more))
+        for sensor, (least, more) in zip((*known, *others), _DELAYS, strict=True)
+    )
+
+
+def _facing(
+    name: str, bearing: float, distance: float, height: float, clock: ClockModel, phase: float
+) -> SimulatedSensor:
+    """A sensor that the person has in this direction (degrees in ``world``), looking at the person."""
+    angle = np.radians(bearing)
+    place = np.array([DISTANCE + distance * np.cos(angle), distance * np.sin(angle), height])
+    turned = Rotation.from_euler("z", angle + np.pi) * Rotation.from_quat(level_pose(name, pitch=0.05).quat_xyzw)
+    return SimulatedSensor(SensorPose(name, place, turned.as_quat()), clock, phase)
+
+
+def all_motions(duration: float) -> Motion:
+    """The three motions one after the other, again and again."""
+
+    def pose(times: FloatArray) -> Pose:
+        start, number, result = 0.0, 0, MOTIONS[0].pose(times)
+        while start < duration:
+            start, number = start + MOTIONS[number % len(MOTIONS)].duration, number + 1
+            share = np.clip((times - start + _BLEND) / (2.0 * _BLEND), 0.0, 1.0)
+            share = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
+            coming = MOTIONS[number % len(MOTIONS)].pose(times - start)
+            result = Pose(
+                *(
+                    (1.0 - share) * getattr(result, name) + share * getattr(coming, name)
+                    for name in Pose.__dataclass_fields__
+                )
+            )
+        return result
+
+    return Motion("four_sensors", duration, pose)
+
+
+def simulate(duration: float) -> SimulatedRecording:
+    """The recording; the same numbers each time."""
+    motion, frames = all_motions(duration), []
+    for number, sensor in enumerate(sensors()):
+        rng = np.random.default_rng([SEED, number])
+        times = sensor.capture_times(duration, rng)
+        frames += sensor.observe(times, true_positions(motion, times), START_NS, RECEIVED_FROM_NS, rng)
+    frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
+    return SimulatedRecording(motion.name, sensors(), tuple(frames), ())
+
+
+def captures(recording: SimulatedRecording) -> list[int]:
+    """Nanoseconds after the start at which each frame was taken."""
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    return [clocks[each.sensor].to_reference(each.skeletons[0].stamp_ns) - START_NS for each in recording.frames]
+
+
+def disorder(taken: Sequence[int]) -> dict[str, int]:
+    """How many frames come after later ones, and how many of these they come after, in all."""
+    behind = [sum(other > each for other in taken[max(0, k - 40) : k]) for k, each in enumerate(taken)]
+    return {"late": sum(count > 0 for count in behind), "steps_again": sum(behind)}
+
+
+# --- the measurement
+
+
+class Ear:
+    """Receives what the graph puts out, and its diagnostics."""
+
+    def __init__(self) -> None:
+        rclpy.init()
+        self.node = rclpy.create_node("four_sensors_bench")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.outputs: dict[str, dict[int, int]] = {"model_state": {}, "joint_states": {}}
+        self.statuses: dict[str, tuple[float, dict[str, str]]] = {}
+        best_effort, reliable = to_profile(graph.SKELETON), to_profile(RELIABLE)
+        self.node.create_subscription(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, reliable)
+        for name, topic, qos in (
+            ("model_state", graph.MODEL_STATE, best_effort),
+            ("joint_states", graph.joint_states_topic(graph.DEFAULT_BODY), reliable),
+        ):
+            self.node.create_subscription(JointState, topic, self._taker(self.outputs[name]), qos, raw=True)
+
+    def _taker(self, received: dict[int, int]) -> Callable[[bytes], None]:
+        def on_message(cdr: bytes) -> None:
+            sec, nanosec = _STAMP.unpack_from(cdr, 4)
+            received.setdefault(sec * NANOSECONDS + nanosec, time.time_ns())
+
+        return on_message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.split(":")[0]
+            self.statuses[name] = time.time(), {pair.key: pair.value for pair in status.values}
+
+    def until(self, wall: float, alive: Callable[[], bool]) -> None:
+        """Listen until a wall time."""
+        while time.time() < wall:
+            if not alive():
+                raise SystemExit("four_sensors: the graph ended too early")
+            self.executor.spin_once(timeout_sec=min(0.2, max(0.0, wall - time.time())))
+
+    def close(self) -> None:
+        rclpy.try_shutdown()
+
+
+@contextlib.contextmanager
+def running_graph(folder: Path, recording: SimulatedRecording, start: float) -> Iterator[subprocess.Popen[bytes]]:
+    """``body_tracking up`` with four sensor nodes that begin to play at a wall time."""
+    bag, calibration, file = folder / "bag", folder / "calibration.yaml", folder / "parameters.yaml"
+    write_bag(recording, bag)
+    names = [sensor.pose.sensor for sensor in recording.sensors]
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
+    save(CalibrationResult(names[0], poses, clocks, quality), calibration)
+    values = {f"{name}_skeleton": {SECTION: {"file": str(bag), "start_time": start}} for name in names}
+    file.write_text(yaml.safe_dump(values), encoding="utf-8")
+    command = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", FILTER, "--sensors", ",".join(names)]
+    command += ["--params-file", str(file), "--calibration", str(calibration), "--log-dir", str(folder)]
+    with (folder / "up.log").open("wb") as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)  # it ends its nodes itself
+        try:
+            process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            process.kill()  # and its nodes with it
+            process.wait()
+
+
+def nodes_of(pid: int) -> dict[str, psutil.Process]:
+    """The node processes of a graph by name."""
+    found = {}
+    for process in psutil.Process(pid).children():
+        with contextlib.suppress(psutil.Error):
+            words = process.cmdline()
+            names = [word.removeprefix("__node:=") for word in words if word.startswith("__node:=")]
+            if names:
+                found[names[0]] = process
+    return found
+
+
+def _cpu(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """Run the graph once."""
+    recording = simulate(SETTLE + seconds + TAIL)
+    taken = captures(recording)
+    start = time.time() + START_AFTER
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        up = stack.enter_context(running_graph(folder, recording, start))
+        ear = Ear()
+        stack.callback(ear.close)
+
+        def alive() -> bool:
+            return up.poll() is None
+
+        ear.until(start + SETTLE, alive)
+        processes = nodes_of(up.pid)
+        begin, before = time.monotonic(), {name: _cpu(process) for name, process in processes.items()}
+        ear.until(start + SETTLE + seconds, alive)
+        elapsed = time.monotonic() - begin
+        share = {name: (_cpu(process) - before[name]) / elapsed for name, process in processes.items()}
+        # The last frame is through, and everybody has reported once more.
+        ear.until(
+            start + max(frame.received_ns - RECEIVED_FROM_NS for frame in recording.frames) / NANOSECONDS + 2.5, alive
+        )
+    if "skeleton_filter" not in share or "skeleton_filter" not in ear.statuses:
+        raise SystemExit("four_sensors: the filter node was not there")
+    return {
+        "seconds": round(elapsed, 1),
+        "filter": FILTER,
+        "sensors": _sensor_rows(recording, taken, ear),
+        "refused": _refused(ear),
+        "disorder": {**disorder(taken), "counted_late": _number(ear, "skeleton_filter", "late_frames")},
+        "outputs": _delays(recording, taken, ear, start, SETTLE, SETTLE + seconds),
+        "cpu_percent": {name: round(100.0 * value, 1) for name, value in sorted(share.items(), key=lambda i: -i[1])},
+    }
+
+
+def _number(ear: Ear, node: str, key: str) -> int:
+    return int(ear.statuses.get(node, (0.0, {}))[1].get(key, 0))
+
+
+def _refused(ear: Ear) -> dict[str, int]:
+    return {name: _number(ear, "skeleton_filter", name) for name in _REFUSED}
+
+
+def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: Ear) -> dict[str, dict[str, float]]:
+    """Of each sensor: frames and delays."""
+    rows = {}
+    for sensor in recording.sensors:
+        name = sensor.pose.sensor
+        own = [k for k, frame in enumerate(recording.frames) if frame.sensor == name]
+        delays = [(_delivered(recording.frames[k]) - taken[k]) / 1e6 for k in own]
+        rows[name] = {
+            "recorded": len(own),
+            "sent": _number(ear, f"{name}_skeleton", "published"),
+            "taken": _number(ear, "skeleton_filter", f"frames of {name}"),
+            "delay_median_ms": round(float(np.median(delays)), 1),
+            "delay_max_ms": round(max(delays), 1),
+        }
+    return rows
+
+
+def _delivered(frame: RecordedFrame) -> int:
+    """Nanoseconds after the start."""
+    return frame.received_ns - RECEIVED_FROM_NS
+
+
+def _delays(
+    recording: SimulatedRecording, taken: list[int], ear: Ear, start: float, begin: float, end: float
+) -> dict[str, dict[str, float]]:
+    """Of each output, in the steady part: how many, and how long after capture and after delivery."""
+    order = np.argsort(taken)
+    times = np.array(taken)[order]
+    delivered = np.array([_delivered(frame) for frame in recording.frames])[order]
+    start_ns = round(start * NANOSECONDS)
+    result = {}
+    for name, received in ear.outputs.items():
+        stamps = np.array(sorted(received)) - START_NS
+        arrived = np.array([received[stamp] for stamp in sorted(received)]) - start_ns
+        steady = (stamps >= begin * NANOSECONDS) & (stamps < end * NANOSECONDS)
+        stamps, arrived = stamps[steady], arrived[steady]
+        if not len(stamps):
+            raise SystemExit(f"four_sensors: no {name} came")
+        nearest = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
+        nearest -= stamps - times[nearest - 1] < times[nearest] - stamps
+        # Not among the frames: predicted, or the calibration has moved a clock.
+        known = np.abs(times[nearest] - stamps) < 20_000
+        row: dict[str, float] = {"count": len(stamps), "matched": int(known.sum())}
+        for since, values in (("capture", arrived - stamps), ("delivery", (arrived - delivered[nearest])[known])):
+            for key, percent in (("median", 50), ("p99", 99)):
+                row[f"{since}_{key}_ms"] = round(float(np.percentile(values, percent)) / 1e6, 2)
+        result[name] = row
+    return result
+
+
+# --- the command
+
+
+def bars(result: dict[str, Any]) -> dict[str, bool]:
+    """Which are met."""
+    rows = result["sensors"].values()
+    whole = all(row["recorded"] == row["sent"] == row["taken"] for row in rows) and not any(result["refused"].values())
+    return {"no_frame_lost": whole, "filter_below_30_percent": result["cpu_percent"]["skeleton_filter"] < 100.0 * LIMIT}
+
+
+def show(result: dict[str, Any]) -> None:
+    """The table."""
+    print(f"four sensors at 30 Hz live, filter {result['filter']}, {result['seconds']:g} s steady")
+    print("  sensor     recorded   sent  taken   delay median    max")
+    for name, row in result["sensors"].items():
+        print(
+            f"  {name:10} {row['recorded']:8} {row['sent']:6} {row['taken']:6}      "
+            f"{row['delay_median_ms']:5.1f} ms {row['delay_max_ms']:5.1f} ms"
+        )
+    print("  refused by the filter: " + ", ".join(f"{name} {count}" for name, count in result["refused"].items()))
+    order, frames = result["disorder"], sum(row["recorded"] for row in result["sensors"].values())
+    print(
+        f"  frames that come after later ones: {order['late']} of {frames} (by the filter {order['counted_late']}); "
+        f"frames to take again: {order['steps_again']} ({order['steps_again'] / frames:.2f} per frame)"
+    )
+    for name, row in result["outputs"].items():
+        print(
+            f"  {name:12} {row['count']} messages   from capture median {row['capture_median_ms']:6.1f} ms  "
+            f"99 % {row['capture_p99_ms']:6.1f} ms   from delivery {row['delivery_median_ms']:6.1f} ms  "
+            f"{row['delivery_p99_ms']:6.1f} ms"
+        )
+    print("  processor time, % of one core: " + ", ".join(f"{k} {v:.1f}" for k, v in result["cpu_percent"].items()))
+    for name, met in bars(result).items():
+        print(f"  {name}: {'met' if met else 'missed'}")
+
+
+def main() -> int:
+    """The command: 0, or 1 when a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=30.0, help="steady seconds to measure (default 30)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    if not 1.0 <= args.seconds <= 600.0:
+        parser.error(f"--seconds {args.seconds:g}: expected 1 to 600")
+    result = measure(args.seconds)
+    result["bars"] = bars(result)
+    if args.json:
+        print(json.dumps(result, indent=2))
+    else:
+        show(result)
+    return 0 if all(result["bars"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
