@@ -84,7 +84,7 @@ _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
 _VAGUE = 0.5
 """Share of the range's deviation from which an angle is drawn to the middle of its range."""
-_SPURIOUS = 0.35
+_SPURIOUS = 0.7
 """Share of what the ranges say below which the variance of an unobserved direction is taken to be false."""
 _SETTLE_AFTER = 0.3
 """Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
@@ -128,13 +128,21 @@ class EkfParameters:
         FilterError: a value out of its range.
     """
 
-    velocity_time: float = _parameter(1.5, "time in which a velocity fades when nothing renews it", "s", 0.05, 100.0)
+    velocity_time: float = _parameter(0.8, "time in which a velocity fades when nothing renews it", "s", 0.05, 100.0)
     density_translation: float = _parameter(
         1.0, "spectral density of the base's acceleration per axis, before it is learnt", "m2/s3", 1e-5, 1e3
     )
     density_trunk: float = _parameter(
         2.0,
-        "spectral density of the angular acceleration of base, spine, neck, clavicles, at first",
+        "spectral density of the angular acceleration of the base's tilt, spine, neck, clavicles, at first",
+        "rad2/s3",
+        1e-4,
+        1e4,
+    )
+    density_turn: float = _parameter(
+        20.0,
+        "spectral density of the angular acceleration with which the whole person turns, at first: people stand, and "
+        "then turn at once",
         "rad2/s3",
         1e-4,
         1e4,
@@ -1041,7 +1049,8 @@ class ExtendedKalmanFilter:
                 keys.append(key)
                 limb, hand = key.startswith(("shoulder", "elbow")), key.startswith(("forearm", "wrist"))
                 density = p.density_limb if limb else p.density_hand if hand else p.density_trunk
-                densities.append(p.density_translation if key in ("base_level", "base_height") else density)
+                base = {"base_level": p.density_translation, "base_height": p.density_translation}
+                densities.append({**base, "base_turn": p.density_turn}.get(key, density))
             groups[number] = keys.index(key)
         return groups, np.log(densities)
 

@@ -43,17 +43,14 @@ from body_tracking.skeleton import FloatArray, IntArray
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
 
-KNOWN_SHARE = 0.5
-"""An angle counts as observed while its standard deviation is below this share of that of its range of motion.
+KNOWN_SHARE = 0.6
+"""An angle counts as observed while its standard deviation is below this share of what its range of motion alone says.
 
-The range alone, a uniform distribution, already tells an angle to within its own standard deviation; a filter that uses
-ranges as weak measurements never says more than that of an angle that nothing else observes. Half of it is a fourth of
-the variance: three quarters of what is known then come from measurements.
+A filter that uses ranges as weak measurements never says much more than the range of an angle that nothing else
+observes. This share of the deviation is a third of the variance: two thirds of what is known then come from elsewhere.
 """
-GREATEST_STDDEV = np.pi / np.sqrt(12.0)
-"""Radians: that of a uniform distribution over half a turn; what the range of a split angle says is never more.
-
-At a singular pose the range's own share grows without bound too, and would hide that the angle is lost.
+GREATEST_STDDEV = np.pi / 6.0
+"""Radians: of half a turn with the limits at three deviations; what the range of a split angle says is never more.
 """
 
 _ROUNDING = 1e-9

@@ -2,7 +2,7 @@
 
 A range is no wall: people differ, and the frames of a sensor's skeleton are not those of a goniometer. Limits push back
 softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one about the
-range's centre, which is within the range 95 % of the time: people are seldom at their limits.
+range's centre with the limits at three standard deviations: people move about the middle and are seldom at their limits.
 
 Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
 motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
@@ -43,6 +43,8 @@ SHOULDER_SWING = 130.0
 """Degrees by which an upper arm may point away from the centre of its reach."""
 SHOULDER_TWIST = 110.0
 """Degrees by which it may be turned about itself against the shortest way there, to either side."""
+RANGE_DEVIATIONS = 3.0
+"""Standard deviations from the centre of a range to its limits."""
 TWIST_SHARING_STDDEV = 30.0
 """Degrees by which the lumbar part of a twist departs from its share by the ranges. Weak: nothing separates the two."""
 
@@ -104,7 +106,7 @@ class Ranges:
         self.low: FloatArray = np.radians(low)
         self.high: FloatArray = np.radians(high)
         self.centre: FloatArray = 0.5 * (self.low + self.high)
-        self.stddev: FloatArray = (self.high - self.low) / 4.0
+        self.stddev: FloatArray = (self.high - self.low) / (2.0 * RANGE_DEVIATIONS)
         self.twist: FloatArray = np.zeros(model.nv - 6)
         lumbar, thoracic = (names[6:].index(f"{part}_axial") for part in ("lumbar", "thoracic"))
         self.twist[lumbar], self.twist[thoracic] = 1.0, -high[lumbar] / high[thoracic]
