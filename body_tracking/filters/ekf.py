@@ -228,7 +228,6 @@ class _SensorState:
         slow: (2,) scales of the slow variance: of points by themselves, of limbs.
         slow_estimate: (2,) their running estimates, of which only significant ones are used.
         slow_information: (2,) of the estimates.
-        cross: (85, 61) covariance of the state with the slow errors, these in units of their deviation; None for zero.
     """
 
     stamps: tuple[int, ...]
@@ -239,7 +238,6 @@ class _SensorState:
     slow: FloatArray
     slow_estimate: FloatArray
     slow_information: FloatArray
-    cross: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,6 +252,8 @@ class _State:
         moved: (32,) faded sum of the corrections of the velocities.
         moved_variance: (32,) its variance, if all is right.
         sensors: what is known of each.
+        slow_names: (n,) those with whose slow errors the state is correlated.
+        crosses: (85, 61 n) covariance of the state with the slow errors of these, in units of their deviation.
         rejected_for: (19,) seconds.
         lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
         leaning: (19,) how many innovations it is worth.
@@ -276,6 +276,8 @@ class _State:
     moved: FloatArray
     moved_variance: FloatArray
     sensors: dict[str, _SensorState]
+    slow_names: tuple[str, ...]
+    crosses: FloatArray
     rejected_for: FloatArray
     lean: FloatArray
     leaning: FloatArray
@@ -287,6 +289,13 @@ class _State:
     null: FloatArray
     fresh: bool = False
     attempted_ns: int = 0
+
+    def cross(self, name: str) -> FloatArray | None:
+        """(85, 61) of ``crosses``, those of one sensor; None for zero."""
+        if name not in self.slow_names:
+            return None
+        place, size = self.slow_names.index(name), self.crosses.shape[1] // len(self.slow_names)
+        return self.crosses[:, place * size : (place + 1) * size]
 
 
 class ExtendedKalmanFilter:
@@ -318,6 +327,7 @@ class ExtendedKalmanFilter:
         self._group_sum[self._group, np.arange(self._nv)] = 1.0
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self._limb_points = self._limb_table()
+        self._slow_size = 3 * self._points + len(self._limbs)
         self._pose_prior()
         self._lengths_prior()
         self.counters: dict[str, int] = dict.fromkeys(
@@ -494,7 +504,7 @@ class ExtendedKalmanFilter:
         except np.linalg.LinAlgError:
             # Rounding, or numbers beyond all measure, have made of the covariance what is none: nothing of it is kept.
             self.counters["broken_covariances"] += 1
-            learnt = {name: replace(sensor, cross=None) for name, sensor in state.sensors.items()}
+            learnt = state.sensors
             unseen = np.full(self._points, np.inf)
             return self._first_state(measurement, None, learnt) or replace(
                 self._new_state(state.stamp_ns, state.q, state.lengths, unseen, None), sensors=learnt
@@ -544,15 +554,9 @@ class ExtendedKalmanFilter:
         p[tangent, velocities] += tv * density
         p[velocities, tangent] += tv * density
 
-        slow_fade = np.exp(-dt / self.parameters.slow_time)
-        sensors = {}
-        for name, sensor in state.sensors.items():
-            cross = sensor.cross
-            if cross is not None:
-                cross = slow_fade * cross
-                cross[t] = turn @ cross[t] + reach * cross[v]
-                cross[v] *= fade
-            sensors[name] = replace(sensor, cross=cross)
+        crosses = np.exp(-dt / self.parameters.slow_time) * state.crosses
+        crosses[t] = turn @ crosses[t] + reach * crosses[v]
+        crosses[v] *= fade
         fading = np.exp(-dt / _WHITENESS_TIME)
         return replace(
             state,
@@ -562,7 +566,7 @@ class ExtendedKalmanFilter:
             covariance=p,
             moved=fading * state.moved,
             moved_variance=fading * fading * state.moved_variance,
-            sensors=sensors,
+            crosses=crosses,
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
             fresh=False,
@@ -589,15 +593,14 @@ class ExtendedKalmanFilter:
         cross_covariance = state.covariance[:, : self._observed] @ observation.T
         seen = observation @ cross_covariance[: self._observed]
         basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
-        shared = None
+        cross = state.cross(measurement.sensor)
         rows = np.arange(3 * self._points)
         if basis is not None:
             seen += basis @ basis.T
-            if sensor.cross is not None:
-                shared = observation @ sensor.cross[: self._observed]
-                both = shared @ basis.T
+            if cross is not None:
+                both = (observation @ cross[: self._observed]) @ basis.T
                 seen += both + both.T
-                cross_covariance = cross_covariance + sensor.cross @ basis.T
+                cross_covariance = cross_covariance + cross @ basis.T
         s = seen
         s[rows, rows] += np.repeat(sensor.white, 3)
         diagonal = np.arange(self._points)
@@ -644,16 +647,24 @@ class ExtendedKalmanFilter:
                 part -= (state.null @ part) @ state.null
         self.innovation_distance, self.innovation_dimension = float(white @ white), len(white)
 
-        sensors = dict(state.sensors)
-        for name, other in state.sensors.items():
-            if other.cross is not None and name != measurement.sensor:
-                part = observation[rows] @ other.cross[: self._observed]
-                sensors[name] = replace(other, cross=self._considered(other.cross, gain, factor, part, state.settled))
+        names, crosses = state.slow_names, state.crosses
+        if measurement.sensor in names and basis is None:
+            names, crosses = _without(names, crosses, measurement.sensor)
+        elif measurement.sensor not in names and basis is not None:
+            names = (*names, measurement.sensor)
+            crosses = np.concatenate([crosses, np.zeros((self._size, self._slow_size))], axis=1)
         own_cross = None
-        if basis is not None:
-            part = basis if shared is None else shared + basis
-            cross = np.zeros((self._size, basis.shape[1])) if sensor.cross is None else sensor.cross
-            own_cross = self._considered(cross, gain, factor, part[rows], state.settled)
+        if names:
+            # Slow errors are only considered (Schmidt 1966): C - K H C, and - K B of the sensor's own.
+            kalman, _ = dtrtrs(factor, gain, lower=1, trans=1)  # (k, 85), transposed
+            before_it = crosses
+            crosses = before_it - (kalman.T @ observation[rows]) @ before_it[: self._observed]
+            if basis is not None:
+                place = names.index(measurement.sensor) * self._slow_size
+                own_cross = crosses[:, place : place + self._slow_size]
+                own_cross -= kalman.T @ basis[rows]
+            if state.settled:
+                crosses[self._lengths] = before_it[self._lengths]
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
@@ -665,9 +676,8 @@ class ExtendedKalmanFilter:
             ratio = self._per_error(np.where(sensor.slow > _NEGLIGIBLE_SLOW, slow_scale / before_that, 1.0))
             covariance -= (own_cross * (1.0 - ratio)) @ own_cross.T
             own_cross *= np.sqrt(ratio)
-        sensors[measurement.sensor] = replace(
+        learnt = replace(
             self._seen_by(sensor, measurement, used),
-            cross=own_cross,
             slow=slow_scale,
             slow_estimate=slow_estimate,
             slow_information=information,
@@ -681,31 +691,15 @@ class ExtendedKalmanFilter:
             log_density=self._densities_learnt(state, moved, moved_variance, after, dt),
             moved=moved,
             moved_variance=moved_variance,
-            sensors=sensors,
+            sensors={**state.sensors, measurement.sensor: learnt},
+            slow_names=names,
+            crosses=crosses,
             rejected_for=rejected_for,
             used_ns=used_ns,
             lean=lean,
             leaning=leaning,
             strain=strain,
         )
-
-    def _considered(
-        self, cross: FloatArray, gain: FloatArray, factor: FloatArray, part: FloatArray, settled: bool
-    ) -> FloatArray:
-        """Covariance of the corrected state with slow errors, which are not estimated themselves (Schmidt 1966).
-
-        Args:
-            cross: (85, 61) before.
-            gain: (k, 85) of the correction.
-            factor: (k, k) of the innovation's covariance.
-            part: (k, 61) covariance of the innovation with the slow errors.
-            settled: whether the lengths are only considered, too.
-        """
-        half, _ = dtrtrs(factor, part, lower=1)
-        result: FloatArray = cross - gain.T @ half
-        if settled:
-            result[self._lengths] = cross[self._lengths]
-        return result
 
     def _last_stamp(self, state: _State, measurement: _Measurement) -> int:
         sensor = state.sensors.get(measurement.sensor)
@@ -727,7 +721,6 @@ class ExtendedKalmanFilter:
             np.array([slow, 0.0]),
             np.array([slow, 0.0]),
             np.full(2, 4.0),
-            None,
         )
 
     def _seen_by(self, sensor: _SensorState, measurement: _Measurement, used: BoolArray) -> _SensorState:
@@ -737,7 +730,7 @@ class ExtendedKalmanFilter:
         if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
             factors = _third_difference((*stamps, measurement.stamp_ns))
             difference = (factors[:3] @ frames.reshape(3, -1)).reshape(-1, 3) + factors[3] * points
-            squared = (difference * difference).mean(axis=1)
+            squared = np.einsum("pi,pi->p", difference, difference) / _DIMENSIONS
             known = squared >= 0.0  # not NaN
             if known.any():
                 sensor = self._white_learnt(sensor, squared, known)
@@ -782,7 +775,7 @@ class ExtendedKalmanFilter:
             return unchanged  # what is white is not known yet, and would be taken for slow
         if sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
             return unchanged  # it changes slowly, and takes a while to compute
-        half, _ = dtrtrs(factor, self._unit_basis(measurement, measurement.positions)[rows], lower=1)
+        half, _ = dtrtrs(factor, self._basis_of(measurement, measurement.positions)[rows], lower=1)
         likely = white @ half
         gram = half.T @ half
         expected = gram.diagonal()
@@ -807,19 +800,21 @@ class ExtendedKalmanFilter:
         """(57, 61) displacement of the points by each slow error of unit variance; None where these are negligible."""
         if scales.max() < _NEGLIGIBLE_SLOW:
             return None
-        return self._unit_basis(measurement, positions) * np.sqrt(self._per_error(scales))
+        return self._basis_of(measurement, positions, *np.sqrt(scales))
 
-    def _unit_basis(self, measurement: _Measurement, positions: FloatArray) -> FloatArray:
-        """The same at unit scale.
+    def _basis_of(
+        self, measurement: _Measurement, positions: FloatArray, of_points: float = 1.0, of_limbs: float = 1.0
+    ) -> FloatArray:
+        """The same for slow errors of points and limbs that are so many times the stated deviations.
 
         Each point is off by itself, and the upper arms and forearms are too long or too short in some poses, with all
         that hangs on them: along a limb a depth sensor finds its joints by a tenth of the length nearer or farther.
         """
         basis = np.zeros((3 * self._points, 3 * self._points + len(self._limbs)))
         diagonal = np.arange(3 * self._points)
-        basis[diagonal, diagonal] = np.repeat(np.sqrt(measurement.model_variance), 3)
+        basis[diagonal, diagonal] = (of_points * np.sqrt(measurement.model_variance)).repeat(3)
         starts, ends, beyond = self._limb_points
-        along = _STRETCH * (positions[ends] - positions[starts])
+        along = of_limbs * _STRETCH * (positions[ends] - positions[starts])
         basis[:, 3 * self._points :] = (beyond[:, None, :] * along.T).reshape(-1, len(self._limbs))
         return basis
 
@@ -878,7 +873,7 @@ class ExtendedKalmanFilter:
         state = self._new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
         state = replace(state, fresh=True, sensors=state.sensors if learnt is None else learnt)
         sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor(measurement)
-        sensor = self._seen_by(replace(sensor, cross=None), measurement, measurement.measured)
+        sensor = self._seen_by(sensor, measurement, measurement.measured)
         return replace(state, sensors={**state.sensors, measurement.sensor: sensor})
 
     def _new_state(
@@ -924,7 +919,9 @@ class ExtendedKalmanFilter:
             self._first_log_density if previous is None else previous.log_density,
             zero,
             zero,
-            {} if previous is None else {k: replace(s, cross=None) for k, s in previous.sensors.items()},
+            {} if previous is None else previous.sensors,
+            (),
+            np.empty((self._size, 0)),
             np.zeros(self._points),
             np.zeros((self._points, 3)),
             np.zeros(self._points),
@@ -1127,17 +1124,13 @@ class ExtendedKalmanFilter:
         """The same state told by another configuration, whose tangent has other signs (32,)."""
         self.counters["branches"] += 1
         both = np.concatenate([signs, np.ones(self._nl), signs])
-        sensors = {
-            name: sensor if sensor.cross is None else replace(sensor, cross=sensor.cross * both[:, None])
-            for name, sensor in state.sensors.items()
-        }
         return replace(
             state,
             q=q,
             velocity=state.velocity * signs,
             covariance=state.covariance * both * both[:, None],
             moved=state.moved * signs,
-            sensors=sensors,
+            crosses=state.crosses * both[:, None],
         )
 
     def _unsure(self, state: _State) -> _State:
@@ -1207,18 +1200,11 @@ class ExtendedKalmanFilter:
         covariance = state.covariance - gain.T @ gain
         if state.settled:
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
-        sensors = {
-            name: sensor
-            if sensor.cross is None
-            else replace(
-                sensor,
-                cross=self._considered(
-                    sensor.cross, gain, factor, observation @ sensor.cross[self._tangent], state.settled
-                ),
-            )
-            for name, sensor in state.sensors.items()
-        }
-        return self._moved(replace(state, covariance=covariance, sensors=sensors), white @ gain)
+        half, _ = dtrtrs(factor, observation @ state.crosses[self._tangent], lower=1)
+        crosses = state.crosses - gain.T @ half
+        if state.settled:
+            crosses[self._lengths] = state.crosses[self._lengths]
+        return self._moved(replace(state, covariance=covariance, crosses=crosses), white @ gain)
 
     def _pushed_back(
         self, state: _State, observation: FloatArray, excess: FloatArray, stddev: float = _LIMIT_STDDEV
@@ -1277,6 +1263,12 @@ class ExtendedKalmanFilter:
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
+
+
+def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tuple[str, ...], FloatArray]:
+    """``slow_names`` and ``crosses`` of a state without those of one sensor."""
+    kept = np.repeat([each != name for each in names], crosses.shape[1] // len(names))
+    return tuple(each for each in names if each != name), crosses[:, kept]
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:

@@ -157,7 +157,7 @@ class _Backward:
 
     def _joint(self, state: _State, sensors: tuple[str, ...]) -> FloatArray:
         """Covariance of a state and the slow errors of these sensors, which are in units of their deviation."""
-        crosses = [cross for name in sensors if (cross := state.sensors[name].cross) is not None]
+        crosses = [cross for name in sensors if (cross := state.cross(name)) is not None]
         n = self._size
         joint = np.eye(n + sum(cross.shape[1] for cross in crosses))
         joint[:n, :n] = state.covariance
@@ -184,7 +184,7 @@ class _Backward:
         columns = [np.arange(self._size)]
         place = self._size
         for name in known:
-            cross = state.sensors[name].cross
+            cross = state.cross(name)
             count = 0 if cross is None else cross.shape[1]
             if name in wanted:
                 columns.append(place + np.arange(count))
@@ -194,7 +194,7 @@ class _Backward:
 
 def _sensors(state: _State) -> tuple[str, ...]:
     """The sensors whose slow errors a state has to do with."""
-    return tuple(name for name, sensor in state.sensors.items() if sensor.cross is not None)
+    return state.slow_names
 
 
 def _divided(numerator: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -300,12 +300,12 @@ def _learnt(
     if best is None or start is None:
         return None
     sensors = {
-        name: replace(sensor, stamps=(), positions=sensor.positions[:0], cross=None)
-        for name, sensor in best.sensors.items()
+        name: replace(sensor, stamps=(), positions=sensor.positions[:0]) for name, sensor in best.sensors.items()
     }
     # The lengths come from the very frames that follow: they are considered, as estimates would count these twice. How
     # briskly the person moves is found anew: what suits the end, or the average, is too sure of itself in between.
-    return replace(best, log_density=start.log_density, sensors=sensors, settled=True)
+    nothing = best.crosses[:, :0]
+    return replace(best, log_density=start.log_density, sensors=sensors, slow_names=(), crosses=nothing, settled=True)
 
 
 class _Forward:

@@ -136,7 +136,7 @@ def test_equals_the_rts_smoother_of_filterpy_where_the_filter_is_linear() -> Non
     assert len(told) == len(states) > 30
 
     origin = states[0]
-    slow_sizes = [0 if s.sensors[""].cross is None else s.sensors[""].cross.shape[1] for s in states]
+    slow_sizes = [s.crosses.shape[1] for s in states]
     size = 2 * NV + NL
     full = size + max(slow_sizes)
     means, covariances, transitions, noises = [], [], [np.eye(full)], [np.zeros((full, full))]
@@ -147,7 +147,7 @@ def test_equals_the_rts_smoother_of_filterpy_where_the_filter_is_linear() -> Non
         )
         covariances.append(np.eye(full))
         covariances[-1][:size, :size] = state.covariance
-        cross = state.sensors[""].cross
+        cross = state.cross("")
         if cross is not None:
             covariances[-1][:size, size:] = cross
             covariances[-1][size:, :size] = cross.T
