@@ -305,7 +305,7 @@ def _learnt(
     }
     # The lengths come from the very frames that follow: they are considered, as estimates would count these twice. How
     # briskly the person moves is found anew: what suits the end, or the average, is too sure of itself in between.
-    return replace(best, log_density=start.log_density, sensors=sensors, settled=True)
+    return replace(best, log_density=start.log_density, sensors=sensors, settled=True, seen=None)
 
 
 class _Forward:
