@@ -11,8 +11,9 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
   motion all but cancels; no tuning for a sensor. What its points are wrong by for seconds (a joint placed beside the
   anatomical one) is a state of its own that is considered but not estimated (Schmidt 1966), with the deviation of
   ``body_tracking.measurement`` scaled until the innovations are as large as expected.
-- Lengths are estimated until they are known to some millimetres, and from then on only considered: they are constant,
-  and what is left of their uncertainty stays in the covariance.
+- Lengths are estimated for the first seconds. From then on they are what the distances between points say over many
+  poses (``lengths``), and only considered here: what errs for seconds would otherwise be learnt as a length. They are
+  brought in every second, until they are known to some millimetres or for a minute, and then stay as they are.
 - Ranges of motion bound what nothing observes. They enter as rarely as they would be new information.
 """
 
@@ -26,6 +27,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.stats import chi2
 
+from body_tracking.filters.lengths import SegmentLengths, proportions
 from body_tracking.filters.linear import check_fields
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
@@ -109,10 +111,10 @@ _MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
-_STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
-"""Standard deviations by which lengths differ from the average: all alike, each kind, left from right."""
-_SHORTEST_SCALE = 0.08
-"""Metres: shorter lengths differ as if they were as long as this, because sensors place these points so."""
+_ENOUGH_BLOCKS = 5
+"""Seconds of frames from which on the lengths are what these say."""
+_ANOTHER_SIZE = 1.2
+"""Times that a person is larger or smaller than the one before, who must be another one."""
 
 
 def _parameter(default: float, doc: str, unit: str, low: float, high: float) -> float:
@@ -184,7 +186,7 @@ class EkfParameters:
     settle_stddev: float = _parameter(
         0.003, "lengths stay as they are from when they are known as well as this", "m", 1e-5, 1.0
     )
-    settle_time: float = _parameter(30.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
+    settle_time: float = _parameter(60.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
     late_window: float = _parameter(0.2, "frames that come late by no more than this still count", "s", 0.0, 2.0)
     predict_for: float = _parameter(
         2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
@@ -261,7 +263,8 @@ class _State:
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last brought in.
         tracked: seconds since the start.
-        settled: the lengths stay.
+        settled: the lengths are only considered.
+        seen: what tells the lengths; None from when they stay as they are.
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
         attempted_ns: when another pose was looked for last.
@@ -286,6 +289,7 @@ class _State:
     since_prior: float
     tracked: float
     settled: bool
+    seen: SegmentLengths | None
     null: FloatArray
     fresh: bool = False
     attempted_ns: int = 0
@@ -329,7 +333,7 @@ class ExtendedKalmanFilter:
         self._limb_points = self._limb_table()
         self._slow_size = 3 * self._points + len(self._limbs)
         self._pose_prior()
-        self._lengths_prior()
+        self._lengths_covariance = proportions()
         self.counters: dict[str, int] = dict.fromkeys(
             (
                 "frames",
@@ -523,7 +527,7 @@ class ExtendedKalmanFilter:
                 state = replace(self._reacquired(state, measurement), attempted_ns=state.stamp_ns)
             elif state.strain > _STRAINED:
                 state = replace(self._straightened(state, measurement), attempted_ns=state.stamp_ns)
-        return self._within(self._bounded(state))
+        return self._within(self._bounded(self._measured(state, measurement)))
 
     def _predicted(self, state: _State, stamp_ns: int) -> _State:
         """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
@@ -830,6 +834,37 @@ class ExtendedKalmanFilter:
         log_density = state.log_density + rate * lean
         return np.clip(log_density, self._first_log_density - _DENSITY_DOWN, self._first_log_density + _DENSITY_UP)
 
+    def _measured(self, state: _State, measurement: _Measurement) -> _State:
+        """The lengths that many poses tell, which take the place of those that the filter had."""
+        if state.seen is None:
+            return state
+        sensor = state.sensors[measurement.sensor]
+        seen = state.seen.seen(
+            measurement.sensor,
+            measurement.stamp_ns,
+            measurement.positions,
+            measurement.measured & (measurement.skeleton.states[self.model.joints] == TrackingState.TRACKED),
+            sensor.white,
+            measurement.model_variance,
+            float(sensor.slow[0]),
+            math.sqrt(sensor.slow[1]) * _STRETCH,
+        )
+        news = seen.blocks is not state.seen.blocks and len(seen.blocks) >= _ENOUGH_BLOCKS
+        state = replace(state, seen=seen)
+        if not news:
+            return state
+        found = seen.estimate()
+        known = float(np.sqrt(found.covariance.diagonal()).max()) < self.parameters.settle_stddev
+        if known and state.tracked > _SETTLE_AFTER * self.parameters.settle_time:
+            state = replace(state, seen=None)
+        # The lengths' errors are new ones. What is known of the rest where the lengths are given stays as it is.
+        before = state.covariance[self._lengths, self._lengths]
+        follows = np.linalg.solve(before, state.covariance[self._lengths]).T
+        crosses = state.crosses - follows @ state.crosses[self._lengths]
+        covariance = state.covariance + follows @ (found.covariance - before) @ follows.T
+        moved = self._moved(replace(state, settled=False), follows @ (found.lengths - state.lengths))
+        return replace(moved, lengths=found.lengths, covariance=covariance, crosses=crosses, settled=True)
+
     # --- start, restart
 
     def _begun(self, measurement: _Measurement) -> _State | None:
@@ -930,6 +965,7 @@ class ExtendedKalmanFilter:
             0.0,
             0.0 if previous is None else previous.tracked,
             False if previous is None else previous.settled,
+            SegmentLengths(self.parameters.slow_time) if previous is None else previous.seen,
             np.empty((0, self._nv)),
         )
 
@@ -952,14 +988,17 @@ class ExtendedKalmanFilter:
             fit = self.inverse.solve(points, stddev, state.lengths)
             # lengths that were learnt in a wrong pose are wrong, too
             lengths = self._lengths_of(points)
-            fresh = self.inverse.solve(points, stddev, lengths, fit.q)
+            size = float(np.median(lengths / state.lengths))
+            other = not state.settled or not 1.0 / _ANOTHER_SIZE < size < _ANOTHER_SIZE
+            fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
         except ModelError:
             return state
         present = self.inverse.cost(state.q, points, stddev, state.lengths)
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
-        if whole and fresh.cost < share * min(fit.cost, present):
+        if other and whole and fresh.cost < share * min(fit.cost, present):
             self.counters["restarts"] += 1
-            state = replace(state, settled=False, tracked=0.0)
+            seen = SegmentLengths(self.parameters.slow_time) if state.settled else state.seen
+            state = replace(state, settled=False, tracked=0.0, seen=seen)
             return self._new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
         if fit.cost > share * present:
             return state
@@ -1075,16 +1114,6 @@ class ExtendedKalmanFilter:
         bones = [(path[a], path[b]) for a, b in BONES if a in path and b in path]
         self._bones = np.array([a for a, _ in bones], dtype=np.intp), np.array([b for _, b in bones], dtype=np.intp)
 
-    def _lengths_prior(self) -> None:
-        """How people differ in their proportions; left and right of one person hardly do."""
-        lengths = self.model.default_lengths()
-        names = self.model.length_names
-        kinds = [name.removesuffix("_left").removesuffix("_right") for name in names]
-        same = np.array([[a == b for b in kinds] for a in kinds])
-        relative = _STATURE_SHARE**2 + _PROPORTION_SHARE**2 * same + _SIDE_SHARE**2 * np.eye(len(names))
-        scale = np.maximum(lengths, _SHORTEST_SCALE)
-        self._lengths_covariance = relative * np.outer(scale, scale)
-
     def _bounded(self, state: _State) -> _State:
         """Bring in the ranges of motion: softly push back what left them, and bound what nothing observes."""
         if state.since_prior < _PRIOR_PERIOD:
@@ -1102,10 +1131,9 @@ class ExtendedKalmanFilter:
         limit = stddev**2
         unknown = variance > limit
         noise = variance * limit / np.maximum(variance - limit, 1e-12)
-        known = np.sqrt(state.covariance.diagonal()[self._lengths]).max() < self.parameters.settle_stddev
-        early = state.tracked < _SETTLE_AFTER * self.parameters.settle_time
-        settled = state.settled or (bool(known) and not early) or state.tracked > self.parameters.settle_time
-        state = replace(state, since_prior=0.0, settled=settled)
+        state = replace(state, since_prior=0.0)
+        if state.seen is not None and state.tracked > self.parameters.settle_time:
+            state = replace(state, settled=True, seen=None)
         branch = self.ranges.nearest_branch(state.q)
         if branch is not None:
             return self._turned(state, *branch)

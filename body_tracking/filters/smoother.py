@@ -304,8 +304,15 @@ def _learnt(
     }
     # The lengths come from the very frames that follow: they are considered, as estimates would count these twice. How
     # briskly the person moves is found anew: what suits the end, or the average, is too sure of itself in between.
-    nothing = best.crosses[:, :0]
-    return replace(best, log_density=start.log_density, sensors=sensors, slow_names=(), crosses=nothing, settled=True)
+    return replace(
+        best,
+        log_density=start.log_density,
+        sensors=sensors,
+        slow_names=(),
+        crosses=best.crosses[:, :0],
+        settled=True,
+        seen=None,
+    )
 
 
 class _Forward:

@@ -197,6 +197,55 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
     assert np.abs(settled[0] - truth.lengths).max() < 0.5 * np.abs(found[0][1] - truth.lengths).max()
 
 
+def test_lengths_come_from_many_poses_once_there_are_some() -> None:
+    """After some seconds the lengths change once a second at most, and the rest of the state follows them."""
+    truth = somebody(14, 10.0)
+    observation = measured(truth)
+    estimator = ExtendedKalmanFilter()
+    both = np.append(OBSERVED, np.arange(MODEL.nv, MODEL.nv + len(MODEL.length_names)))
+    changes, normalised = [], []
+    before = None
+    for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
+        estimator.update(skeleton)
+        state = estimator._state
+        if state is None or not state.settled:
+            continue
+        error = np.concatenate([MODEL.difference(state.q, truth.q[k]), truth.lengths - state.lengths])[both]
+        normalised.append(error @ np.linalg.solve(state.covariance[np.ix_(both, both)], error))
+        if before is not None and np.abs(state.lengths - before).max() > 0.0:
+            changes.append(truth.times[k])
+        before = state.lengths
+    assert 2 <= len(changes) <= 6 and np.diff(changes).min() > 0.9
+    assert np.abs(known(estimator).lengths - truth.lengths).max() < 0.02
+    # pose and lengths are wrong together as the joint covariance says
+    assert 0.4 < np.mean(normalised) / len(both) < 1.6, np.mean(normalised) / len(both)
+
+
+def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
+    truth = somebody(16, 12.0)
+    skeletons = list(measured(truth).skeletons)
+    # as a Kinect does with a person seen from behind: left and right change places for some seconds
+    turned = [
+        replace(each, positions=each.positions[MIRROR]) if 7.0 < time < 10.0 else each
+        for each, time in zip(skeletons, truth.times, strict=True)
+    ]
+    estimator = ExtendedKalmanFilter()
+    run(estimator, turned)
+    assert estimator.counters["restarts"] >= 1
+    assert np.abs(known(estimator).lengths - truth.lengths).max() < 0.02
+
+
+def test_another_person_of_another_size_is_learnt_anew() -> None:
+    truth = somebody(18, 16.0)
+    skeletons = [
+        replace(each, positions=0.65 * each.positions) if time > 8.0 else each
+        for each, time in zip(measured(truth).skeletons, truth.times, strict=True)
+    ]
+    estimator = ExtendedKalmanFilter()
+    run(estimator, skeletons)
+    assert_allclose(known(estimator).lengths, 0.65 * truth.lengths, rtol=0.0, atol=0.02)
+
+
 def test_it_does_not_depend_on_the_origin_of_world() -> None:
     truth = somebody(3, 3.0)
     origin = np.array([-3.0, 5.0, 0.7])
@@ -625,7 +674,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     # averages over a second: the noise of one frame is no drift
     averages = np.stack(angles)[: len(angles) // 30 * 30].reshape(-1, 30, len(UNOBSERVED)).mean(axis=1)
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0
-    # at 30 s at the latest the lengths are settled
+    # of perfectly white noise the lengths are known well enough to be settled by then
     assert np.abs(np.stack(learnt[910:]) - learnt[-1]).max() < 1e-9
 
 

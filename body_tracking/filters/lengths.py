@@ -1,0 +1,358 @@
+"""How long a person's segments are, from the distances between the points of many frames.
+
+Beside the filter, and independent of the pose that it believes in: a wrong pose spoils no length here. What a skeleton
+sensor shows of one bone differs from pose to pose by a tenth and more, for seconds, and these errors are by far the
+greatest; averaging frames as if each were new would soon be sure of a wrong length. Therefore
+
+- frames are gathered into blocks of a second; the mean squared distances in a block, less what white noise adds to
+  them, tell its lengths. Frames far from the block's median do not count;
+- over the blocks a mean is taken that single strange poses do not move (Huber 1964), each weighed by how much the
+  sensors' points are worth by the measurement model: a body seen from the side is not seen well;
+- its variance is that of the blocks: the part that two interleaved halves of a block do not share is white and
+  averages out from block to block, the rest persists from pose to pose and averages out that much more slowly;
+- and all is weighed against how people differ in their proportions, left hardly from right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from body_tracking.kinematics.upper_body import LENGTHS, UpperBody
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
+
+_BLOCK_NS = NANOSECONDS
+_FEWEST_FRAMES = 4
+"""Frames from which on a block counts: two for each of its halves."""
+_MOST_BLOCKS = 240
+_FAR = 4.0
+"""Standard deviations from the median of a block from which a frame does not count in it."""
+_HUBER = 1.345
+"""Huber's constant of 95 % efficiency."""
+_EFFICIENCY = 0.95
+_ITERATIONS = 8
+_NORMAL = 1.4826
+"""Standard deviation of normal deviates over the median of their sizes."""
+_OWN_WEIGHT = 3.0
+"""Blocks that what is stated of the slow errors is worth against their observed spread."""
+_SUREST = 1e-5
+"""Metres: standard deviation that no length falls below, so that covariances stay invertible."""
+_SHORTEST = 0.005
+"""Metres: nothing is shorter."""
+_STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
+"""Standard deviations by which lengths differ from the average: all alike, each kind, left from right."""
+_SHORTEST_SCALE = 0.08
+"""Metres: shorter lengths differ as if they were as long as this, because sensors place these points so."""
+_LEAST_SIZE, _GREATEST_SIZE = 0.5, 1.4
+"""Of a person against one of average stature."""
+
+_MODEL: Final = UpperBody()
+_DEFAULT: Final = _MODEL.default_lengths()
+
+
+def proportions() -> FloatArray:
+    """(21, 21) square metres: how people differ in their lengths; left and right of one person hardly do."""
+    kinds = [name.removesuffix("_left").removesuffix("_right") for name in LENGTHS]
+    same = np.array([[a == b for b in kinds] for a in kinds])
+    relative = _STATURE_SHARE**2 + _PROPORTION_SHARE**2 * same + _SIDE_SHARE**2 * np.eye(len(LENGTHS))
+    scale = np.maximum(_DEFAULT, _SHORTEST_SCALE)
+    result: FloatArray = relative * np.outer(scale, scale)
+    return result
+
+
+def _ends() -> dict[str, tuple[Joint, Joint]]:
+    """The two points between which each length shows; the model's hand tip and thumb hang on the wrist."""
+    found = {
+        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
+        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
+        "neck": (Joint.SPINE_SHOULDER, Joint.NECK),
+        "head": (Joint.NECK, Joint.HEAD),
+        "hip_drop": (Joint.SPINE_BASE, Joint.HIP_LEFT),
+    }
+    for side in ("LEFT", "RIGHT"):
+        own = {kind: Joint[f"{kind}_{side}"] for kind in ("SHOULDER", "ELBOW", "WRIST", "HAND", "THUMB", "HIP")}
+        pairs = {
+            "clavicle": (Joint.SPINE_SHOULDER, own["SHOULDER"]),
+            "upper_arm": (own["SHOULDER"], own["ELBOW"]),
+            "forearm": (own["ELBOW"], own["WRIST"]),
+            "hand": (own["WRIST"], own["HAND"]),
+            "hand_tip": (own["WRIST"], Joint[f"HAND_TIP_{side}"]),
+            "thumb_along": (own["WRIST"], own["THUMB"]),
+            "thumb_out": (own["WRIST"], own["THUMB"]),
+            "hip_width": (Joint.SPINE_BASE, own["HIP"]),
+        }
+        found |= {f"{kind}_{side.lower()}": pair for kind, pair in pairs.items()}
+    return found
+
+
+_ENDS: Final = _ends()
+_POINT: Final = {Joint(joint): number for number, joint in enumerate(_MODEL.joints)}
+_SIDES: Final = ("left", "right")
+
+
+def _products() -> tuple[tuple[str, ...], IntArray]:
+    """Names (k,) and points (4, k) a, b, c, d of the scalar products (b - a) . (d - c) that tell all lengths."""
+    rows: dict[str, tuple[Joint, Joint, Joint, Joint]] = {}
+    for name, (a, b) in _ENDS.items():
+        if not name.startswith(("thumb_out", "hip_drop")):
+            rows[name] = (a, b, a, b)
+    rows["hips"] = (Joint.HIP_RIGHT, Joint.HIP_LEFT) * 2
+    for side, other in (_SIDES, _SIDES[::-1]):
+        wrist, tip = _ENDS[f"hand_tip_{side}"]
+        rows[f"thumb_tip_{side}"] = (*_ENDS[f"thumb_along_{side}"], wrist, tip)
+        rows[f"hip_across_{side}"] = (
+            *_ENDS[f"hip_width_{side}"],
+            Joint[f"HIP_{other.upper()}"],
+            Joint[f"HIP_{side.upper()}"],
+        )
+    return tuple(rows), np.array([[_POINT[joint] for joint in row] for row in rows.values()], dtype=np.intp).T
+
+
+_PRODUCTS, _FACTORS = _products()
+_COLUMN: Final = {name: number for number, name in enumerate(_PRODUCTS)}
+
+
+def _noise() -> FloatArray:
+    """(k, 19) by how much white noise of unit variance of each point raises each product."""
+    first, second = np.zeros((2, len(_PRODUCTS), len(_POINT)))
+    rows = np.arange(len(_PRODUCTS))
+    a, b, c, d = _FACTORS
+    first[rows, b] += 1.0
+    first[rows, a] -= 1.0
+    second[rows, d] += 1.0
+    second[rows, c] -= 1.0
+    result: FloatArray = 3.0 * first * second
+    return result
+
+
+_RAISED: Final = _noise()
+_SHARES: Final = np.array(
+    [[float(joint in _ENDS[name]) for joint in _POINT] for name in LENGTHS]  # (21, 19)
+)
+_INVOLVED: Final = np.array(
+    [[float(point in column) for point in range(len(_POINT))] for column in _FACTORS.T]  # (k, 19)
+)
+_LIMB: Final = np.array([name.startswith(("upper_arm", "forearm")) for name in LENGTHS])
+
+
+def _lengths_of(products: FloatArray) -> FloatArray:
+    """(..., 21) metres from (..., k) products in square metres."""
+    of = {name: products[..., column] for name, column in _COLUMN.items()}
+
+    def root(square: FloatArray) -> FloatArray:
+        result: FloatArray = np.sqrt(np.maximum(square, _SHORTEST**2))
+        return result
+
+    across = root(of["hips"])
+    found: dict[str, FloatArray] = {}
+    drops = []
+    for side in _SIDES:
+        tip = root(of[f"hand_tip_{side}"])
+        hand = root(of[f"hand_{side}"])
+        along = np.maximum(of[f"thumb_tip_{side}"] / tip, _SHORTEST)
+        width = np.maximum(of[f"hip_across_{side}"] / across, _SHORTEST)
+        found[f"hand_{side}"] = hand
+        found[f"hand_tip_{side}"] = np.maximum(tip - hand, _SHORTEST)
+        found[f"thumb_along_{side}"] = along
+        found[f"thumb_out_{side}"] = root(of[f"thumb_along_{side}"] - along**2)
+        found[f"hip_width_{side}"] = width
+        drops.append(of[f"hip_width_{side}"] - width**2)
+    found["hip_drop"] = root(0.5 * (drops[0] + drops[1]))
+    return np.stack([found[name] if name in found else root(of[name]) for name in LENGTHS], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Block:
+    """A second of frames of one sensor.
+
+    Attributes:
+        stamp_ns: of its first frame.
+        products: (k,) square metres, less what white noise adds; NaN where not seen.
+        lengths: (21,) metres.
+        white: (21,) square metres: variance of the lengths by what its two interleaved halves do not share.
+        slow: (21,) square metres: variance of the lengths by slow errors, as it was stated.
+        model: (19,) square metres: variance of the points by the measurement model.
+    """
+
+    stamp_ns: int
+    products: FloatArray
+    lengths: FloatArray
+    white: FloatArray
+    slow: FloatArray
+    model: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LengthEstimate:
+    """Lengths and what is known of them.
+
+    Attributes:
+        lengths: (21,) metres.
+        covariance: (21, 21) square metres.
+    """
+
+    lengths: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentLengths:
+    """What was seen of a person's lengths so far; never written into.
+
+    Attributes:
+        persistence: seconds, the time constant of the autocorrelation of errors in a length.
+        blocks: the finished blocks.
+    """
+
+    persistence: float = 3.0
+    blocks: tuple[_Block, ...] = ()
+    _gathered: dict[str, tuple[tuple[int, FloatArray, BoolArray, FloatArray], ...]] = field(default_factory=dict)
+
+    def seen(
+        self,
+        sensor: str,
+        stamp_ns: int,
+        points: FloatArray,
+        tracked: BoolArray,
+        white: FloatArray,
+        model: FloatArray,
+        slow: float = 0.0,
+        stretch: float = 0.0,
+    ) -> SegmentLengths:
+        """With one more frame; ``blocks`` is another one whenever a block is complete. Arrays are kept, not copied.
+
+        Args:
+            sensor: whose frame it is.
+            stamp_ns: when it was captured.
+            points: (19, 3) metres, the points of the model, in any frame.
+            tracked: (19,) which of them count.
+            white: (19,) square metres per axis, variance of their white noise.
+            model: (19,) square metres per axis, their variance by the measurement model, which blocks are weighed by.
+            slow: share of that which is known to be errors that last for seconds.
+            stretch: share of their length that upper arms and forearms are wrong by, beside that (standard deviation).
+        """
+        frames = self._gathered.get(sensor, ())
+        blocks = self.blocks
+        if frames and not 0 <= stamp_ns - frames[0][0] < _BLOCK_NS:
+            if len(frames) >= _FEWEST_FRAMES:
+                stamps, positions, counted, variances = zip(*frames, strict=True)
+                shown = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
+                mean = np.mean(variances, axis=0)
+                slow_variance = slow * (_SHARES @ mean) + _LIMB * (stretch * _DEFAULT) ** 2
+                block = _block(stamps[0], shown, white, slow_variance, mean)
+                blocks = (*blocks[1 - _MOST_BLOCKS :], block)
+            frames = ()
+        frames = (*frames, (stamp_ns, points, tracked, model))
+        return SegmentLengths(self.persistence, blocks, {**self._gathered, sensor: frames})
+
+    def estimate(self) -> LengthEstimate:
+        """All that is known; an average person where nothing was seen."""
+        prior = proportions()
+        if not self.blocks:
+            return LengthEstimate(_DEFAULT, prior)
+        products = np.stack([block.products for block in self.blocks])
+        lengths = np.stack([block.lengths for block in self.blocks])
+        seen = np.isfinite(lengths)
+        count = np.maximum(seen.sum(axis=0), 1)
+        model = np.stack([block.model for block in self.blocks])
+        worth, total = _worth(1.0 / (model @ _SHARES.T), seen)
+        white = np.stack([block.white for block in self.blocks])
+        whiteness = np.nansum(white, axis=0) / count
+        stated = (worth * [block.slow for block in self.blocks]).sum(axis=0) / count
+        centre, off = _location(lengths, worth, np.sqrt(whiteness + stated))
+        worth_of_products, _ = _worth(1.0 / (model @ _INVOLVED.T), np.isfinite(products))
+        middle = _lengths_of(_location(products, worth_of_products, np.zeros(products.shape[1]))[0])
+        known = np.isfinite(centre) & np.isfinite(middle)
+        if not known.any():
+            return LengthEstimate(_DEFAULT, prior)
+        # variance of a block that is worth as much as one on average
+        spread = (worth * off**2).sum(axis=0) / np.maximum(count - 1, 1)
+        excess = np.maximum(spread - whiteness, 0.0)
+        slow = (_OWN_WEIGHT * stated + (count - 1.0) * excess) / (_OWN_WEIGHT + count - 1.0)
+        # the variance of a mean of blocks whose errors are as alike as they are close in time
+        stamps = np.array([block.stamp_ns for block in self.blocks]) / NANOSECONDS
+        alike = np.exp(-np.abs(stamps[:, None] - stamps) / self.persistence)
+        roots = np.sqrt(worth)
+        from_slow = slow * ((alike @ roots) * roots).sum(axis=0)
+        from_white = (worth**2 * np.where(seen, whiteness, 0.0)).sum(axis=0)
+        variance = (from_white + from_slow) / np.maximum(total, 1e-12) ** 2 / _EFFICIENCY + _SUREST**2
+        size = np.clip(np.median(middle[known] / _DEFAULT[known]), _LEAST_SIZE, _GREATEST_SIZE)
+        mean = size * _DEFAULT
+        rows = np.flatnonzero(known)
+        gain = np.linalg.solve(prior[np.ix_(rows, rows)] + np.diag(variance[rows]), prior[rows]).T
+        covariance = prior - gain @ prior[rows]
+        return LengthEstimate(mean + gain @ (middle - mean)[rows], 0.5 * (covariance + covariance.T))
+
+
+def _block(stamp_ns: int, frames: FloatArray, white: FloatArray, slow: FloatArray, model: FloatArray) -> _Block:
+    """What some frames (n, 19, 3) say."""
+    a, b, c, d = _FACTORS
+    products = ((frames[:, b] - frames[:, a]) * (frames[:, d] - frames[:, c])).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        middle = _nanmedian(products)
+        scale = _NORMAL * _nanmedian(np.abs(products - middle))
+        products = np.where(np.abs(products - middle) <= _FAR * scale, products, np.nan)
+    raised = _RAISED @ white
+    whole, even, odd = (_lengths_of(_nanmean(part) - raised) for part in (products, products[::2], products[1::2]))
+    seen = np.isfinite(even) & np.isfinite(odd)
+    return _Block(
+        stamp_ns,
+        _nanmean(products) - raised,
+        np.where(seen, whole, np.nan),
+        np.where(seen, 0.25 * (even - odd) ** 2, np.nan),
+        slow,
+        model,
+    )
+
+
+def _nanmean(values: FloatArray) -> FloatArray:
+    """Over the first dimension; NaN, without a warning, where at most one value is there."""
+    there = np.isfinite(values)
+    count = there.sum(axis=0)
+    total = np.where(there, values, 0.0).sum(axis=0)
+    return np.where(count > 1, total / np.maximum(count, 1), np.nan)
+
+
+def _nanmedian(values: FloatArray) -> FloatArray:
+    """Over the first dimension; NaN, without a warning, where no value is there."""
+    ordered = np.sort(values, axis=0)  # NaN comes last
+    count = np.isfinite(values).sum(axis=0)
+    columns = np.arange(values.shape[1])
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
+    result: FloatArray = 0.5 * (ordered[low, columns] + ordered[high, columns])
+    return result
+
+
+def _worth(worth: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Weights (n, m), 1 on average and 0 where not seen, and their sums (m,)."""
+    worth = np.where(seen, worth, 0.0)
+    total = worth.sum(axis=0)
+    count = seen.sum(axis=0)
+    return worth * count / np.where(count > 0, total, 1.0), count.astype(float)
+
+
+def _location(values: FloatArray, worth: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Huber's estimate of location (m,) of values (n, m), NaN where missing, and how far (n, m) these are from it.
+
+    What is missing is not far, and nothing farther than some times the scale.
+
+    Args:
+        values: one row per block.
+        worth: (n, m) inverse variances, 1 on average.
+        least: (m,) scale that a value of average worth has at least.
+    """
+    there = np.isfinite(values)
+    filled = np.where(there, values, 0.0)
+    root = np.sqrt(worth)
+    centre = _nanmedian(values)
+    distance = np.where(there, root * np.abs(filled - centre), np.nan)
+    scale = np.maximum(np.maximum(_NORMAL * _nanmedian(distance), least), 1e-12)
+    for _ in range(_ITERATIONS):
+        far = root * np.abs(filled - centre)
+        weight = worth * np.minimum(1.0, _HUBER * scale / np.maximum(far, 1e-15))
+        total = weight.sum(axis=0)
+        centre = np.where(total > 0.0, (weight * filled).sum(axis=0) / np.where(total > 0.0, total, 1.0), np.nan)
+    bound = _FAR * scale / np.where(there, np.maximum(root, 1e-12), 1.0)
+    return centre, np.where(there, np.clip(filled - centre, -bound, bound), 0.0)

@@ -1,0 +1,216 @@
+"""Segment lengths from distances between points: exact, robust, and as sure as errors that last for seconds allow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from body_tracking.cdr import decode_skeletons
+from body_tracking.filters.lengths import LengthEstimate, SegmentLengths, proportions
+from body_tracking.graph import FUSED
+from body_tracking.kinematics.upper_body import LENGTHS
+from body_tracking.measurement import BASE_STDDEV
+from body_tracking.recording.importer import import_files
+from body_tracking.recording.replay import replay
+from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.stages import ReplaySettings
+from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson, capture_times, truth_of
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint
+
+POINTS = MODEL.joints
+EVERY = np.ones(len(POINTS), dtype=bool)
+BASE = BASE_STDDEV[POINTS] ** 2
+ARM = [LENGTHS.index(name) for name in ("upper_arm_left", "forearm_left", "hand_left")]
+
+
+def somebody(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (n,), points (n, 19, 3) and lengths (21,)."""
+    rng = np.random.default_rng(seed)
+    truth = truth_of(RandomPerson.draw(rng), RandomMotion(rng, seconds), capture_times(seconds, rng, rate))
+    return truth.times, truth.positions, truth.lengths
+
+
+def learnt(
+    times: FloatArray,
+    points: FloatArray,
+    white: float = 0.0,
+    *,
+    tracked: BoolArray = EVERY,
+    model: FloatArray | None = None,
+    slow: float = 0.0,
+) -> SegmentLengths:
+    """What frames of one sensor tell; ``white`` is a standard deviation, ``model`` (n, 19)."""
+    seen = SegmentLengths()
+    for k, (time, frame) in enumerate(zip(times, points, strict=True)):
+        variance = BASE if model is None else model[k]
+        seen = seen.seen("", round(time * NANOSECONDS), frame, tracked, np.full(len(POINTS), white**2), variance, slow)
+    return seen
+
+
+def estimated(*args: FloatArray, **kwargs: float) -> LengthEstimate:
+    return learnt(*args, **kwargs).estimate()  # type: ignore[arg-type]
+
+
+def stddev(estimate: LengthEstimate) -> FloatArray:
+    return np.sqrt(estimate.covariance.diagonal())
+
+
+def lasting(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
+    """(n, size) deviates of unit variance that last (Ornstein-Uhlenbeck)."""
+    kept = np.exp(-np.diff(times) / persistence)
+    found = np.empty((len(times), size))
+    found[0] = rng.normal(size=size)
+    for k, share in enumerate(kept, 1):
+        found[k] = share * found[k - 1] + np.sqrt(1.0 - share**2) * rng.normal(size=size)
+    return found
+
+
+def test_of_perfect_points_the_lengths_are_exact() -> None:
+    for seed in range(5):
+        times, points, lengths = somebody(seed, 4.0)
+        assert_allclose(estimated(times, points).lengths, lengths, rtol=0.0, atol=1e-6)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times, points, _ = somebody(3, 4.0, rate=10.0)
+    points = points + rng.normal(scale=0.01, size=points.shape)
+    turned = Rotation.random(random_state=rng).apply(points.reshape(-1, 3)).reshape(points.shape) + rng.normal(size=3)
+    one, two = estimated(times, points, 0.01), estimated(times, turned, 0.01)
+    assert_allclose(one.lengths, two.lengths, rtol=0.0, atol=1e-9)
+    assert_allclose(one.covariance, two.covariance, rtol=0.0, atol=1e-9)
+
+
+def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
+    for seen in (SegmentLengths(), learnt(*somebody(0, 4.0)[:2], tracked=~EVERY)):
+        estimate = seen.estimate()
+        assert_allclose(estimate.lengths, MODEL.default_lengths())
+        assert_allclose(estimate.covariance, proportions())
+        left, right = (LENGTHS.index(f"forearm_{side}") for side in ("left", "right"))
+        between = np.array([1.0, -1.0]) @ estimate.covariance[np.ix_([left, right], [left, right])] @ [1.0, -1.0]
+        assert between < 0.1 * estimate.covariance[left, left]
+
+
+def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
+    times, points, lengths = somebody(4, 10.0)
+    hidden = np.isin(POINTS, [Joint[f"{name}_LEFT"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")])
+    estimate = estimated(times, points, tracked=~hidden)
+    assert (np.abs(estimate.lengths - lengths)[ARM] < 3.0 * stddev(estimate)[ARM]).all()
+    right = estimate.lengths[[column + 1 for column in ARM]]
+    assert_allclose(estimate.lengths[ARM], right, rtol=0.05)
+    whole = stddev(estimated(times, points))
+    assert (stddev(estimate)[ARM] > whole[ARM]).all()
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.04])
+def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
+    off, normalised = [], []
+    for seed in range(12):
+        times, points, lengths = somebody(seed, 12.0)
+        rng = np.random.default_rng(seed)
+        estimate = estimated(times, points + rng.normal(scale=noise, size=points.shape), noise)
+        off.append(estimate.lengths - lengths)
+        normalised.append(off[-1] / stddev(estimate))
+    assert np.abs(np.mean(off, axis=0)).max() < 0.2 * noise
+    assert 0.3 < np.square(normalised).mean() < 2.0
+
+
+def test_the_more_frames_the_surer_as_long_as_the_noise_is_white() -> None:
+    times, points, _ = somebody(5, 32.0)
+    points = points + np.random.default_rng(5).normal(scale=0.02, size=points.shape)
+    short, long = (stddev(estimated(times[times < end], points[times < end], 0.02)) for end in (8.0, 32.0))
+    assert np.median(long / short) < 0.7  # half, as variances fall with the time
+
+
+def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out() -> None:
+    """Two halves of a minute differ as is stated, by far more than if every frame were new."""
+    normalised, as_if_new = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        times, points, _ = somebody(seed, 60.0, rate=15.0)
+        wrong = 0.02 * lasting(times, rng, 3.0, points[0].size).reshape(points.shape)
+        points = points + wrong + rng.normal(scale=0.003, size=points.shape)
+        first = times < 30.0
+        halves = [estimated(times[part], points[part], 0.003) for part in (first, ~first)]
+        difference = halves[0].lengths - halves[1].lengths
+        normalised.append(difference / np.hypot(*(stddev(half) for half in halves)))
+        as_if_new.append(difference / (0.02 * 2.0 / np.sqrt(first.sum())))
+    assert 0.3 < np.square(normalised).mean() < 1.5
+    assert np.square(as_if_new).mean() > 5.0
+
+
+def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
+    times, points, lengths = somebody(6, 20.0)
+    rng = np.random.default_rng(6)
+    points = points + rng.normal(scale=0.01, size=points.shape)
+    good = estimated(times, points, 0.01)
+    wild = points.copy()
+    outliers = rng.random(points.shape[:2]) < 0.05
+    wild[outliers] += rng.normal(scale=0.5, size=(int(outliers.sum()), 3))
+    elbow = list(POINTS).index(Joint.ELBOW_LEFT)
+    wild[(times > 4.0) & (times < 6.0), elbow] += 0.3
+    bad = estimated(times, wild, 0.01)
+    assert np.abs(bad.lengths - lengths).max() < 0.02
+    assert np.abs(bad.lengths - good.lengths).max() < 0.015
+
+
+def test_seconds_seen_badly_count_less() -> None:
+    times, points, lengths = somebody(7, 20.0)
+    late = times >= 10.0
+    points = points + np.random.default_rng(7).normal(scale=0.003, size=points.shape)
+    points[late] *= 1.1
+    badly = np.where(late[:, None], 10.0, 1.0) * BASE
+    off_badly, off_alike = (
+        np.linalg.norm(estimated(times, points, 0.003, model=model).lengths - lengths)
+        for model in (badly, np.broadcast_to(BASE, badly.shape))
+    )
+    assert off_badly < 0.5 * off_alike
+
+
+def test_stated_slow_errors_keep_a_few_seconds_from_being_sure() -> None:
+    times, points, _ = somebody(8, 6.0)
+    sure, unsure = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
+    assert (unsure > 2.0 * sure).all()
+
+
+def test_two_sensors_are_gathered_apart() -> None:
+    times, points, lengths = somebody(9, 6.0)
+    seen = SegmentLengths()
+    zero = np.zeros(len(POINTS))
+    for time, frame in zip(times, points, strict=True):
+        for number, sensor in enumerate(("one", "other")):
+            seen = seen.seen(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
+    assert len(seen.blocks) >= 8
+    assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
+
+
+def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
+    import_files([shared_data / "kinect_pairs" / "p02_45deg.csv.gz"], tmp_path / "in")
+    replay(tmp_path / "in", tmp_path / "out", ReplaySettings(()))
+    with BagReader(tmp_path / "out") as reader:
+        frames = [each[0] for raw in reader.messages([FUSED]) if (each := decode_skeletons(raw.cdr))]
+    middle = (frames[0].stamp_ns + frames[-1].stamp_ns) // 2
+    halves = []
+    for part in (True, False):
+        seen = SegmentLengths()
+        for frame in frames:
+            if (frame.stamp_ns < middle) is part:
+                assert frame.covariances is not None
+                variance = frame.covariances[POINTS].diagonal(axis1=1, axis2=2).mean(axis=1)
+                model = np.where(frame.valid[POINTS], variance, BASE)
+                seen = seen.seen(
+                    "", frame.stamp_ns, frame.positions[POINTS], frame.valid[POINTS], np.full(19, 9e-6), model, 0.1
+                )
+        halves.append(seen.estimate())
+    difference = halves[0].lengths - halves[1].lengths
+    assert np.abs(difference).max() < 0.010
+    normalised = difference / np.hypot(*(stddev(half) for half in halves))
+    assert np.sqrt(np.square(normalised).mean()) < 1.5
