@@ -72,6 +72,9 @@ _NEGLIGIBLE_SLOW = 1e-3
 _STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
 _SLOW_BOUND = 9.0
+_MEDIAN_OF_CHI2 = 0.455
+_LEAST_ERROR = 0.005
+"""Metres: no sensor knows where the centre of a joint is better than this."""
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
 _SLOW_PERIOD_NS = NANOSECONDS // 15
@@ -102,6 +105,9 @@ _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_DRAWING = 9.0
+"""Squared Mahalanobis distance that a point is taken for which has been rejected for long."""
+_MOST_GROWN = 100.0
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
@@ -614,7 +620,14 @@ class ExtendedKalmanFilter:
         own = blocks[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
         distances = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own), y)
-        used = measurement.measured & (distances < self._gate)
+        near = distances < self._gate
+        # what stays where the person is not believed to be, and where no other pose is found, draws it there slowly
+        stubborn = measurement.measured & ~near & (state.rejected_for > self.parameters.reacquire_after)
+        if stubborn.any():
+            which = np.flatnonzero(stubborn)
+            grown = np.minimum(distances[which] / _DRAWING, _MOST_GROWN) - 1.0
+            blocks[which, :, which] += grown[:, None, None] * own[which]
+        used = measurement.measured & (near | stubborn)
         rejected = measurement.measured & ~used
         self.counters["measured"] += int(used.sum())
         self.counters["rejected"] += int(rejected.sum())
@@ -623,7 +636,7 @@ class ExtendedKalmanFilter:
         if not used.all():
             rows = np.flatnonzero(np.repeat(used, 3))
             s, cross_covariance, innovation = s[np.ix_(rows, rows)], cross_covariance[:, rows], innovation[rows]
-        rejected_for = np.where(used, 0.0, np.where(rejected, state.rejected_for + dt, state.rejected_for))
+        rejected_for = np.where(used & near, 0.0, state.rejected_for + np.where(measurement.measured, dt, 0.0))
         used_ns = np.where(used, measurement.stamp_ns, state.used_ns)
         if not used.any():
             sensors = {**state.sensors, measurement.sensor: self._seen_by(sensor, measurement, used)}
@@ -774,7 +787,8 @@ class ExtendedKalmanFilter:
         Returns:
             (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
         """
-        unchanged = sensor.slow, sensor.slow_estimate, sensor.slow_information
+        least = self._least_slow(sensor.white, measurement)
+        unchanged = np.maximum(sensor.slow, least), sensor.slow_estimate, sensor.slow_information
         if sensor.weight.max() < 2.0 * _POOL:
             return unchanged  # what is white is not known yet, and would be taken for slow
         if sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
@@ -784,7 +798,10 @@ class ExtendedKalmanFilter:
         gram = half.T @ half
         expected = gram.diagonal()
         points = 3 * self._points
-        score = 0.5 * (np.minimum(likely**2, _SLOW_BOUND * expected) - expected)
+        squares = likely**2
+        # one that is far from all others says nothing, where all are far they say much
+        usual = max(1.0, float(np.median(squares[:points] / np.maximum(expected[:points], 1e-30))) / _MEDIAN_OF_CHI2)
+        score = 0.5 * (np.minimum(squares, _SLOW_BOUND * usual * expected) - expected)
         squared = gram * gram
         scores = np.array([score[:points].sum(), score[points:].sum()])
         information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
@@ -794,7 +811,12 @@ class ExtendedKalmanFilter:
         estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
         # an error is taken for real when it stands out: else every sensor would have a little of it
         real = estimate * np.sqrt(total) > _SIGNIFICANT
-        return np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), estimate, total
+        return np.maximum(np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), least), estimate, total
+
+    def _least_slow(self, white: FloatArray, measurement: _Measurement) -> FloatArray:
+        """(2,) the scales that there are at least: what a sensor's points do not tremble by, they are wrong by."""
+        missing = _LEAST_ERROR**2 - float(white.mean())
+        return np.array([max(missing, 0.0) / float(measurement.model_variance.mean()), 0.0])
 
     def _per_error(self, scales: FloatArray) -> FloatArray:
         """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
@@ -882,7 +904,9 @@ class ExtendedKalmanFilter:
         sensors: dict[str, _SensorState] = {}
         for each in self._waiting:
             known = sensors.get(each.sensor) or self._unknown_sensor(each)
-            sensors[each.sensor] = self._seen_by(known, each, each.measured)
+            known = self._seen_by(known, each, each.measured)
+            slow = np.maximum(known.slow, self._least_slow(known.white, each))
+            sensors[each.sensor] = replace(known, slow=slow)
         # only the noise is kept: the frames themselves are still to come
         learnt = {name: replace(sensor, stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}
         first, *others = self._waiting
@@ -973,7 +997,6 @@ class ExtendedKalmanFilter:
         """Start the pose anew where another one fits the rejected points much better."""
         points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
-        state = replace(state, rejected_for=np.zeros(self._points))
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started

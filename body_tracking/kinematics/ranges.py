@@ -2,7 +2,7 @@
 
 A range is no wall: people differ, and the frames of a sensor's skeleton are not those of a goniometer. Limits push back
 softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one about the
-range's centre with the limits at three standard deviations: people move about the middle and are seldom at their limits.
+range's centre, with the limits at three standard deviations: people are seldom near their limits.
 
 Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
 motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
