@@ -105,6 +105,8 @@ _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_SUDDEN, _SUDDEN_TIME = 20.0, 0.05
+"""m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
 _DRAWING = 9.0
 """Squared Mahalanobis distance that a point is taken for which has been rejected for long."""
 _MOST_GROWN = 100.0
@@ -620,7 +622,10 @@ class ExtendedKalmanFilter:
         own = blocks[diagonal, :, diagonal]
         y = innovation.reshape(-1, 3)
         distances = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own), y)
-        near = distances < self._gate
+        # a limb may set off faster than it is expected to: what it can do in the time that passed is no outlier
+        sudden = 0.5 * _SUDDEN * min(dt, _SUDDEN_TIME) ** 2
+        foreseen = np.einsum("pi,pij,pj->p", y, np.linalg.inv(own + sudden**2 * np.eye(3)), y)
+        near = foreseen < self._gate
         # what stays where the person is not believed to be, and where no other pose is found, draws it there slowly
         stubborn = measurement.measured & ~near & (state.rejected_for > self.parameters.reacquire_after)
         if stubborn.any():
