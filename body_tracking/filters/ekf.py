@@ -72,8 +72,10 @@ _NEGLIGIBLE_SLOW = 1e-3
 _STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
 _SLOW_BOUND = 9.0
+_FORESEEABLE = 0.1
+"""Metres: standard deviation of a predicted point up to which its innovation tells of slow errors."""
 _MEDIAN_OF_CHI2 = 0.455
-_LEAST_ERROR = 0.005
+_LEAST_ERROR = 0.004
 """Metres: no sensor knows where the centre of a joint is better than this."""
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
@@ -691,7 +693,12 @@ class ExtendedKalmanFilter:
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
 
-        slow_scale, slow_estimate, information = self._slow_learnt(sensor, measurement, factor, white, rows)
+        foreseeable = float((own.trace(axis1=1, axis2=2) / _DIMENSIONS - sensor.white)[used].max()) < _FORESEEABLE**2
+        slow_scale, slow_estimate, information = (
+            self._slow_learnt(sensor, measurement, factor, white, rows)
+            if foreseeable  # elsewhere the linearisation errs by more than the sensor
+            else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
+        )
         if own_cross is not None and slow_scale is not sensor.slow:
             # What the slow errors did to the state so far is as much smaller as they are.
             before_that = np.maximum(sensor.slow, _NEGLIGIBLE_SLOW)

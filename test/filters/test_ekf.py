@@ -670,7 +670,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
         assert np.isinf(told.position_stddev[columns]).all()
         tangents = np.array([MODEL.coordinate_names.index(name) for name in UNOBSERVED])
         stated = np.sqrt(estimate.covariance.diagonal()[tangents])
-        assert (stated > 0.8 * ranges.stddev[tangents - 6]).all()
+        assert (stated > 0.6 * ranges.stddev[tangents - 6]).all()
     # averages over a second: the noise of one frame is no drift
     averages = np.stack(angles)[: len(angles) // 30 * 30].reshape(-1, 30, len(UNOBSERVED)).mean(axis=1)
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0

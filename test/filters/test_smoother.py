@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from body_tracking.filters import smoother
+from body_tracking.filters import ekf, smoother
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.linear import FilterError
 from body_tracking.filters.smoother import FixedLagSmoother, Smoothed, smooth
@@ -227,8 +227,9 @@ def gained(before: list[tuple[Skeleton, ModelEstimate]], after: list[tuple[Skele
     return np.asarray((old - new) / (scale[:, :, None] * scale[:, None, :]))
 
 
-def test_is_never_less_certain_than_a_filter_that_estimates_everything() -> None:
+def test_is_never_less_certain_than_a_filter_that_estimates_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the positive semidefinite sense, of the tangent and the velocities."""
+    monkeypatch.setattr(ekf, "_LEAST_ERROR", 0.0)  # slow errors are not estimated
     parameters = EkfParameters(slow_scale=0.0, settle_stddev=1e-5, settle_time=1e5)
     frames = rest(np.random.default_rng(2), 60, 1e-3)
     shares = np.linalg.eigvalsh(gained(filtered(frames, parameters), lagged(frames, LONG, parameters)))
@@ -258,7 +259,7 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
     observed = np.array([name not in weak for name in MODEL.coordinate_names])
     errors: dict[str, list[FloatArray]] = {"filter": [], "lag": [], "full": []}
     inside = []
-    for seed in (11, 12):
+    for seed in (11, 12, 13, 14):  # the ratio of two smoothers trembles by 5 % from one to the other
         truth, frames = recorded(seed, 4.0, noise)
         for name, told in (
             ("filter", filtered(frames)),
@@ -270,7 +271,7 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
                 at = int(np.abs(truth.times - (skeleton.stamp_ns - START_NS) / NANOSECONDS).argmin())
                 if 1.0 < truth.times[at] < 3.8:
                     errors[name].append(skeleton.positions[MODEL.joints] - truth.positions[at])
-                    if name == "full":
+                    if name == "full" and seed < 13:
                         off = MODEL.difference(estimate.q, truth.q[at])[observed]
                         inside.append(np.abs(off) < 1.96 * np.sqrt(np.diag(estimate.covariance)[:NV][observed]))
     rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in errors.items()}
