@@ -71,7 +71,7 @@ _OUTLYING = 6.0
 _NEGLIGIBLE_SLOW = 1e-3
 _STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
-_SLOW_BOUND = 9.0
+_SLOW_BOUND = 25.0
 _FORESEEABLE = 0.1
 """Metres: standard deviation of a predicted point up to which its innovation tells of slow errors."""
 _MEDIAN_OF_CHI2 = 0.455
@@ -109,7 +109,7 @@ _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
-_DRAWING = 9.0
+_DRAWING = 3.0
 """Squared Mahalanobis distance that a point is taken for which has been rejected for long."""
 _MOST_GROWN = 100.0
 _MUCH_BETTER = 0.5
