@@ -181,6 +181,8 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
         found = back.search(graph_up.text())
         assert found is not None
         assert float(found[1]) < 3.0, graph_up.text()
+        heard = len(graph_up.received)  # out here, where the node has to be discovered first
+        assert graph_up.until(lambda heard=heard: len(graph_up.received) > heard, timeout=5.0), graph_up.text()
         assert graph_up.process.poll() is None
         others = graph_up.nodes()
         assert all(others[other].pid == before[other].pid for other in NODES if other != name)
