@@ -18,6 +18,8 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
 SKEW: FloatArray = -_LEVI_CIVITA.reshape(3, 9)
 """(3, 9): ``v @ SKEW`` is the cross product matrix of v, row by row."""
+_CROSS: FloatArray = _LEVI_CIVITA.reshape(9, 3)
+_ONES = np.ones((3, 1))
 
 _MATRIX = np.zeros((16, 9))
 # R = (w^2 - u.u) I + 2 u u^T + 2 w [u]x, as the linear map of the products of the quaternion's numbers
@@ -41,6 +43,13 @@ _PRODUCT = _PRODUCT.reshape(16, 4)
 def skew(v: FloatArray) -> FloatArray:
     """(..., 3, 3) the matrices of the cross product with (..., 3) vectors."""
     result: FloatArray = (v @ SKEW).reshape(*v.shape, 3)
+    return result
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(..., 3) cross products of (..., 3) vectors; numpy's takes several times as long for a few."""
+    products = a[..., :, None] * b[..., None, :]
+    result: FloatArray = products.reshape(*products.shape[:-2], 9) @ _CROSS
     return result
 
 
@@ -86,12 +95,9 @@ def quat_inverse(q: FloatArray) -> FloatArray:
 
 def exp(v: FloatArray) -> FloatArray:
     """(..., 4) unit quaternions xyzw of (..., 3) rotation vectors, radians."""
-    half = 0.5 * np.sqrt((v * v).sum(axis=-1, keepdims=True))
-    q = np.empty((*v.shape[:-1], 4))
-    q[..., 3:] = np.cos(half)
-    half = np.maximum(half, _TINY)  # sin(x) / x is 1 there, exactly
-    q[..., :3] = (0.5 * np.sin(half) / half) * v
-    return q
+    # sin(x) / x is 1, exactly, at the least angle
+    half = np.maximum(0.5 * np.sqrt((v * v) @ _ONES), _TINY)
+    return np.concatenate([(0.5 * np.sin(half) / half) * v, np.cos(half)], axis=-1)
 
 
 def log(q: FloatArray) -> FloatArray:

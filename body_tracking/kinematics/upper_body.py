@@ -23,7 +23,7 @@ of its other angles too. A straight elbow adds the humerus turning against prona
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from body_tracking.skeleton import FloatArray, IntArray, Joint
 
 _EYE3 = np.eye(3)
 _X, _Y, _Z = _EYE3
+# of a point x, [x]x beside the identity: (3, 6), row by row
+_ARM = np.concatenate([so3.SKEW.reshape(3, 3, 3), np.zeros((3, 3, 3))], axis=-1).reshape(3, 18)
+_BESIDE = np.concatenate([np.zeros((3, 3)), _EYE3], axis=-1).reshape(18)
 
 SEGMENTS: tuple[str, ...] = (
     "pelvis",
@@ -179,7 +182,7 @@ class UpperBody:
         ball_segments: list[int] = [0]
         scalar_segments: list[int] = []
         axes = np.zeros((len(SEGMENTS), 3, 3))
-        v_of_axis: list[int] = []
+        scalar_of: list[tuple[int, int]] = []
         nq = 7
         for segment, joint in enumerate(_AXES):
             if segment == 0:
@@ -198,7 +201,7 @@ class UpperBody:
                     axes[segment, number] = axis
                     q_scalar.append(nq + number)
                     v_scalar.append(start + number)
-                    v_of_axis.append(3 * (len(scalar_segments) - 1) + number)
+                    scalar_of.append((segment, number))
                     names.append(name)
                 nq += len(joint)
             self.segment_coordinates.append(slice(start, len(names)))
@@ -214,13 +217,22 @@ class UpperBody:
         self.scalar_v: IntArray = np.array(v_scalar, dtype=np.intp)
         self._quat_q: IntArray = (np.array(q_ball)[:, None] + np.arange(4)).astype(np.intp)
         self.ball_v: IntArray = (np.array(v_ball)[:, None] + np.arange(3)).astype(np.intp)
+        # what of the tangent is simply added to the configuration
+        self._added = np.zeros((self.nv, self.nq))
+        self._added[:3, :3] = _EYE3
+        self._added[self.scalar_v, self.scalar_q] = 1.0
 
-        # rotations of the joints: exp(angle [axis]x) = 1 + sin [axis]x + (1 - cos) [axis]x^2
-        self._scalar_segments = np.array(scalar_segments, dtype=np.intp)
-        self._ball_segments = np.array(ball_segments, dtype=np.intp)
-        self._axis_slot: IntArray = np.array(v_of_axis, dtype=np.intp)
-        generator = so3.skew(axes[scalar_segments])
-        self._generators = np.stack([generator, generator @ generator])
+        # rotations of the joints: exp(angle [axis]x) = 1 + sin [axis]x + (1 - cos) [axis]x^2; in this order the first
+        # axes of all joints that turn about axes, the second ones, and the third ones, which only the first joints have
+        order = [(segment, number) for number in range(3) for segment in scalar_segments if axes[segment, number].any()]
+        self._turning_joints = len(scalar_segments)
+        self._three_axes = len(order) - 2 * len(scalar_segments)
+        places = list(zip(scalar_of, q_scalar, strict=True))
+        self._angle_q: IntArray = np.array([q for axis in order for of, q in places if of == axis], dtype=np.intp)
+        generator = so3.skew(np.array([axes[axis] for axis in order]))
+        self._sine_part, self._cosine_part = generator, generator @ generator
+        joints = [*scalar_segments, *ball_segments]
+        self._joint_of: IntArray = np.array([joints.index(segment) for segment in range(len(SEGMENTS))], dtype=np.intp)
 
         # the tree: levels of segments that can be computed at once; these and their parents stand side by side
         depth = [0] * len(SEGMENTS)
@@ -228,7 +240,8 @@ class UpperBody:
             depth[segment] = depth[parent] + 1
         levels = [[s for s in range(len(SEGMENTS)) if depth[s] == level] for level in range(1, max(depth) + 1)]
         self._levels = [
-            (slice(level[0], level[-1] + 1), slice(PARENTS[level[0]], PARENTS[level[-1]] + 1)) for level in levels
+            (_rotations(level[0], level[-1] + 1), _rotations(PARENTS[level[0]], PARENTS[level[-1]] + 1))
+            for level in levels
         ]
         point_of = {joint: number for number, (joint, _, _) in enumerate(_POINTS)}
         segment_of = [SEGMENTS.index(name) for _, name, _ in _POINTS]
@@ -260,20 +273,21 @@ class UpperBody:
         The last axis of a joint stands still in the segment that it turns, the first one in the parent. The middle one
         of three stands still in a frame of its own, which comes after the segments.
         """
-        self._three: IntArray = np.array([k for k, s in enumerate(scalar_segments) if len(_AXES[s] or ()) == 3])
-        self._three_parents = np.array([PARENTS[scalar_segments[k]] for k in self._three], dtype=np.intp)
+        three = [s for s in scalar_segments if len(_AXES[s] or ()) == 3]
+        assert three == scalar_segments[: self._three_axes]
+        self._three_parents = np.array([PARENTS[s] for s in three], dtype=np.intp)
         frame: dict[int, tuple[int, FloatArray]] = {}
         for segment in ball_segments:
             start = self.segment_coordinates[segment].start
             frame.update({start + axis: (segment, np.eye(3)[axis]) for axis in range(3)})
-        for number, segment in enumerate(scalar_segments):
+        for segment in scalar_segments:
             joint = _AXES[segment]
             assert joint is not None
             start = self.segment_coordinates[segment].start
             frame[start] = (PARENTS[segment], joint[0][1])
             frame[start + len(joint) - 1] = (segment, joint[-1][1])
             if len(joint) == 3:
-                frame[start + 1] = (len(SEGMENTS) + list(self._three).index(number), joint[1][1])
+                frame[start + 1] = (len(SEGMENTS) + three.index(segment), joint[1][1])
         self._axis_columns = _columns([frame[v] for v in range(3, self.nv)])
 
     def _place_lengths(self, segment_of: list[int]) -> None:
@@ -313,11 +327,8 @@ class UpperBody:
 
     def integrate(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """(..., 35) the configuration (..., 35) moved by the tangent vector (..., 32)."""
-        leading = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
-        moved = np.empty((*leading, self.nq))
-        moved[..., :3] = q[..., :3] + v[..., :3]
-        moved[..., self.scalar_q] = q[..., self.scalar_q] + v[..., self.scalar_v]
-        turned = so3.quat_multiply(q[..., self._quat_q], so3.exp(v[..., self.ball_v]))
+        moved: FloatArray = q + v @ self._added
+        turned = so3.quat_multiply(q.take(self._quat_q, axis=-1), so3.exp(v.take(self.ball_v, axis=-1)))
         # products of unit quaternions leave the unit sphere by a rounding error each
         moved[..., self._quat_q] = turned / np.sqrt((turned * turned).sum(axis=-1, keepdims=True))
         return moved
@@ -348,17 +359,18 @@ class UpperBody:
         """Forward kinematics and its derivatives; arguments and errors as of :meth:`forward`."""
         frames = self._frames(q)
         along, posture = self._place(q, lengths, frames)
-        axes = self._directions(frames, self._axis_columns)  # (..., 29, 3)
+        axes = _directions(frames, self._axis_columns)  # (..., 29, 3)
         columns = axes.swapaxes(-1, -2)
-        # a segment turns with the axes of all joints up to it; a point moves by axis x (point - origin)
+        # a segment turns with the axes of all joints up to it; a point moves by axis x (point - origin), the opposite
+        # of [point]x axis + axis x origin
         centres = posture.origins.take(self._centre_segment, axis=-2)
-        swept = (so3.skew(axes) * centres[..., None, :]).sum(axis=-1).swapaxes(-1, -2)
+        screws = np.concatenate([axes, so3.cross(axes, centres)], axis=-1).swapaxes(-1, -2)  # (..., 6, 29)
         shape = axes.shape[:-2]
-        arms = so3.skew(posture.positions).reshape(*shape, -1, 3)
-        moved = (arms @ columns).reshape(*shape, len(self.joints), 3, self.nv - 3)
+        arms = (posture.positions @ _ARM + _BESIDE).reshape(*shape, -1, 6)
+        moved = (arms @ screws).reshape(*shape, len(self.joints), 3, self.nv - 3)
         jacobian = np.empty((*shape, len(self.joints), 3, self.nv))
         jacobian[..., :3] = _EYE3
-        np.multiply(moved + swept[..., None, :, :], self._minus_moves, out=jacobian[..., 3:])
+        np.multiply(moved, self._minus_moves, out=jacobian[..., 3:])
         turning = np.zeros((*shape, len(SEGMENTS), 3, self.nv))
         np.multiply(columns[..., None, :, :], self._turns, out=turning[..., 3:])
         by_lengths = self._counts[:, None, :] * along.swapaxes(-1, -2)[..., None, :, :]
@@ -378,51 +390,51 @@ class UpperBody:
             (19, 3) metres.
         """
         axes = lines.rotation_jacobian[self._centre_segment, :, np.arange(3, self.nv)]
-        behind = lines.jacobian[..., 3:] @ (covariance[3:, 3:] * self._pairs).T * -self._minus_moves
-        swung = np.ascontiguousarray(behind.swapaxes(1, 2)).reshape(len(behind), -1)
-        result: FloatArray = swung @ so3.skew(axes).swapaxes(1, 2).reshape(-1, 3)
-        return result
+        behind = lines.jacobian[..., 3:].reshape(-1, self.nv - 3) @ (covariance[3:, 3:] * self._pairs).T
+        behind = behind.reshape(-1, 3, self.nv - 3) * self._minus_moves
+        # the sum of axis x behind over all coordinates, as one product
+        result: FloatArray = behind.reshape(len(behind), -1) @ so3.skew(axes).transpose(2, 0, 1).reshape(-1, 3)
+        return -result
 
     def _frames(self, q: FloatArray) -> FloatArray:
         """(..., 14, 3, 3) rotations in world: of the segments, then of the middle axes of the joints with three."""
         if q.shape[-1] != self.nq:
             raise ModelError(f"upper_body: a configuration of {q.shape[-1]} numbers, expected {self.nq}")
-        leading = q.shape[:-1]
-        angles = np.zeros((*leading, 3 * len(self._scalar_segments)))
-        angles[..., self._axis_slot] = q.take(self.scalar_q, axis=-1)
-        angles = angles.reshape(*leading, -1, 3, 1, 1)
-        first, second = self._generators
-        steps = _EYE3 + np.sin(angles) * first + (1.0 - np.cos(angles)) * second
-        frames = np.empty((*leading, len(SEGMENTS) + len(self._three), 3, 3))
-        two = steps[..., 0, :, :] @ steps[..., 1, :, :]
-        frames[..., self._scalar_segments, :, :] = two
-        last = self._scalar_segments[self._three]
-        frames[..., last, :, :] = two[..., self._three, :, :] @ steps[..., self._three, 2, :, :]
-        frames[..., self._ball_segments, :, :] = so3.quat_to_matrix(q[..., self._quat_q])
+        angles = q.take(self._angle_q, axis=-1)[..., None, None]
+        steps = _EYE3 + np.sin(angles) * self._sine_part + (1.0 - np.cos(angles)) * self._cosine_part
+        joints, three = self._turning_joints, self._three_axes
+        turned = steps[..., :joints, :, :] @ steps[..., joints : 2 * joints, :, :]
+        turned[..., :three, :, :] = turned[..., :three, :, :] @ steps[..., 2 * joints :, :, :]
+        balls = so3.quat_to_matrix(q.take(self._quat_q, axis=-1))
+        frames = np.concatenate([turned, balls], axis=-3).take(self._joint_of, axis=-3)
         for segments, parents in self._levels:  # in place, parents first; the base has its own already
-            frames[..., segments, :, :] = frames[..., parents, :, :] @ frames[..., segments, :, :]
-        middle = frames[..., self._three_parents, :, :] @ steps[..., self._three, 0, :, :]
-        frames[..., len(SEGMENTS) :, :, :] = middle
-        return frames
-
-    def _directions(self, frames: FloatArray, columns: tuple[IntArray, FloatArray]) -> FloatArray:
-        """(..., n, 3) columns of rotations (..., 14, 3, 3), or their opposites."""
-        places, signs = columns
-        flat = frames.swapaxes(-1, -2).reshape(*frames.shape[:-3], -1, 3)
-        result: FloatArray = flat.take(places, axis=-2) * signs
-        return result
+            frames[segments] = frames[parents] @ frames[segments]
+        middle = frames.take(self._three_parents, axis=-3) @ steps[..., :three, :, :]
+        return np.concatenate([frames, middle], axis=-3)
 
     def _place(self, q: FloatArray, lengths: FloatArray, frames: FloatArray) -> tuple[FloatArray, Posture]:
         """(..., 21, 3) directions of the lengths in world, and the posture; points are linear in the lengths."""
         if lengths.shape[-1] != len(LENGTHS):
             raise ModelError(f"upper_body: {lengths.shape[-1]} segment lengths, expected {len(LENGTHS)}")
-        along = self._directions(frames, self._length_columns)
+        along = _directions(frames, self._length_columns)
         positions = q[..., None, :3] + self._counts @ (lengths[..., None] * along)
         origins = positions.take(self._origin_point, axis=-2)
         return along, Posture(positions, origins, frames[..., : len(SEGMENTS), :, :])
 
 
+def _rotations(start: int, stop: int) -> tuple[Any, ...]:
+    """The index of some of a stack of rotations (..., n, 3, 3)."""
+    return (..., slice(start, stop), slice(None), slice(None))
+
+
 def _columns(places: list[tuple[int, FloatArray]]) -> tuple[IntArray, FloatArray]:
-    """(n,) indices of columns in a stack of rotations, row after row, and (n, 1) signs, of (rotation, signed axis)."""
-    columns = np.array([3 * frame + int(np.abs(axis).argmax()) for frame, axis in places], dtype=np.intp)
-    return columns, np.array([[float(axis.sum())] for _, axis in places])
+    """(n, 3) indices of columns in flat rotations, one after the other, and (n, 1) signs, of (rotation, signed axis)."""
+    columns = [9 * frame + 3 * np.arange(3) + np.abs(axis).argmax() for frame, axis in places]
+    return np.array(columns, dtype=np.intp), np.array([[float(axis.sum())] for _, axis in places])
+
+
+def _directions(frames: FloatArray, columns: tuple[IntArray, FloatArray]) -> FloatArray:
+    """(..., n, 3) columns of rotations (..., 14, 3, 3), or their opposites."""
+    places, signs = columns
+    result: FloatArray = frames.reshape(*frames.shape[:-3], -1).take(places, axis=-1) * signs
+    return result
