@@ -428,7 +428,7 @@ def _rotations(start: int, stop: int) -> tuple[Any, ...]:
 
 
 def _columns(places: list[tuple[int, FloatArray]]) -> tuple[IntArray, FloatArray]:
-    """(n, 3) indices of columns in flat rotations, one after the other, and (n, 1) signs, of (rotation, signed axis)."""
+    """(n, 3) indices of columns in a flat stack of rotations, and (n, 1) signs, of (rotation, signed axis)."""
     columns = [9 * frame + 3 * np.arange(3) + np.abs(axis).argmax() for frame, axis in places]
     return np.array(columns, dtype=np.intp), np.array([[float(axis.sum())] for _, axis in places])
 
