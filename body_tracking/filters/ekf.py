@@ -51,6 +51,7 @@ from body_tracking.skeleton import (
 
 _DIMENSIONS = 3
 _EYE3 = np.eye(_DIMENSIONS)
+_LOWER = np.asfortranarray(np.tri(_DIMENSIONS * N_JOINTS))
 _START_FRAMES = 4
 """Frames of one sensor that tell its noise."""
 _WAIT_NS = NANOSECONDS // 2
@@ -728,6 +729,8 @@ class ExtendedKalmanFilter:
         if names:
             # Slow errors are only considered (Schmidt 1966): C - K H C, and - K B of the sensor's own.
             kalman = gain.T @ whitening  # (85, k)
+            if state.settled:
+                kalman[self._lengths] = 0.0
             taken = kalman @ observation[rows]
             news = [(block, taken[block] @ crosses[: self._observed]) for block in self._estimated[state.settled]]
             crosses = crosses.copy()
@@ -736,9 +739,8 @@ class ExtendedKalmanFilter:
             if basis is not None:
                 place = names.index(measurement.sensor) * self._slow_size
                 own_cross = crosses[:, place : place + self._slow_size]
-                for block in self._estimated[state.settled]:
-                    own_cross[block, rows] -= kalman[block] * basis.points[rows]
-                    own_cross[block, 3 * self._points :] -= kalman[block] @ basis.limbs[rows]
+                own_cross[:, rows] -= kalman * basis.points[rows]
+                own_cross[:, 3 * self._points :] -= kalman @ basis.limbs[rows]
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
@@ -1106,11 +1108,11 @@ class ExtendedKalmanFilter:
         """The faded mean of the innovations (19, 3), its weights (19,) and the strain."""
         fade = math.exp(-dt / _LEAN_TIME)
         bounded = np.minimum(1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9)))  # one outlier is no lean
-        weight = np.where(measured, fade * state.leaning + 1.0, fade * state.leaning)
-        step = np.where(measured, bounded / np.maximum(weight, 1.0), 0.0)
-        lean = state.lean + step[:, None] * innovation - (measured / np.maximum(weight, 1.0))[:, None] * state.lean
+        weight = fade * state.leaning + measured
+        step = measured / np.maximum(weight, 1.0)
+        lean = state.lean + step[:, None] * (bounded[:, None] * innovation - state.lean)
         # variance of a faded mean of white innovations with this weight
-        worth = np.minimum(weight * (1.0 + fade) / 2.0, weight)
+        worth = (0.5 + 0.5 * fade) * weight
         # a body is no model: what is off by less than this needs no other pose
         averaged = white * (1.0 - 1.0 / np.maximum(worth, 1.0))  # only what is white averages out
         spread = covariance + (_MISFIT**2 - averaged)[:, None, None] * _EYE3
@@ -1286,6 +1288,8 @@ class ExtendedKalmanFilter:
         Softly a range pushes back ten times a second; a velocity that runs on while nothing is seen, or a measurement
         that no body can follow, is stopped here at once.
         """
+        if self.ranges.surely_within(state.q, _FAR_BEYOND):
+            return state
         for _ in range(_PROJECTIONS):
             excess = self.ranges.excess(state.q)
             size = np.abs(excess)
@@ -1384,14 +1388,15 @@ def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tu
     return tuple(each for each in names if each != name), crosses[:, kept]
 
 
-def _cholesky(matrix: FloatArray) -> FloatArray:
-    """The lower factor; numpy's takes three times as long on one so small.
+def _cholesky(matrix: FloatArray, *, clean: bool = True) -> FloatArray:
+    """The lower factor, without zeros above it if not ``clean``; numpy's takes three times as long on one so small.
 
     Raises:
         LinAlgError: the matrix is not positive definite, or not finite.
     """
     factor: FloatArray
-    factor, failed = dpotrf(matrix, lower=1, clean=1)
+    # the transpose of a symmetric matrix need not be brought into Fortran's order
+    factor, failed = dpotrf(matrix.T, lower=1, clean=clean)
     if failed or not math.isfinite(float(factor.trace())):
         raise np.linalg.LinAlgError("not positive definite")
     return factor
@@ -1404,7 +1409,8 @@ def _whitening(covariance: FloatArray) -> FloatArray:
         LinAlgError: as of :func:`_cholesky`.
     """
     inverse: FloatArray
-    inverse, _ = dtrtri(_cholesky(covariance), lower=1)
+    inverse, _ = dtrtri(_cholesky(covariance, clean=False), lower=1, overwrite_c=1)
+    inverse *= _LOWER[: len(inverse), : len(inverse)]  # LAPACK leaves something above the diagonal
     return inverse
 
 
