@@ -51,6 +51,8 @@ from body_tracking.skeleton import (
 
 _DIMENSIONS = 3
 _EYE3 = np.eye(_DIMENSIONS)
+_UNKNOWN = np.zeros((N_JOINTS, _DIMENSIONS, _DIMENSIONS))
+_UNKNOWN[:] = np.diag([np.inf] * _DIMENSIONS)
 _LOWER = np.asfortranarray(np.tri(_DIMENSIONS * N_JOINTS))
 _START_FRAMES = 4
 """Frames of one sensor that tell its noise."""
@@ -371,6 +373,7 @@ class ExtendedKalmanFilter:
         self._base_variance = BASE_STDDEV[self.model.joints] ** 2
         self._gate = float(chi2.ppf(p.gate_probability, _DIMENSIONS))
         self._group, self._first_log_density = self._groups()
+        self._log_density_bounds = self._first_log_density - _DENSITY_DOWN, self._first_log_density + _DENSITY_UP
         self._group_sum = np.zeros((len(self._first_log_density), self._nv))
         self._group_sum[self._group, np.arange(self._nv)] = 1.0
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
@@ -868,7 +871,8 @@ class ExtendedKalmanFilter:
         points = 3 * self._points
         squares = likely**2
         # one that is far from all others says nothing, where all are far they say much
-        usual = max(1.0, float(np.median(squares[:points] / np.maximum(expected[:points], 1e-30))) / _MEDIAN_OF_CHI2)
+        shares = np.sort(squares[:points] / np.maximum(expected[:points], 1e-30))
+        usual = max(1.0, float(shares[points // 2]) / _MEDIAN_OF_CHI2)  # their number is odd
         score = 0.5 * (np.minimum(squares, _SLOW_BOUND * usual * expected) - expected)
         squared = gram * gram
         scores = np.array([score[:points].sum(), score[points:].sum()])
@@ -918,10 +922,11 @@ class ExtendedKalmanFilter:
         rate = self.parameters.density_rate * dt / _WHITENESS_TIME
         # coordinates that the measurement does not touch say nothing
         share = variance / (variance + _UNTOUCHED * remaining + 1e-30)
-        ratio = np.minimum(moved**2 / (variance + 1e-30), _RATIO_BOUND) - 1.0
+        ratio = np.minimum(moved * moved / (variance + 1e-30), _RATIO_BOUND) - 1.0
         lean = self._group_sum @ (share * ratio) / (self._group_sum @ share + 0.3)
-        log_density = state.log_density + rate * lean
-        return np.clip(log_density, self._first_log_density - _DENSITY_DOWN, self._first_log_density + _DENSITY_UP)
+        least, greatest = self._log_density_bounds
+        result: FloatArray = np.minimum(np.maximum(state.log_density + rate * lean, least), greatest)
+        return result
 
     def _measured(self, state: _State, measurement: _Measurement) -> _State:
         """The lengths that many poses tell, which take the place of those that the filter had."""
@@ -1367,16 +1372,14 @@ class ExtendedKalmanFilter:
     def _output(self, state: _State, skeleton: Skeleton) -> Skeleton:
         lines = self.model.linearise(state.q, state.lengths)
         joints = self.model.joints
-        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
-        flat = observation.reshape(-1, self._observed)
-        spread = (flat @ state.covariance[: self._observed, : self._observed]).reshape(self._points, 3, self._observed)
-        positions, velocities = np.full((N_JOINTS, 3), np.nan), np.full((N_JOINTS, 3), np.nan)
-        covariances = np.zeros((N_JOINTS, 3, 3))
-        covariances[:] = np.diag([np.inf] * 3)
+        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
+        spread = observation @ state.covariance[: self._observed, : self._observed] @ observation.T
+        positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
+        covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)
         positions[joints] = lines.posture.positions
-        velocities[joints] = lines.jacobian @ state.velocity
-        covariances[joints] = spread @ observation.swapaxes(1, 2)
+        velocities[joints] = (observation[:, self._tangent] @ state.velocity).reshape(-1, 3)
+        covariances[joints] = spread.reshape(-1).take(self._own)
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)

@@ -18,7 +18,6 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
 SKEW: FloatArray = -_LEVI_CIVITA.reshape(3, 9)
 """(3, 9): ``v @ SKEW`` is the cross product matrix of v, row by row."""
-_CROSS: FloatArray = _LEVI_CIVITA.reshape(9, 3)
 _ONES = np.ones((3, 1))
 
 _MATRIX = np.zeros((16, 9))
@@ -43,13 +42,6 @@ _PRODUCT = _PRODUCT.reshape(16, 4)
 def skew(v: FloatArray) -> FloatArray:
     """(..., 3, 3) the matrices of the cross product with (..., 3) vectors."""
     result: FloatArray = (v @ SKEW).reshape(*v.shape, 3)
-    return result
-
-
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(..., 3) cross products of (..., 3) vectors; numpy's takes several times as long for a few."""
-    products = a[..., :, None] * b[..., None, :]
-    result: FloatArray = products.reshape(*products.shape[:-2], 9) @ _CROSS
     return result
 
 

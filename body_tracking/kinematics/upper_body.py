@@ -36,6 +36,8 @@ _X, _Y, _Z = _EYE3
 # of a point x, [x]x beside the identity: (3, 6), row by row
 _ARM = np.concatenate([so3.SKEW.reshape(3, 3, 3), np.zeros((3, 3, 3))], axis=-1).reshape(3, 18)
 _BESIDE = np.concatenate([np.zeros((3, 3)), _EYE3], axis=-1).reshape(18)
+_CROSS = -so3.SKEW
+_BASE_SCREWS = np.concatenate([np.zeros((3, 3)), -_EYE3])
 
 SEGMENTS: tuple[str, ...] = (
     "pelvis",
@@ -232,7 +234,8 @@ class UpperBody:
         generator = so3.skew(np.array([axes[axis] for axis in order]))
         self._sine_part, self._cosine_part = generator, generator @ generator
         joints = [*scalar_segments, *ball_segments]
-        self._joint_of: IntArray = np.array([joints.index(segment) for segment in range(len(SEGMENTS))], dtype=np.intp)
+        joint_of = [*map(joints.index, range(len(SEGMENTS))), *range(len(joints), len(joints) + self._three_axes)]
+        self._joint_of: IntArray = np.array(joint_of, dtype=np.intp)
 
         # the tree: levels of segments that can be computed at once; these and their parents stand side by side
         depth = [0] * len(SEGMENTS)
@@ -256,11 +259,13 @@ class UpperBody:
                 turns[segment] = turns[parent]
             turns[segment, self.segment_coordinates[segment]] = 1.0
         self._turns = turns[:, None, 3:]
-        self._minus_moves = -self._turns[segment_of]
+        self._minus_moves = np.full((len(_POINTS), 1, self.nv), -1.0)  # the base's translation moves every point
+        self._minus_moves[..., 3:] = -self._turns[segment_of]
         carrier = [
             segment for segment, part in enumerate(self.segment_coordinates) for _ in range(part.start, part.stop)
         ]
         self._centre_segment: IntArray = np.array(carrier, dtype=np.intp)
+        self._centre_point = self._origin_point[self._centre_segment]
         # of each pair of coordinates the second derivative has the earlier axis outside; of a ball's both by half
         same = self._centre_segment[:, None] == self._centre_segment
         ball = same & np.isin(self._centre_segment, ball_segments)
@@ -275,7 +280,11 @@ class UpperBody:
         """
         three = [s for s in scalar_segments if len(_AXES[s] or ()) == 3]
         assert three == scalar_segments[: self._three_axes]
-        self._three_parents = np.array([PARENTS[s] for s in three], dtype=np.intp)
+        # the last level: the middle axes of the joints with three
+        first = PARENTS[three[0]]
+        assert [PARENTS[s] for s in three] == list(range(first, first + len(three)))
+        count = len(SEGMENTS)
+        self._levels.append((_rotations(count, count + len(three)), _rotations(first, first + len(three))))
         frame: dict[int, tuple[int, FloatArray]] = {}
         for segment in ball_segments:
             start = self.segment_coordinates[segment].start
@@ -359,21 +368,20 @@ class UpperBody:
         """Forward kinematics and its derivatives; arguments and errors as of :meth:`forward`."""
         frames = self._frames(q)
         along, posture = self._place(q, lengths, frames)
-        axes = _directions(frames, self._axis_columns)  # (..., 29, 3)
-        columns = axes.swapaxes(-1, -2)
+        axes = _directions(frames, self._axis_columns)  # (..., 3, 29)
         # a segment turns with the axes of all joints up to it; a point moves by axis x (point - origin), the opposite
-        # of [point]x axis + axis x origin
-        centres = posture.origins.take(self._centre_segment, axis=-2)
-        screws = np.concatenate([axes, so3.cross(axes, centres)], axis=-1).swapaxes(-1, -2)  # (..., 6, 29)
+        # of [point]x axis + axis x origin; and it moves with the base
         shape = axes.shape[:-2]
+        screws = np.empty((*shape, 6, self.nv))
+        screws[..., :3] = _BASE_SCREWS
+        screws[..., :3, 3:] = axes
+        screws[..., 3:, 3:] = _cross(axes, posture.positions.swapaxes(-1, -2).take(self._centre_point, axis=-1))
         arms = (posture.positions @ _ARM + _BESIDE).reshape(*shape, -1, 6)
-        moved = (arms @ screws).reshape(*shape, len(self.joints), 3, self.nv - 3)
-        jacobian = np.empty((*shape, len(self.joints), 3, self.nv))
-        jacobian[..., :3] = _EYE3
-        np.multiply(moved, self._minus_moves, out=jacobian[..., 3:])
+        jacobian = (arms @ screws).reshape(*shape, len(self.joints), 3, self.nv)
+        jacobian *= self._minus_moves
         turning = np.zeros((*shape, len(SEGMENTS), 3, self.nv))
-        np.multiply(columns[..., None, :, :], self._turns, out=turning[..., 3:])
-        by_lengths = self._counts[:, None, :] * along.swapaxes(-1, -2)[..., None, :, :]
+        np.multiply(axes[..., None, :, :], self._turns, out=turning[..., 3:])
+        by_lengths = self._counts[:, None, :] * along[..., None, :, :]
         return Linearisation(posture, jacobian, by_lengths, turning)
 
     def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
@@ -391,7 +399,7 @@ class UpperBody:
         """
         axes = lines.rotation_jacobian[self._centre_segment, :, np.arange(3, self.nv)]
         behind = lines.jacobian[..., 3:].reshape(-1, self.nv - 3) @ (covariance[3:, 3:] * self._pairs).T
-        behind = behind.reshape(-1, 3, self.nv - 3) * self._minus_moves
+        behind = behind.reshape(-1, 3, self.nv - 3) * self._minus_moves[..., 3:]
         # the sum of axis x behind over all coordinates, as one product
         result: FloatArray = behind.reshape(len(behind), -1) @ so3.skew(axes).transpose(2, 0, 1).reshape(-1, 3)
         return -result
@@ -406,18 +414,18 @@ class UpperBody:
         turned = steps[..., :joints, :, :] @ steps[..., joints : 2 * joints, :, :]
         turned[..., :three, :, :] = turned[..., :three, :, :] @ steps[..., 2 * joints :, :, :]
         balls = so3.quat_to_matrix(q.take(self._quat_q, axis=-1))
-        frames = np.concatenate([turned, balls], axis=-3).take(self._joint_of, axis=-3)
+        local = np.concatenate([turned, balls, steps[..., :three, :, :]], axis=-3)
+        frames: FloatArray = local.take(self._joint_of, axis=-3)
         for segments, parents in self._levels:  # in place, parents first; the base has its own already
             frames[segments] = frames[parents] @ frames[segments]
-        middle = frames.take(self._three_parents, axis=-3) @ steps[..., :three, :, :]
-        return np.concatenate([frames, middle], axis=-3)
+        return frames
 
     def _place(self, q: FloatArray, lengths: FloatArray, frames: FloatArray) -> tuple[FloatArray, Posture]:
-        """(..., 21, 3) directions of the lengths in world, and the posture; points are linear in the lengths."""
+        """(..., 3, 21) directions of the lengths in world, and the posture; points are linear in the lengths."""
         if lengths.shape[-1] != len(LENGTHS):
             raise ModelError(f"upper_body: {lengths.shape[-1]} segment lengths, expected {len(LENGTHS)}")
         along = _directions(frames, self._length_columns)
-        positions = q[..., None, :3] + self._counts @ (lengths[..., None] * along)
+        positions = q[..., None, :3] + self._counts @ (lengths[..., None, :] * along).swapaxes(-1, -2)
         origins = positions.take(self._origin_point, axis=-2)
         return along, Posture(positions, origins, frames[..., : len(SEGMENTS), :, :])
 
@@ -428,13 +436,20 @@ def _rotations(start: int, stop: int) -> tuple[Any, ...]:
 
 
 def _columns(places: list[tuple[int, FloatArray]]) -> tuple[IntArray, FloatArray]:
-    """(n, 3) indices of columns in a flat stack of rotations, and (n, 1) signs, of (rotation, signed axis)."""
+    """(3, n) indices of columns in a flat stack of rotations, and (n,) signs, of (rotation, signed axis)."""
     columns = [9 * frame + 3 * np.arange(3) + np.abs(axis).argmax() for frame, axis in places]
-    return np.array(columns, dtype=np.intp), np.array([[float(axis.sum())] for _, axis in places])
+    return np.array(columns, dtype=np.intp).T.copy(), np.array([float(axis.sum()) for _, axis in places])
 
 
 def _directions(frames: FloatArray, columns: tuple[IntArray, FloatArray]) -> FloatArray:
-    """(..., n, 3) columns of rotations (..., 14, 3, 3), or their opposites."""
+    """(..., 3, n) columns of rotations (..., 14, 3, 3), or their opposites."""
     places, signs = columns
     result: FloatArray = frames.reshape(*frames.shape[:-3], -1).take(places, axis=-1) * signs
+    return result
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(..., 3, n) cross products of columns."""
+    products = a[..., :, None, :] * b[..., None, :, :]
+    result: FloatArray = _CROSS @ products.reshape(*products.shape[:-3], 9, -1)
     return result
