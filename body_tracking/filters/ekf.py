@@ -887,8 +887,8 @@ class ExtendedKalmanFilter:
 
     def _least_slow(self, white: FloatArray, measurement: _Measurement) -> FloatArray:
         """(2,) the scales that there are at least: what a sensor's points do not tremble by, they are wrong by."""
-        missing = _LEAST_ERROR**2 - float(white.mean())
-        return np.array([max(missing, 0.0) / float(measurement.model_variance.mean()), 0.0])
+        missing = self._points * _LEAST_ERROR**2 - float(white.sum())
+        return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), 0.0])
 
     def _per_error(self, scales: FloatArray) -> FloatArray:
         """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
