@@ -29,6 +29,17 @@ for _i in range(3):
     _MATRIX[15, 4 * _i] += 1.0
 _MATRIX[3:12:4] += 2.0 * SKEW
 
+# four times the products of a quaternion's numbers, as a linear map of its rotation matrix and constants
+_PRODUCTS: FloatArray = np.zeros((3, 3, 4, 4))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _PRODUCTS[_i, _i] = np.diag([-1.0, -1.0, -1.0, 1.0])
+    _PRODUCTS[_i, _i, _i, _i] = 1.0
+    _PRODUCTS[_i, _j, [_i, _j], [_j, _i]] = _PRODUCTS[_j, _i, [_i, _j], [_j, _i]] = 1.0
+    _PRODUCTS[_k, _j, [_i, 3], [3, _i]] = 1.0
+    _PRODUCTS[_j, _k, [_i, 3], [3, _i]] = -1.0
+_PRODUCTS = _PRODUCTS.reshape(9, 16)
+_UNIT_PRODUCTS: FloatArray = np.eye(4).reshape(16)
+
 _PRODUCT: FloatArray = np.zeros((4, 4, 4))
 # a * b = (aw bv + bw av + av x bv, aw bw - av . bv), as the linear map of the products of the quaternions' numbers
 for _i in range(3):
@@ -54,21 +65,13 @@ def quat_to_matrix(q: FloatArray) -> FloatArray:
 
 def matrix_to_quat(matrix: FloatArray) -> FloatArray:
     """(..., 4) unit quaternions xyzw, w >= 0, of (..., 3, 3) rotation matrices (Shepperd 1978: by the largest part)."""
-    m = matrix
-    diagonal = np.diagonal(m, axis1=-2, axis2=-1)
-    trace = diagonal.sum(axis=-1)
-    # four times the products of the quaternion's numbers: (..., 4, 4), its largest row is the best conditioned
-    outer = np.empty((*m.shape[:-2], 4, 4))
-    outer[..., :3, :3] = m + m.swapaxes(-1, -2)
-    for i in range(3):
-        outer[..., i, i] = 1.0 + 2.0 * diagonal[..., i] - trace
-    vee = np.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
-    outer[..., 3, :3] = outer[..., :3, 3] = vee
-    outer[..., 3, 3] = 1.0 + trace
-    best = np.diagonal(outer, axis1=-2, axis2=-1).argmax(axis=-1)
-    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    result: FloatArray = np.where(q[..., 3:] < 0.0, -q, q)
+    # four times the products of the quaternion's numbers: (n, 4, 4), its largest row is the best conditioned
+    outer = (matrix.reshape(-1, 9) @ _PRODUCTS + _UNIT_PRODUCTS).reshape(-1, 4)
+    best = outer.reshape(-1, 16)[:, ::5].argmax(axis=1)
+    q = outer[4 * np.arange(len(best)) + best]
+    # w >= 0
+    q /= np.copysign(np.sqrt((q * q).sum(axis=1)), q[:, 3])[:, None]
+    result: FloatArray = q.reshape(*matrix.shape[:-2], 4)
     return result
 
 

@@ -344,11 +344,8 @@ class UpperBody:
 
     def difference(self, q0: FloatArray, q1: FloatArray) -> FloatArray:
         """(..., 32) the shortest ``v`` with ``integrate(q0, v) == q1``."""
-        leading = np.broadcast_shapes(q0.shape[:-1], q1.shape[:-1])
-        v = np.empty((*leading, self.nv))
-        v[..., :3] = q1[..., :3] - q0[..., :3]
-        v[..., self.scalar_v] = q1[..., self.scalar_q] - q0[..., self.scalar_q]
-        relative = so3.quat_multiply(so3.quat_inverse(q0[..., self._quat_q]), q1[..., self._quat_q])
+        v: FloatArray = (q1 - q0) @ self._added.T
+        relative = so3.quat_multiply(so3.quat_inverse(q0.take(self._quat_q, axis=-1)), q1.take(self._quat_q, axis=-1))
         v[..., self.ball_v] = so3.log(relative)
         return v
 
