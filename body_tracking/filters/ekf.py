@@ -50,6 +50,7 @@ from body_tracking.skeleton import (
 )
 
 _DIMENSIONS = 3
+_TRACKED, _INFERRED = np.uint8(TrackingState.TRACKED), np.uint8(TrackingState.INFERRED)
 _EYE3 = np.eye(_DIMENSIONS)
 _UNKNOWN = np.zeros((N_JOINTS, _DIMENSIONS, _DIMENSIONS))
 _UNKNOWN[:] = np.diag([np.inf] * _DIMENSIONS)
@@ -490,7 +491,7 @@ class ExtendedKalmanFilter:
         measured = skeleton.valid[joints]
         positions = np.where(measured[:, None], skeleton.positions[joints], 0.0)
         states = skeleton.states[joints]
-        inferred = np.where(states == TrackingState.TRACKED, 1.0, INFERRED_FACTOR**2)
+        inferred = np.where(states == _TRACKED, 1.0, INFERRED_FACTOR**2)
         model = self._base_variance * inferred
         if skeleton.covariances is not None:
             given = skeleton.covariances[joints]
@@ -937,7 +938,7 @@ class ExtendedKalmanFilter:
             measurement.sensor,
             measurement.stamp_ns,
             measurement.positions,
-            measurement.measured & (measurement.skeleton.states[self.model.joints] == TrackingState.TRACKED),
+            measurement.measured & (measurement.skeleton.states[self.model.joints] == _TRACKED),
             sensor.white,
             measurement.model_variance,
             float(sensor.slow[0]),
@@ -1381,7 +1382,7 @@ class ExtendedKalmanFilter:
         velocities[joints] = (observation[:, self._tangent] @ state.velocity).reshape(-1, 3)
         covariances[joints] = spread.reshape(-1).take(self._own)
         used = state.used_ns == skeleton.stamp_ns
-        states[joints] = np.where(used, skeleton.states[joints], np.uint8(TrackingState.INFERRED))
+        states[joints] = np.where(used, skeleton.states[joints], _INFERRED)
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
 
 
