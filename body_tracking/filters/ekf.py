@@ -113,6 +113,9 @@ _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_LINEARISATIONS = 4
+_FAR, _CLOSE = 0.2, 0.05
+"""Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
 _DRAWING = 3.0
@@ -346,6 +349,27 @@ class _State(_Changeable):
             return None
         place, size = self.slow_names.index(name), self.crosses.shape[1] // len(self.slow_names)
         return self.crosses[:, place * size : (place + 1) * size]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Expected:
+    """A frame against what was expected of it.
+
+    Attributes:
+        observation: (57, 53) derivative of the points by tangent and lengths of the state.
+        innovation: (57,) metres, for a state without any correction.
+        covariance: (57, 57) of the innovation.
+        own: (19, 3, 3) its blocks of single points, with what curvature adds.
+        cross: (57, 85) covariance of the innovation with the state.
+        basis: of the slow errors; None where these are negligible.
+    """
+
+    observation: FloatArray
+    innovation: FloatArray
+    covariance: FloatArray
+    own: FloatArray
+    cross: FloatArray
+    basis: _SlowBasis | None
 
 
 class ExtendedKalmanFilter:
@@ -648,31 +672,9 @@ class ExtendedKalmanFilter:
         """The Kalman update with the points that pass the gate; what was learnt of the sensor."""
         dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
         sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor(measurement)
-        lines = self.model.linearise(state.q, state.lengths)
-        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
-        curvature = self.model.curvature(lines, state.covariance[self._tangent, self._tangent])
-        innovation = (measurement.positions - lines.posture.positions - curvature).reshape(-1)
-
-        # (57, 85) covariance of the points, as they are measured, with the state: H P + B C^T
-        cross_covariance = observation @ state.covariance[: self._observed]
-        basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
-        cross = state.cross(measurement.sensor)
-        if basis is None:
-            s = cross_covariance[:, : self._observed] @ observation.T
-            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3)
-        else:
-            # H P H^T + B C^T H^T + H C B^T + B B^T
-            half = 0.5 * cross_covariance
-            if cross is not None:
-                by_slow = basis.of(cross.T)
-                cross_covariance += by_slow
-                half += by_slow
-            half = half[:, : self._observed] @ observation.T
-            s = half + half.T + basis.limbs @ basis.limbs.T
-            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3) + basis.points**2
-        # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
-        own = s.reshape(-1).take(self._own) + 2.0 * curvature[:, :, None] * curvature[:, None, :]
-        y = innovation.reshape(-1, 3)
+        seen = self._expected(state, measurement, sensor)
+        own = seen.own
+        y = seen.innovation.reshape(-1, 3)
         distances = _squared_distance(own, y)
         near = distances < self._gate
         # a limb may set off faster than it is expected to: what it can do in the time that passed is no outlier
@@ -681,11 +683,7 @@ class ExtendedKalmanFilter:
             near = _squared_distance(own + sudden**2 * _EYE3, y) < self._gate
         # what stays where the person is not believed to be, and where no other pose is found, draws it there slowly
         stubborn = measurement.measured & ~near & (state.rejected_for > self.parameters.reacquire_after)
-        drawn = own
-        if stubborn.any():
-            grown = np.where(stubborn, np.minimum(distances / _DRAWING, _MOST_GROWN), 1.0)
-            drawn = grown[:, None, None] * own
-        s.reshape(-1)[self._own] = drawn
+        grown = np.where(stubborn, np.minimum(distances / _DRAWING, _MOST_GROWN), 1.0)
         used = measurement.measured & (near | stubborn)
         rejected = measurement.measured & ~used
         self.counters["measured"] += int(used.sum())
@@ -695,7 +693,6 @@ class ExtendedKalmanFilter:
         rows: slice | IntArray = slice(0, 3 * self._points)
         if not used.all():
             rows = np.flatnonzero(np.repeat(used, 3))
-            s, cross_covariance, innovation = s[np.ix_(rows, rows)], cross_covariance[rows], innovation[rows]
         rejected_for = np.where(used & near, 0.0, state.rejected_for + np.where(measurement.measured, dt, 0.0))
         used_ns = np.where(used, measurement.stamp_ns, state.used_ns)
         if not used.any():
@@ -709,11 +706,28 @@ class ExtendedKalmanFilter:
                 strain=strain,
             )
 
-        whitening = _whitening(s)
-        gain = whitening @ cross_covariance  # (k, 85): L^-1 (P H^T)^T
-        white = whitening @ innovation
-        correction = white @ gain
-        covariance = state.covariance - gain.T @ gain
+        correction = np.zeros(self._size)
+        for _ in range(_LINEARISATIONS):
+            s = seen.covariance
+            s.reshape(-1)[self._own] = grown[:, None, None] * seen.own
+            whitening = _whitening(s[rows][:, rows])
+            gain = whitening @ seen.cross[rows]  # (k, 85): L^-1 (P H^T)^T
+            white = whitening @ seen.innovation[rows]
+            before, correction = correction, white @ gain
+            covariance = state.covariance - gain.T @ gain
+            turned = np.abs(correction[3 : self._nv]).max()
+            if turned < _FAR or np.abs(correction - before)[3 : self._nv].max() < _CLOSE:
+                break
+            # Far from where it was linearised the measurement says something else: linearise it anew about what was
+            # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
+            seen = self._expected(state, measurement, sensor, correction[: self._observed], covariance)
+        observation, basis = seen.observation, seen.basis
+        if turned >= _FAR:
+            # errors are told in the tangent of what was found
+            for ball in self.model.ball_v:
+                turn = so3.right_jacobian(correction[ball])
+                covariance[ball] = turn @ covariance[ball]
+                covariance[:, ball] = covariance[:, ball] @ turn.T
         if state.settled:
             correction[self._lengths] = 0.0
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
@@ -786,6 +800,59 @@ class ExtendedKalmanFilter:
             leaning=leaning,
             strain=strain,
         )
+
+    def _expected(
+        self,
+        state: _State,
+        measurement: _Measurement,
+        sensor: _SensorState,
+        correction: FloatArray | None = None,
+        covariance: FloatArray | None = None,
+    ) -> _Expected:
+        """What a sensor is expected to measure, linearised about the state or about what a correction makes of it.
+
+        Args:
+            state: of the measurement's time.
+            measurement: the frame.
+            sensor: its errors.
+            correction: (53,) of tangent and lengths; None for none.
+            covariance: (85, 85) after it.
+        """
+        q, lengths, t = state.q, state.lengths, self._tangent
+        if correction is not None:
+            q = self.model.integrate(q, correction[t])
+            lengths = lengths if state.settled else lengths + correction[self._lengths]
+        lines = self.model.linearise(q, lengths)
+        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
+        spread = state.covariance if covariance is None else covariance
+        curvature = self.model.curvature(lines, spread[t, t])
+        innovation = (measurement.positions - lines.posture.positions - curvature).reshape(-1)
+        if correction is not None:
+            for ball in self.model.ball_v:  # in the tangent of the state
+                observation[:, ball] = observation[:, ball] @ so3.right_jacobian(correction[ball])
+            known = self._nv if state.settled else self._observed
+            innovation += observation[:, :known] @ correction[:known]
+
+        # (57, 85) covariance of the points, as they are measured, with the state: H P + B C^T
+        cross_covariance = observation @ state.covariance[: self._observed]
+        basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
+        cross = state.cross(measurement.sensor)
+        if basis is None:
+            s = cross_covariance[:, : self._observed] @ observation.T
+            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3)
+        else:
+            # H P H^T + B C^T H^T + H C B^T + B B^T
+            half = 0.5 * cross_covariance
+            if cross is not None:
+                by_slow = basis.of(cross.T)
+                cross_covariance += by_slow
+                half += by_slow
+            half = half[:, : self._observed] @ observation.T
+            s = half + half.T + basis.limbs @ basis.limbs.T
+            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3) + basis.points**2
+        # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
+        own = s.reshape(-1).take(self._own) + 2.0 * curvature[:, :, None] * curvature[:, None, :]
+        return _Expected(observation, innovation, s, own, cross_covariance, basis)
 
     def _last_stamp(self, state: _State, measurement: _Measurement) -> int:
         sensor = state.sensors.get(measurement.sensor)

@@ -105,6 +105,19 @@ def log(q: FloatArray) -> FloatArray:
     return result
 
 
+def right_jacobian(v: FloatArray) -> FloatArray:
+    """(..., 3, 3) derivative of ``log(exp(-v) * exp(v + d))`` by d at 0, for rotation vectors (Sola eq. 143)."""
+    angle_squared = (v * v).sum(axis=-1)[..., None, None]
+    angle = np.sqrt(angle_squared)
+    cross = skew(v)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, 2.0 * np.sin(0.5 * safe) ** 2 / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    result: FloatArray = np.eye(3) - first * cross + second * (cross @ cross)
+    return result
+
+
 def right_jacobian_inverse(v: FloatArray) -> FloatArray:
     """(..., 3, 3) derivative of ``log(exp(v) * exp(d))`` by d at 0, for (..., 3) rotation vectors (Sola eq. 144)."""
     angle_squared = (v * v).sum(axis=-1)[..., None, None]

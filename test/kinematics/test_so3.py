@@ -100,6 +100,13 @@ def test_right_jacobian_inverse_is_the_derivative_of_the_logarithm(direction: Fl
     np.testing.assert_allclose(so3.right_jacobian_inverse(vector), numeric, rtol=0, atol=2e-8)
 
 
+@given(_DIRECTIONS, st.floats(0.0, 3.1))
+def test_right_jacobian_is_the_inverse_of_its_inverse(direction: FloatArray, angle: float) -> None:
+    vector = _rotation_vector(direction, angle)
+    product = so3.right_jacobian(vector) @ so3.right_jacobian_inverse(vector)
+    np.testing.assert_allclose(product, np.eye(3), rtol=0, atol=1e-9)
+
+
 def test_right_jacobian_inverse_has_no_step_at_its_series() -> None:
     """On either side of the angle where the series takes over the values agree."""
     direction = np.array([0.6, -0.48, 0.64])
