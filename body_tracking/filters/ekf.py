@@ -707,7 +707,7 @@ class ExtendedKalmanFilter:
             )
 
         correction = np.zeros(self._size)
-        for _ in range(_LINEARISATIONS):
+        for left in reversed(range(_LINEARISATIONS)):
             s = seen.covariance
             s.reshape(-1)[self._own] = grown[:, None, None] * seen.own
             whitening = _whitening(s[rows][:, rows])
@@ -716,18 +716,17 @@ class ExtendedKalmanFilter:
             before, correction = correction, white @ gain
             covariance = state.covariance - gain.T @ gain
             turned = np.abs(correction[3 : self._nv]).max()
-            if turned < _FAR or np.abs(correction - before)[3 : self._nv].max() < _CLOSE:
+            if not left or turned < _FAR or np.abs(correction - before)[3 : self._nv].max() < _CLOSE:
                 break
             # Far from where it was linearised the measurement says something else: linearise it anew about what was
             # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
             seen = self._expected(state, measurement, sensor, correction[: self._observed], covariance)
         observation, basis = seen.observation, seen.basis
-        if turned >= _FAR:
-            # errors are told in the tangent of what was found
-            for ball in self.model.ball_v:
-                turn = so3.right_jacobian(correction[ball])
-                covariance[ball] = turn @ covariance[ball]
-                covariance[:, ball] = covariance[:, ball] @ turn.T
+        # errors are told in the tangent of what is found
+        turns = [(ball, so3.right_jacobian(correction[ball])) for ball in self.model.ball_v] if turned >= _FAR else []
+        for ball, turn in turns:
+            covariance[ball] = turn @ covariance[ball]
+            covariance[:, ball] = covariance[:, ball] @ turn.T
         if state.settled:
             correction[self._lengths] = 0.0
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
@@ -759,6 +758,8 @@ class ExtendedKalmanFilter:
                 own_cross = crosses[:, place : place + self._slow_size]
                 own_cross[:, rows] -= kalman * basis.points[rows]
                 own_cross[:, 3 * self._points :] -= kalman @ basis.limbs[rows]
+            for ball, turn in turns:
+                crosses[ball] = turn @ crosses[ball]
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
