@@ -238,6 +238,11 @@ class _SlowBasis:
     points: FloatArray
     limbs: FloatArray
 
+    def own_limbs(self) -> FloatArray:
+        """(19, 3, 3) covariance of each point by the slow errors of the limbs."""
+        limbs = self.limbs.reshape(-1, _DIMENSIONS, self.limbs.shape[1])
+        return np.asarray(limbs @ limbs.swapaxes(1, 2))
+
     def of(self, errors: FloatArray) -> FloatArray:
         """(57, n) displacement by errors (61, n)."""
         count = len(self.points)
@@ -688,7 +693,9 @@ class ExtendedKalmanFilter:
         rejected = measurement.measured & ~used
         self.counters["measured"] += int(used.sum())
         self.counters["rejected"] += int(rejected.sum())
-        lean, leaning, strain = self._leaning(state, y, own, measurement.measured, distances, sensor.white, dt)
+        # a wrong pose must not pass for limbs that stretch
+        unstretched = own if seen.basis is None else own - seen.basis.own_limbs()
+        lean, leaning, strain = self._leaning(state, y, unstretched, measurement.measured, distances, sensor.white, dt)
 
         rows: slice | IntArray = slice(0, 3 * self._points)
         if not used.all():
