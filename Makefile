@@ -67,6 +67,7 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	with() { folder=$$1; shift; if [ -d "$$data/$$folder" ]; then run "$$@"; \
 	  else echo; echo "== $$1 is left out: no $$data/$$folder (BODY_TRACKING_DATA names the folder of real recordings)"; fi; }; \
 	run benchmarks/latency.py; \
+	run benchmarks/four_sensors.py; \
 	run benchmarks/thesis.py; \
 	run benchmarks/honesty.py --runs 40; \
 	run benchmarks/robustness.py --runs 100; \
