@@ -27,8 +27,6 @@ _BLOCK_NS = NANOSECONDS
 _FEWEST_FRAMES = 4
 """Frames from which on a block counts: two for each of its halves."""
 _MOST_BLOCKS = 240
-_MOST_RAISED = 0.5
-"""Share of a squared distance that slow errors may be taken to account for."""
 _FAR = 4.0
 """Standard deviations from the median of a block from which a frame does not count in it."""
 _HUBER = 1.345
@@ -243,7 +241,7 @@ class SegmentLengths:
                 shown = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
                 mean = np.mean(variances, axis=0)
                 slow_variance = slow * (_SHARES @ mean) + _LIMB * (stretch * _DEFAULT) ** 2
-                block = _block(stamps[0], shown, white, white + slow * mean, slow_variance, mean)
+                block = _block(stamps[0], shown, white, slow_variance, mean)
                 blocks = (*blocks[1 - _MOST_BLOCKS :], block)
             frames = ()
         frames = (*frames, (stamp_ns, points, tracked, model))
@@ -288,24 +286,20 @@ class SegmentLengths:
         return LengthEstimate(mean + gain @ (middle - mean)[rows], 0.5 * (covariance + covariance.T))
 
 
-def _block(
-    stamp_ns: int, frames: FloatArray, white: FloatArray, error: FloatArray, slow: FloatArray, model: FloatArray
-) -> _Block:
-    """What some frames (n, 19, 3) say, of points with white noise and all errors of these variances (19,) per axis."""
+def _block(stamp_ns: int, frames: FloatArray, white: FloatArray, slow: FloatArray, model: FloatArray) -> _Block:
+    """What some frames (n, 19, 3) say."""
     a, b, c, d = _FACTORS
     products = ((frames[:, b] - frames[:, a]) * (frames[:, d] - frames[:, c])).sum(axis=-1)
     with np.errstate(invalid="ignore"):
         middle = _nanmedian(products)
         scale = _NORMAL * _nanmedian(np.abs(products - middle))
         products = np.where(np.abs(products - middle) <= _FAR * scale, products, np.nan)
-    # A point that is wrong by any error is farther from the next one; what cannot be that much is left as it is.
-    mean = _nanmean(products)
-    raised = np.where(np.abs(_RAISED @ error) < _MOST_RAISED * np.abs(mean), _RAISED @ error, _RAISED @ white)
+    raised = _RAISED @ white
     whole, even, odd = (_lengths_of(_nanmean(part) - raised) for part in (products, products[::2], products[1::2]))
     seen = np.isfinite(even) & np.isfinite(odd)
     return _Block(
         stamp_ns,
-        mean - raised,
+        _nanmean(products) - raised,
         np.where(seen, whole, np.nan),
         np.where(seen, 0.25 * (even - odd) ** 2, np.nan),
         slow,
