@@ -62,6 +62,7 @@ from body_tracking.simulation.bags import (
 )
 from body_tracking.simulation.figure import Pose
 from body_tracking.simulation.motions import MOTIONS, Motion
+from body_tracking.simulation.random_people import minimum_jerk
 from body_tracking.simulation.sensors import Errors, SimulatedSensor
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
@@ -120,8 +121,7 @@ def all_motions(duration: float) -> Motion:
         start, number, result = 0.0, 0, MOTIONS[0].pose(times)
         while start < duration:
             start, number = start + MOTIONS[number % len(MOTIONS)].duration, number + 1
-            share = np.clip((times - start + _BLEND) / (2.0 * _BLEND), 0.0, 1.0)
-            share = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
+            share = minimum_jerk((times - start + _BLEND) / (2.0 * _BLEND))[:, None]
             coming = MOTIONS[number % len(MOTIONS)].pose(times - start)
             result = Pose(
                 *(
