@@ -61,8 +61,7 @@ from body_tracking.simulation.bags import (
     write_bag,
 )
 from body_tracking.simulation.figure import Pose
-from body_tracking.simulation.motions import MOTIONS, Motion
-from body_tracking.simulation.random_people import minimum_jerk
+from body_tracking.simulation.motions import MOTIONS, Motion, minimum_jerk
 from body_tracking.simulation.sensors import Errors, SimulatedSensor
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 

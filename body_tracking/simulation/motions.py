@@ -19,11 +19,16 @@ _MOVE_S = 1.0
 _END_S = 1.5
 
 
-def _step(time: FloatArray, start: float, duration: float) -> FloatArray:
-    """0 before, 1 after, minimum-jerk between (Flash and Hogan 1985)."""
-    x = np.clip((time - start) / duration, 0.0, 1.0)
+def minimum_jerk(share: FloatArray) -> FloatArray:
+    """0 before 0, 1 after 1, minimum-jerk between (Flash and Hogan 1985)."""
+    x = np.clip(share, 0.0, 1.0)
     result: FloatArray = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
     return result
+
+
+def _step(time: FloatArray, start: float, duration: float) -> FloatArray:
+    """0 before, 1 after, minimum-jerk between."""
+    return minimum_jerk((time - start) / duration)
 
 
 def _swing(time: FloatArray, start: float, period: float, repetitions: int) -> FloatArray:

@@ -19,6 +19,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.simulation.motions import minimum_jerk
 from body_tracking.skeleton import (
     N_JOINTS,
     NANOSECONDS,
@@ -137,13 +138,6 @@ class RandomPerson:
             side = 1.0 if name.endswith("_left") else -1.0 if name.endswith("_right") else 0.0
             lengths[number] *= factors[kind] * (1.0 + side * apart[kind])
         return cls(stature, lengths)
-
-
-def minimum_jerk(share: FloatArray) -> FloatArray:
-    """0 before 0, 1 after 1, minimum-jerk between (Flash and Hogan 1985)."""
-    x = np.clip(share, 0.0, 1.0)
-    result: FloatArray = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    return result
 
 
 class _Course:
