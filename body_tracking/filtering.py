@@ -29,6 +29,7 @@ from body_tracking.filters import (
 from body_tracking.filters.prediction import Prediction
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
+from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
@@ -52,6 +53,19 @@ PREDICT_AFTER = Parameter(
     unit="s",
     min=0.01,
     max=3600.0,
+    live=True,
+)
+DEFAULT_ORDER_WAIT = 0.03
+"""Seconds."""
+
+ORDER_WAIT = Parameter(
+    "order_wait",
+    DEFAULT_ORDER_WAIT,
+    "sensors' frames: one waits at most this long for another sensor's older one that is due; 0 for the least delay, "
+    "with frames that come late then taken into account by going back",
+    unit="s",
+    min=0.0,
+    max=1.0,
     live=True,
 )
 ANGLES = (
@@ -88,6 +102,7 @@ class FilterSettings:
         world: likewise: the frame of the output.
         body: the person's id in topics.
         predict_after: seconds without a frame after which predicted ones are published.
+        order_wait: seconds that a sensor's frame waits at most for an older one.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -98,6 +113,7 @@ class FilterSettings:
     world: str = WORLD
     body: str = graph.DEFAULT_BODY
     predict_after: float = DEFAULT_PREDICT_AFTER
+    order_wait: float = DEFAULT_ORDER_WAIT
 
 
 def filter_table() -> tuple[Parameter, ...]:
@@ -146,6 +162,7 @@ class FilterStage:
         self.alignment: SensorAlignment | None = None
         if self.by_sensor:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
+        self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
         self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
@@ -166,6 +183,7 @@ class FilterStage:
         if self.alignment is not None:
             counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
             counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
+            counters |= {f"waited {name}": count for name, count in self._ordering.counters.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
         return counters
@@ -188,7 +206,10 @@ class FilterStage:
             now_ns: when it arrived, in a clock that goes on.
         """
         self.poll(now_ns)
-        self._filtered(self._filter.update(skeleton), now_ns)
+        if self._model_filter is not None:
+            self._take([("", skeleton)], now_ns)
+        elif (filtered := self._filter.update(skeleton)) is not None:
+            self._publish(graph.FILTERED, encode_skeletons([filtered]), filtered.stamp_ns)
 
     def on_sensor(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """One frame of one sensor.
@@ -200,17 +221,20 @@ class FilterStage:
         """
         self._received[sensor] += 1
         subject = self._subjects[sensor].pick(skeletons)
-        if subject is None or self.alignment is None or self._model_filter is None:
+        if subject is None or self.alignment is None:
             return
         aligned = self.alignment.push(sensor, subject)
         if aligned is not None:
             self.poll(now_ns)
-            self._filtered(self._model_filter.update(aligned, sensor), now_ns)
+            self._take(self._ordering.push(sensor, aligned, now_ns), now_ns)
 
     def poll(self, now_ns: int) -> None:
-        """Publish the predicted frames that are due, because nothing came for a while."""
+        """Take the frames that have waited long enough, and publish the predicted ones that are due."""
         if self._model_filter is None:
             return
+        # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
+        while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
+            self._take(self._ordering.poll(deadline_ns), deadline_ns)
         while (stamp_ns := self._prediction.due(now_ns)) is not None:
             predicted = self._model_filter.predict(stamp_ns)
             if predicted is None:
@@ -219,9 +243,15 @@ class FilterStage:
             self._predicted += 1
             self._send(*predicted)
 
+    @property
+    def deadline_ns(self) -> int | None:
+        """When :meth:`poll` should be called for a frame that waits, in the clock of ``now_ns``; None without one."""
+        return self._ordering.deadline_ns
+
     def reset(self) -> None:
         """Forget the person, because time jumped back; poses and clocks stay."""
         self._filter.reset()
+        self._ordering.flush()
         self._prediction.stop()
         self._lengths.reset()
 
@@ -229,26 +259,32 @@ class FilterStage:
         """Forget who was picked of a sensor; the alignment finds out by itself."""
         self._subjects[sensor].reset()
 
-    def _filtered(self, skeleton: Skeleton | None, now_ns: int) -> None:
-        if skeleton is None:
+    def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
+        """Filter frames that go on together, and publish what is known after the last one.
+
+        What was known in between is of no use to anybody any more.
+        """
+        assert self._model_filter is not None
+        stamps = [skeleton.stamp_ns for sensor, skeleton in frames if self._model_filter.take(skeleton, sensor)]
+        estimate = self._model_filter.estimate
+        if not stamps or estimate is None:
             return
-        estimate = None if self._model_filter is None else self._model_filter.estimate
-        if estimate is not None:
-            self._prediction.arrived(skeleton.stamp_ns, now_ns)
-        self._send(skeleton, estimate)
-        if estimate is not None and self._lengths.news(estimate.stamp_ns, estimate.lengths):
+        self._prediction.arrived(stamps[-1], now_ns)
+        self._send(None, estimate)
+        if self._lengths.news(estimate.stamp_ns, estimate.lengths):
             from body_tracking.kinematics.urdf import urdf
 
-            assert self._model_filter is not None
             text = urdf(self._model_filter.model, estimate.lengths, self._body)
             self._publish(self._urdf_topic, encode_string(text), estimate.stamp_ns)
 
-    def _send(self, skeleton: Skeleton, estimate: ModelEstimate | None) -> None:
-        stamp_ns = skeleton.stamp_ns
-        self._publish(graph.FILTERED, encode_skeletons([skeleton]), stamp_ns)
-        if estimate is None or self._model_filter is None:
-            return
-        model = self._model_filter.model
+    def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
+        """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""
+        assert self._model_filter is not None
+        model, stamp_ns = self._model_filter.model, estimate.stamp_ns
+        if self._wanted(graph.FILTERED):
+            skeleton = skeleton or self._model_filter.filtered
+            assert skeleton is not None
+            self._publish(graph.FILTERED, encode_skeletons([skeleton]), stamp_ns)
         if self._wanted(graph.MODEL_STATE) or self._wanted(graph.MODEL_STATE_STDDEV):
             state, stddev = encode_model_state(estimate, model)
             self._publish(graph.MODEL_STATE, state, stamp_ns)

@@ -51,6 +51,13 @@ class ModelFilter(SkeletonFilter, Protocol):
     def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
         """Take one frame of one sensor, as above."""
 
+    def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
+        """The same without making the filtered skeleton; whether there is something to say of its time."""
+
+    @property
+    def filtered(self) -> Skeleton | None:
+        """The filtered skeleton after the last frame in its order; None before a first."""
+
     @property
     def estimate(self) -> ModelEstimate | None:
         """The state of the model after the last frame; None before a first."""

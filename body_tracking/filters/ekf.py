@@ -446,7 +446,7 @@ class ExtendedKalmanFilter:
         """Forget the person; the counters stay."""
         self._state: _State | None = None
         self._frame_id = ""
-        self._body = 0
+        self._newest: Skeleton | None = None
         self._history: list[tuple[_State, _Measurement]] = []
         self._waiting: list[_Measurement] = []
         self.innovation_distance = np.nan
@@ -470,6 +470,14 @@ class ExtendedKalmanFilter:
         self._state = self._new_state(stamp_ns, q, lengths, stddev, None)
 
     def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
+        """Take one frame, and say what it shows: :meth:`take` and then :attr:`filtered`.
+
+        Returns:
+            None where the frame is a repetition, came late, or shows no trunk yet.
+        """
+        return self.filtered if self.take(skeleton, sensor) else None
+
+    def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """Take one frame.
 
         Args:
@@ -477,25 +485,34 @@ class ExtendedKalmanFilter:
             sensor: whose it is, as each has its own noise.
 
         Returns:
-            The modelled joints at its stamp with covariances and velocities; INFERRED where predicted, NOT_TRACKED
-            where not modelled. None where the frame is a repetition, came late, or shows no trunk yet.
+            Whether there is an estimate of its time now: not where the frame is a repetition, came late, or shows no
+            trunk yet.
         """
         measurement = self._measurement(skeleton, sensor)
         state = self._state
         if state is not None and not self._in_time(measurement, state):
-            return None
+            return False
         state = self._state  # a jump of time may have reset it
         self.counters["frames"] += 1
+        if state is not None and measurement.stamp_ns < state.stamp_ns:
+            self._state = self._replay(measurement)
+            return False
+        self._newest = skeleton
         if state is None:
-            self._frame_id, self._body = skeleton.frame_id, skeleton.body
+            self._frame_id = skeleton.frame_id
             self._state = self._begun(measurement)
-            return None if self._state is None else self._output(self._state, skeleton)
-        self._body = skeleton.body
-        if state.sensors and state.fresh and state.stamp_ns == measurement.stamp_ns:
-            return self._output(state, skeleton)  # it was started from this frame, after a gap
-        late = measurement.stamp_ns < state.stamp_ns
-        self._state = self._replay(measurement) if late else self._remember(state, measurement)
-        return None if late else self._output(self._state, skeleton)
+            return self._state is not None
+        if not (state.sensors and state.fresh and state.stamp_ns == measurement.stamp_ns):
+            self._state = self._remember(state, measurement)  # else it was started from this frame, after a gap
+        return True
+
+    @property
+    def filtered(self) -> Skeleton | None:
+        """The modelled joints after the last frame in its order, with covariances and velocities; None before a first.
+
+        INFERRED where predicted, NOT_TRACKED where not modelled.
+        """
+        return None if self._state is None or self._newest is None else self._output(self._state, self._newest)
 
     @property
     def estimate(self) -> ModelEstimate | None:
@@ -509,7 +526,7 @@ class ExtendedKalmanFilter:
             return None
         state = self._within(self._predicted(state, stamp_ns))
         empty = Skeleton(
-            stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body
+            stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body()
         )
         return self._output(state, empty), self._estimate(state)
 
@@ -1428,6 +1445,9 @@ class ExtendedKalmanFilter:
 
     # --- output
 
+    def _body(self) -> int:
+        return 0 if self._newest is None else self._newest.body
+
     def _estimate(self, state: _State) -> ModelEstimate:
         covariance = np.empty((2 * self._nv, 2 * self._nv))
         for row, rows in enumerate((self._tangent, self._velocities)):
@@ -1437,7 +1457,7 @@ class ExtendedKalmanFilter:
         return ModelEstimate(
             state.stamp_ns,
             self._frame_id,
-            self._body,
+            self._body(),
             state.q,
             state.velocity,
             covariance,

@@ -19,18 +19,13 @@ import numpy as np
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.rhythm import Rhythm
 from body_tracking.fusion.sides import PAIRS, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
 from body_tracking.measurement import joint_stddev, viewing_angle
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 WORLD = "world"
-
-DUE_MARGIN = 0.002
-"""A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
-
-PATIENCE = 5
-"""A sensor whose due frame came too late for this many outputs in a row is not waited for until one comes in time."""
 
 FASTEST = 8.0
 """No joint moves faster than this along an axis, metres per second."""
@@ -150,19 +145,7 @@ class _Sensor(Placement):
 
     def clear(self) -> None:
         self.frames: deque[_Frame] = deque(maxlen=8)
-        self._steps: deque[float] = deque(maxlen=7)
-        self.in_vain = 0  # outputs in a row for which its frame was due and did not come in time
-
-    def remember(self, frame: _Frame, step: float | None) -> None:
-        """Keep a frame, and how long after the one before it came, if it is of one run with that."""
-        self.frames.append(frame)
-        if step is not None:
-            self._steps.append(step)
-
-    @property
-    def period(self) -> float:
-        """Seconds between frames, by the median: a lost frame does not make a sensor slower."""
-        return sorted(self._steps)[len(self._steps) // 2] if self._steps else 1.0 / 30.0
+        self.rhythm = Rhythm()
 
 
 class Fusion:
@@ -296,10 +279,11 @@ class Fusion:
             since = stamp
         angle = viewing_angle(positions)
         variance = joint_stddev(positions, states, angle) ** 2
-        source.remember(
-            _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since),
-            step if step < self.parameters.silence else None,
+        source.frames.append(
+            _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
+        if step < self.parameters.silence:
+            source.rhythm.note(step)
 
     def poll(self, now_ns: int) -> list[Skeleton]:
         """The fused skeletons that need wait no longer.
@@ -315,10 +299,10 @@ class Fusion:
                 del self._pending[0]
                 continue
             due = self._due(stamp)
-            if now_ns < deadline and any(source.in_vain < PATIENCE for source in due):
+            if now_ns < deadline and any(rhythm.worth_waiting for rhythm in due):
                 break
             for source in self._sensors.values():
-                source.in_vain = source.in_vain + 1 if source in due else 0
+                source.rhythm.answered(came=source.rhythm not in due)
             del self._pending[0]
             skeleton = self._fuse(stamp)
             if skeleton is not None:
@@ -331,15 +315,15 @@ class Fusion:
             return self._last_ns
         return min((source.frames[0].since_ns for source in self._sensors.values() if source.frames), default=stamp)
 
-    def _due(self, stamp: int) -> list[_Sensor]:
-        """The calibrated sensors whose frame captured up to a time should be here and is not."""
+    def _due(self, stamp: int) -> list[Rhythm]:
+        """Those of the calibrated sensors whose frame captured up to a time should be here and is not."""
         due = []
         for source in self._sensors.values():
             if not source.frames or source.pose(stamp) is None:
                 continue
             age = (stamp - source.to_reference(source.frames[-1].stamp_ns)) / NANOSECONDS
-            if 0.0 < age < self.parameters.silence and age > source.period - DUE_MARGIN:
-                due.append(source)
+            if source.rhythm.due(age, self.parameters.silence):
+                due.append(source.rhythm)
         return due
 
     @property

@@ -19,6 +19,7 @@ from body_tracking import graph
 from body_tracking.filtering import (
     FILTER,
     INPUT,
+    ORDER_WAIT,
     PREDICT_AFTER,
     FilterSettings,
     FilterStage,
@@ -51,6 +52,7 @@ PARAMETERS = (
     REFERENCE,
     WORLD_FRAME,
     BODY,
+    ORDER_WAIT,
     PREDICT_AFTER,
     *filter_table(),
     RELIABLE,
@@ -86,6 +88,7 @@ class SkeletonFilterNode(GraphNode):
             given["world_frame"],
             graph.check_body(given["body"]),
             given["predict_after"],
+            given["order_wait"],
         )
         before, stage = self.stage, FilterStage(settings, self.publish, self.wanted)
         if before is not None and before.by_sensor and stage.by_sensor:
@@ -101,6 +104,9 @@ class SkeletonFilterNode(GraphNode):
         self.advertise(self.values)
         self.connect(self.values)
         self.create_timer(PERIOD_NS / NANOSECONDS, self.on_timer, clock=STEADY)
+        self.deadline_ns: int | None = None
+        self.deadline = self.create_timer(1.0, self.on_deadline, clock=STEADY)
+        self.deadline.cancel()
 
     def advertise(self, values: Mapping[str, Value]) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
@@ -159,12 +165,33 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_sensor(sensor, skeletons, self.now_ns())
+        self.await_deadline()
 
     def on_timer(self) -> None:
         """Publish what is to be expected where nothing comes."""
         assert self.stage is not None
         self.sent_ns = None
         self.stage.poll(self.now_ns())
+
+    def on_deadline(self) -> None:
+        """A frame has waited long enough."""
+        self.deadline.cancel()
+        self.deadline_ns = None
+        self.on_timer()
+        self.await_deadline()
+
+    def await_deadline(self) -> None:
+        """Set the timer for the frame that cannot wait longer."""
+        assert self.stage is not None
+        deadline_ns = self.stage.deadline_ns
+        if deadline_ns == self.deadline_ns:
+            return
+        self.deadline_ns = deadline_ns
+        if deadline_ns is None:
+            self.deadline.cancel()
+        else:  # not at once where simulated time stands still
+            self.deadline.timer_period_ns = max(NANOSECONDS // 1000, deadline_ns - self.now_ns())
+            self.deadline.reset()
 
     def wanted(self, topic: str) -> bool:
         """Whether anybody listens."""

@@ -26,7 +26,7 @@ from body_tracking.cdr import (
     encode_angles,
     encode_skeletons,
 )
-from body_tracking.filtering import DEFAULT_PREDICT_AFTER, FilterSettings, FilterStage
+from body_tracking.filtering import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, FilterStage
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.kinematics.angles import JointAngles
@@ -66,6 +66,7 @@ class ReplaySettings:
         filter_name: one of the filters.
         filter_input: what it filters; ``graph.AUTO`` for what is its own.
         predict_after: seconds without a frame after which predicted ones are made.
+        order_wait: seconds that a sensor's frame waits at most for another's older one, where the filter takes these.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
         angles_input: what they are made of; ``graph.AUTO`` for what is the filter's own.
         body: the id in topics and names of angles.
@@ -80,6 +81,7 @@ class ReplaySettings:
     filter_name: str = DEFAULT_FILTER
     filter_input: str = graph.AUTO
     predict_after: float = DEFAULT_PREDICT_AFTER
+    order_wait: float = DEFAULT_ORDER_WAIT
     convention: str = graph.AUTO
     angles_input: str = graph.AUTO
     body: str = graph.DEFAULT_BODY
@@ -113,6 +115,7 @@ class ReplaySettings:
             self.reference,
             body=self.body,
             predict_after=self.predict_after,
+            order_wait=self.order_wait,
         )
 
 
@@ -280,6 +283,8 @@ class Downstream:
 
     def finish(self) -> Written:
         """Close the bag; one without angles is removed again."""
+        while (deadline_ns := self._filter.deadline_ns) is not None:
+            self._filter.poll(deadline_ns)
         if self._frames:
             self._writer.close()
         else:

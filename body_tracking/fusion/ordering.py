@@ -1,0 +1,124 @@
+"""Frames of several sensors in the order of their capture, though some sensors deliver later than others.
+
+A filter that takes each frame at its own time has to go back for one that comes after a newer one. That costs it all
+the newer ones once more, and what it said of these was said without the late one. So a frame waits while another
+sensor's older one is due, and goes on as soon as that is there; never longer than a few hundredths of a second, and not
+at all for a sensor that keeps others waiting in vain. Where sensors deliver alike, next to nothing waits.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from body_tracking.fusion.placement import CLOCK_JUMP
+from body_tracking.fusion.rhythm import Rhythm
+from body_tracking.skeleton import NANOSECONDS, Skeleton
+
+SILENCE = 0.2
+"""A sensor of which nothing came for longer than this is not waited for, seconds."""
+
+
+@dataclass(order=True, slots=True)
+class _Waiting:
+    """A frame that may have to wait, ordered by its capture."""
+
+    stamp_ns: int
+    number: int  # of its arrival
+    deadline_ns: int = field(compare=False)
+    sensor: str = field(compare=False)
+    skeleton: Skeleton = field(compare=False)
+
+
+class _Source:
+    """What is known of one sensor's frames."""
+
+    def __init__(self) -> None:
+        self.rhythm = Rhythm()
+        self.newest_ns: int | None = None
+
+
+class Ordering:
+    """Puts frames in the order of their stamps, as far as waiting a little allows.
+
+    Args:
+        sensors: their names.
+        wait: seconds that a frame waits at most; 0 passes every frame on as it comes.
+
+    Attributes:
+        counters: what happened since the construction, for diagnostics.
+    """
+
+    def __init__(self, sensors: Sequence[str], wait: float) -> None:
+        self.counters: Counter[str] = Counter()
+        self._wait_ns = round(wait * NANOSECONDS)
+        self._sources = {sensor: _Source() for sensor in sensors}
+        self._waiting: list[_Waiting] = []
+        self._arrived = 0
+
+    def push(self, sensor: str, skeleton: Skeleton, now_ns: int) -> list[tuple[str, Skeleton]]:
+        """Take one frame.
+
+        Args:
+            sensor: one of those given.
+            skeleton: in the clock that all of them share.
+            now_ns: when it arrived, in a clock that goes on.
+
+        Returns:
+            The frames that need wait no longer, in the order of their capture.
+        """
+        # What has waited long enough does not know this frame, whether or not somebody polled in between.
+        ready = self.poll(now_ns)
+        source = self._sources[sensor]
+        stamp_ns = skeleton.stamp_ns
+        if source.newest_ns is not None and stamp_ns < source.newest_ns - CLOCK_JUMP * NANOSECONDS:
+            ready += self.flush()
+        if source.newest_ns is None or stamp_ns > source.newest_ns:
+            if source.newest_ns is not None and (step := (stamp_ns - source.newest_ns) / NANOSECONDS) < SILENCE:
+                source.rhythm.note(step)
+            source.newest_ns = stamp_ns
+        self._arrived += 1
+        insort(self._waiting, _Waiting(stamp_ns, self._arrived, now_ns + self._wait_ns, sensor, skeleton))
+        return ready + self.poll(now_ns)
+
+    def poll(self, now_ns: int) -> list[tuple[str, Skeleton]]:
+        """The frames that need wait no longer, in the order of their capture.
+
+        Args:
+            now_ns: as in :meth:`push`.
+        """
+        ready = []
+        while self._waiting:
+            first = self._waiting[0]
+            due = self._due(first.stamp_ns)
+            if now_ns < first.deadline_ns and any(rhythm.worth_waiting for rhythm in due):
+                break
+            for source in self._sources.values():
+                source.rhythm.answered(came=source.rhythm not in due)
+            self.counters["in vain"] += bool(due)
+            del self._waiting[0]
+            ready.append((first.sensor, first.skeleton))
+        return ready
+
+    def flush(self) -> list[tuple[str, Skeleton]]:
+        """All frames that wait, in the order of their capture; what comes next is of another time."""
+        ready = [(each.sensor, each.skeleton) for each in self._waiting]
+        self._waiting.clear()
+        for sensor in self._sources:
+            self._sources[sensor] = _Source()
+        return ready
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When :meth:`poll` should be called, in the clock of ``now_ns``; None while nothing waits."""
+        return self._waiting[0].deadline_ns if self._waiting else None
+
+    def _due(self, stamp_ns: int) -> list[Rhythm]:
+        """Those of the sensors whose frame captured up to a time should be here and is not."""
+        return [
+            source.rhythm
+            for source in self._sources.values()
+            if source.newest_ns is not None and source.rhythm.due((stamp_ns - source.newest_ns) / NANOSECONDS, SILENCE)
+        ]

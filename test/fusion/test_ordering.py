@@ -1,0 +1,117 @@
+"""Frames of several sensors, brought into the order of their capture."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from body_tracking.fusion.ordering import Ordering
+from body_tracking.fusion.rhythm import PATIENCE
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Skeleton
+
+MS = 1_000_000
+PERIOD = 33 * MS
+
+
+def frame(stamp_ns: int) -> Skeleton:
+    return Skeleton(stamp_ns, "world", np.zeros((N_JOINTS, 3)), np.full(N_JOINTS, 2, dtype=np.uint8))
+
+
+def stamps(ready: list[tuple[str, Skeleton]]) -> list[int]:
+    return [skeleton.stamp_ns for _, skeleton in ready]
+
+
+def known(ordering: Ordering, offsets: dict[str, int], rounds: int = 4) -> int:
+    """Let every sensor deliver some frames without delay; the time after them."""
+    arrivals = sorted((k * PERIOD + offset, sensor) for k in range(rounds) for sensor, offset in offsets.items())
+    for at, sensor in arrivals:
+        ordering.push(sensor, frame(at), at)
+    return rounds * PERIOD
+
+
+@given(
+    delays=st.lists(st.integers(0, 25), min_size=2, max_size=4),
+    phases=st.lists(st.integers(0, 32), min_size=4, max_size=4, unique=True),
+    jitter=st.integers(0, 4),
+    seed=st.integers(0, 1000),
+)
+def test_frames_of_sensors_that_deliver_steadily_leave_in_order_and_each_once(
+    delays: list[int], phases: list[int], jitter: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    sensors = [f"kinect{k}" for k in range(len(delays))]
+    ordering = Ordering(sensors, 0.04)
+    events = sorted(
+        ((k * 33 + phase + delay + int(rng.integers(0, jitter + 1))) * MS, (k * 33 + phase) * MS, sensor)
+        for sensor, delay, phase in zip(sensors, delays, phases, strict=False)
+        for k in range(30)
+    )
+    left = []
+    for now_ns, stamp_ns, sensor in events:
+        for _, skeleton in ordering.push(sensor, frame(stamp_ns), now_ns):
+            left.append((skeleton.stamp_ns, now_ns))
+    left += [(skeleton.stamp_ns, 0) for _, skeleton in ordering.flush()]
+    assert sorted(stamp for stamp, _ in left) == sorted(stamp for _, stamp, _ in events)
+    # in the beginning nothing tells that a sensor is there at all
+    settled = [stamp for stamp, _ in left if stamp > (33 + 32) * MS]
+    assert settled == sorted(settled)
+
+
+def test_a_frame_waits_for_an_older_one_and_no_longer() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    now = known(ordering, {"a": 10 * MS, "b": 0})
+    assert stamps(ordering.push("a", frame(now + 10 * MS), now + 10 * MS)) == []
+    assert ordering.deadline_ns == now + 30 * MS
+    assert ordering.poll(now + 29 * MS) == []
+    assert stamps(ordering.push("b", frame(now), now + 12 * MS)) == [now, now + 10 * MS]
+    assert ordering.deadline_ns is None
+
+
+def test_a_frame_that_waited_long_enough_goes_on_alone() -> None:
+    polled, pushed = Ordering(("a", "b"), 0.02), Ordering(("a", "b"), 0.02)
+    for ordering in (polled, pushed):
+        now = known(ordering, {"a": 10 * MS, "b": 0})
+        ordering.push("a", frame(now + 10 * MS), now + 10 * MS)
+    assert stamps(polled.poll(now + 30 * MS)) == [now + 10 * MS]
+    assert stamps(polled.push("b", frame(now), now + 31 * MS)) == [now]
+    # whether somebody polled in between makes no difference to what goes first
+    assert stamps(pushed.push("b", frame(now), now + 31 * MS)) == [now + 10 * MS, now]
+    assert polled.counters == pushed.counters == {"in vain": 1}
+
+
+def test_without_waiting_every_frame_goes_on_as_it_comes() -> None:
+    ordering = Ordering(("a", "b"), 0.0)
+    now = known(ordering, {"a": 10 * MS, "b": 0})
+    assert stamps(ordering.push("a", frame(now + 10 * MS), now + 10 * MS)) == [now + 10 * MS]
+    assert stamps(ordering.push("b", frame(now), now + 12 * MS)) == [now]
+
+
+def test_sensors_that_deliver_alike_do_not_wait_for_each_other() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    for k in range(50):
+        for sensor, phase in (("a", 0), ("b", 16 * MS)):
+            stamp = k * PERIOD + phase
+            assert stamps(ordering.push(sensor, frame(stamp), stamp + 30 * MS)) == [stamp]
+
+
+def test_a_sensor_that_vanished_is_soon_not_waited_for() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    now = known(ordering, {"a": 10 * MS, "b": 0})
+    waited = 0
+    for k in range(12):
+        at = now + 10 * MS + k * PERIOD
+        waited += ordering.push("a", frame(at), at) == []
+        ordering.poll(at + 20 * MS)
+    # both by patience and because what was silent for long is not expected any more
+    assert 1 <= waited <= PATIENCE
+
+
+def test_a_jump_back_in_time_lets_go_of_what_waits() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    now = known(ordering, {"a": 10 * MS, "b": 0}) + 5 * NANOSECONDS
+    for sensor in ("b", "a"):
+        ordering.push(sensor, frame(now - PERIOD), now - PERIOD)
+    assert stamps(ordering.push("a", frame(now), now)) == []
+    assert stamps(ordering.push("a", frame(0), now + 10 * MS)) == [now, 0]
+    assert ordering.deadline_ns is None

@@ -1,0 +1,92 @@
+"""What the node ``skeleton_filter`` does, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from body_tracking import graph
+from body_tracking.calibration.result import level_pose
+from body_tracking.cdr import decode_skeletons
+from body_tracking.filtering import FilterSettings, FilterStage
+from body_tracking.simulation.random_people import (
+    MeasurementErrors,
+    RandomMotion,
+    RandomPerson,
+    capture_times,
+    observe,
+    truth_of,
+)
+from body_tracking.skeleton import NANOSECONDS, Skeleton
+
+SENSORS = ("kinect1", "kinect2")
+DELAYS = 0.02, 0.045
+"""Seconds from capture to delivery."""
+SECONDS = 3.0
+
+Event = tuple[int, str, Skeleton]
+
+
+@pytest.fixture(scope="module")
+def events() -> list[Event]:
+    """Two sensors at one place see a person, and one of them delivers later than the other: arrivals in their order."""
+    rng = np.random.default_rng(3)
+    person, motion = RandomPerson.draw(rng), RandomMotion(rng, SECONDS + 1.0)
+    found: list[Event] = []
+    for number, (sensor, delay) in enumerate(zip(SENSORS, DELAYS, strict=True)):
+        truth = truth_of(person, motion, capture_times(SECONDS, rng) + 0.012 * (number + 1))
+        pose = level_pose(sensor)
+        for seen in observe(truth, MeasurementErrors(0.005), np.random.default_rng(number)).skeletons:
+            positions = (seen.positions - pose.translation) @ pose.rotation
+            own = Skeleton(seen.stamp_ns, f"{sensor}_optical_frame", positions, seen.states)
+            found.append((seen.stamp_ns + round(delay * NANOSECONDS), sensor, own))
+    return sorted(found, key=lambda event: event[:2])
+
+
+def staged(
+    events: list[Event], wanted: Callable[[str], bool] | None = None, **settings: float
+) -> tuple[FilterStage, list[tuple[str, int]], list[Skeleton]]:
+    """The stage after all events; topic and stamp of what it published; the skeletons."""
+    published: list[tuple[str, int]] = []
+    skeletons: list[Skeleton] = []
+
+    def publish(topic: str, cdr: bytes, stamp_ns: int) -> None:
+        published.append((topic, stamp_ns))
+        if topic == graph.FILTERED:
+            skeletons.extend(decode_skeletons(cdr) or ())
+
+    chosen = FilterSettings("ekf", sensors=SENSORS, **settings)  # type: ignore[arg-type]
+    stage = FilterStage(chosen, publish, wanted)
+    for sensor in SENSORS:
+        stage.set_pose(level_pose(sensor))
+    for now_ns, sensor, skeleton in events:
+        stage.on_sensor(sensor, [skeleton], now_ns)
+    while (deadline_ns := stage.deadline_ns) is not None:
+        stage.poll(deadline_ns)
+    return stage, published, skeletons
+
+
+def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events: list[Event]) -> None:
+    waiting, _, ordered = staged(events)
+    hasty, _, early = staged(events, order_wait=0.0)
+    assert waiting.counters["late_frames"] <= 2 and hasty.counters["late_frames"] > 50
+    assert waiting.counters["frames"] == hasty.counters["frames"] > len(events) - 2 * len(SENSORS) * 4
+    stamps = [skeleton.stamp_ns for skeleton in ordered]
+    assert stamps == sorted(set(stamps))
+    assert_allclose(ordered[-1].positions, early[-1].positions, rtol=0.0, atol=1e-6)
+    assert ordered[-1].stamp_ns == early[-1].stamp_ns
+
+
+def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:
+    _, published, _ = staged(events[:60], lambda topic: topic == graph.MODEL_STATE)
+    assert {topic for topic, _ in published} == {
+        graph.MODEL_STATE,
+        graph.MODEL_STATE_STDDEV,
+        graph.urdf_topic(graph.DEFAULT_BODY),
+    }
+    _, everything, _ = staged(events[:60])
+    wanted = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
+    assert wanted == [stamp_ns for topic, stamp_ns in everything if topic == graph.FILTERED]
