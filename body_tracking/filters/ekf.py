@@ -20,6 +20,7 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
@@ -132,6 +133,8 @@ _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _ENOUGH_BLOCKS = 5
 """Seconds of frames from which on the lengths are what these say."""
+_LENGTHS_PERIOD = 0.75
+"""Seconds that they are left alone for: several sensors' blocks of a second are brought in together."""
 _ANOTHER_SIZE = 1.2
 """Times that a person is larger or smaller than the one before, who must be another one."""
 
@@ -319,6 +322,7 @@ class _State(_Changeable):
         tracked: seconds since the start.
         settled: the lengths are only considered.
         seen: what tells the lengths; None from when they stay as they are.
+        measured_at: seconds since the start at which these were last brought in.
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
         attempted_ns: when another pose was looked for last.
@@ -345,6 +349,7 @@ class _State(_Changeable):
     settled: bool
     seen: SegmentLengths | None
     null: FloatArray
+    measured_at: float = 0.0
     fresh: bool = False
     attempted_ns: int = 0
 
@@ -447,7 +452,7 @@ class ExtendedKalmanFilter:
         self._state: _State | None = None
         self._frame_id = ""
         self._newest: Skeleton | None = None
-        self._history: list[tuple[_State, _Measurement]] = []
+        self._history: deque[tuple[_State, _Measurement]] = deque()
         self._waiting: list[_Measurement] = []
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
@@ -562,7 +567,7 @@ class ExtendedKalmanFilter:
             if started is None:
                 return False  # what is known of person and sensors stays for the first frame that shows a trunk
             self._state = started
-        elif self._is_known(measurement, last):
+        elif self._is_known(measurement, state, last):
             self.counters["repeated_stamps"] += 1
             return False
         elif elapsed < -p.late_window:
@@ -573,8 +578,10 @@ class ExtendedKalmanFilter:
             return jump
         return True
 
-    def _is_known(self, measurement: _Measurement, last: _SensorState | None) -> bool:
+    def _is_known(self, measurement: _Measurement, state: _State, last: _SensorState | None) -> bool:
         """Whether this sensor's frame of this stamp was taken before."""
+        if measurement.stamp_ns > state.stamp_ns:
+            return False
         if last is not None and last.stamps and last.stamps[-1] == measurement.stamp_ns:
             return True
         return any(
@@ -586,7 +593,8 @@ class ExtendedKalmanFilter:
     def _remember(self, state: _State, measurement: _Measurement) -> _State:
         """Take a frame in its order, and keep what a later, older one would have to be put before."""
         horizon = measurement.stamp_ns - self.parameters.late_window * NANOSECONDS
-        self._history = [entry for entry in self._history if entry[1].stamp_ns >= horizon]
+        while self._history and self._history[0][1].stamp_ns < horizon:
+            self._history.popleft()
         self._history.append((state, measurement))
         return self._step(state, measurement)
 
@@ -594,12 +602,12 @@ class ExtendedKalmanFilter:
         """Go back to before a late frame, and take it and all later ones again in their order."""
         self.counters["late_frames"] += 1
         first = next((k for k, (_, m) in enumerate(self._history) if m.stamp_ns > late.stamp_ns), len(self._history))
-        again = self._history[first:]
+        again = [self._history.pop() for _ in range(len(self._history) - first)][::-1]
         state = again[0][0] if again else self._state
         assert state is not None
         if state.stamp_ns > late.stamp_ns:  # it is older than all that is remembered
+            self._history.extend(again)
             return self._state if self._state is not None else state
-        self._history = self._history[:first]
         for measurement in (late, *(m for _, m in again)):
             state = self._remember(state, measurement)
         return state
@@ -1038,8 +1046,9 @@ class ExtendedKalmanFilter:
         )
         news = seen.blocks is not state.seen.blocks and len(seen.blocks) >= _ENOUGH_BLOCKS
         state = state.but(seen=seen)
-        if not news:
+        if not news or state.tracked - state.measured_at < _LENGTHS_PERIOD:
             return state
+        state = state.but(measured_at=state.tracked)
         found = seen.estimate()
         known = float(np.sqrt(found.covariance.diagonal()).max()) < self.parameters.settle_stddev
         if known and state.tracked > _SETTLE_AFTER * self.parameters.settle_time:

@@ -463,7 +463,7 @@ class FixedLagSmoother:
         """Take over the states that the filter came to when it went back for a late frame."""
         while self._frames and self._frames[-1].state.stamp_ns > late.stamp_ns:
             self._frames.pop()
-        history = self.filter._history
+        history = list(self.filter._history)
         newest = self.filter._state
         assert newest is not None
         # it is not among them where it came late to the start, and was the first one of it
