@@ -342,14 +342,14 @@ class ForkedDownstream:
     def _send(self) -> None:
         try:
             self._connection.send(self._batch)
-        except BrokenPipeError:
+        except (BrokenPipeError, ConnectionResetError):
             self._receive()  # raises why
         self._batch = []
 
     def _receive(self) -> Written | None:
         try:
             answer = self._connection.recv()
-        except EOFError:
+        except (EOFError, ConnectionResetError):  # the latter where it left something unread
             self._process.join()
             raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
         if isinstance(answer, BaseException):

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,20 @@ def test_the_other_process_does_not_take_down_what_it_inherits(tmp_path: Path, m
     assert gc.isenabled()
     gc.collect()
     assert notes.read_text() == f"{os.getpid()}\n"
+
+
+def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ending(Downstream):
+        def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+            time.sleep(0.2)  # until more has come, which stays unread
+            os._exit(7)
+
+    monkeypatch.setattr(stages, "Downstream", Ending)
+    stage = ForkedDownstream(ReplaySettings(("kinect1",)), tmp_path / "out", {}, overwrite=False)
+    for _ in range(300):
+        stage.take(graph.FUSED, b"", 0)
+    with pytest.raises(BagError, match="ended with code 7"):
+        stage.finish()
 
 
 MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.MODEL_COVARIANCE, graph.segments_topic("body1"))
