@@ -40,6 +40,10 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 2 with one line on stderr for anything wrong outside the program."""
+    if arguments is None:
+        # The program itself, not a call within another one. Matrices as small as these gain nothing by a second thread,
+        # which OpenBLAS lets spin meanwhile; it has to be said before numpy is loaded, with the first subcommand.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     args = parser().parse_args(arguments)
     try:
         code: int = args.run(args)

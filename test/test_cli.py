@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -69,3 +70,27 @@ def test_a_reader_who_leaves_is_no_error() -> None:
         process.stdout.close()
         assert process.wait(30.0) in (0, 141)
         assert process.stderr.read() == b""
+
+
+NUMERIC_THREADS = """
+import os, sys
+from body_tracking import cli
+sys.argv = ["body_tracking", "--version"]
+try:
+    cli.main()
+except SystemExit:
+    print(os.environ["OPENBLAS_NUM_THREADS"], len(os.listdir("/proc/self/task")))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell its threads")
+def test_the_command_computes_in_one_thread_unless_told_otherwise() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", NUMERIC_THREADS], env=env, capture_output=True, text=True, timeout=60, check=True
+        ).stdout.split()[-2:]
+        for env in (environment, environment | {"OPENBLAS_NUM_THREADS": "2"})
+    ]
+    assert said[0] == ["1", "1"]
+    assert said[1][0] == "2"

@@ -6,6 +6,7 @@ messages, their order and the numbers are the same either way.
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import threading
@@ -313,7 +314,13 @@ class ForkedDownstream:
         with warnings.catch_warnings():
             # Python 3.12 warns of forking with threads; those of the numeric libraries are prepared for it.
             warnings.simplefilter("ignore", DeprecationWarning)
-            self._process.start()
+            collects = gc.isenabled()
+            gc.disable()  # until the other process has set aside what it inherits
+            try:
+                self._process.start()
+            finally:
+                if collects:
+                    gc.enable()
         theirs.close()
         self._receive()
 
@@ -340,14 +347,14 @@ class ForkedDownstream:
     def _send(self) -> None:
         try:
             self._connection.send(self._batch)
-        except BrokenPipeError:
+        except (BrokenPipeError, ConnectionResetError):
             self._receive()  # raises why
         self._batch = []
 
     def _receive(self) -> Written | None:
         try:
             answer = self._connection.recv()
-        except EOFError:
+        except (EOFError, ConnectionResetError):  # the latter where it left something unread
             self._process.join()
             raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
         if isinstance(answer, BaseException):
@@ -361,6 +368,10 @@ def _serve(
     connection: Connection, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], overwrite: bool
 ) -> None:
     """The other process."""
+    # Garbage of the first process is not this one's to take down. ROS nodes among it have threads that are not here,
+    # and end in a crash.
+    gc.freeze()
+    gc.enable()
     stage: Downstream | None = None
     try:
         stage = Downstream(settings, out, topics, overwrite=overwrite)
@@ -388,8 +399,6 @@ def start_downstream(
         FilterError: the filter or its parameters make no sense.
         GraphError: the filter cannot do what it was asked for.
     """
-    # A forked process that ran the extended filter was seen to crash in compiled code (signal 11).
-    forkable = settings.filter_name != "ekf" and hasattr(os, "fork") and threading.active_count() == 1
-    if forkable and len(os.sched_getaffinity(0)) > 1:
+    if hasattr(os, "fork") and len(os.sched_getaffinity(0)) > 1 and threading.active_count() == 1:
         return ForkedDownstream(settings, out, topics, overwrite=overwrite)
     return Downstream(settings, out, topics, overwrite=overwrite)

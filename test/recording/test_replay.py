@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +15,13 @@ import pytest
 
 from body_tracking import cli, graph
 from body_tracking.errors import BodyTrackingError
+from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages import JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, to_nanoseconds
 from body_tracking.parameters import ParameterError
 from body_tracking.recording import replay as replay_module
+from body_tracking.recording import stages
 from body_tracking.recording.replay import ReplayError, replay
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.recording.stages import Downstream, ForkedDownstream, ReplaySettings
@@ -65,14 +70,63 @@ def test_the_same_bag_gives_the_same_messages(replayed: Path, tmp_path: Path) ->
     assert contents(tmp_path / "again") == contents(replayed)
 
 
-@pytest.mark.parametrize("stage", [Downstream, ForkedDownstream])
+@pytest.mark.parametrize("filter_name", [DEFAULT_FILTER, "ekf"])
 def test_one_process_and_two_give_the_same_messages(
-    replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: type[Downstream] | type[ForkedDownstream]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
 ) -> None:
-    monkeypatch.setattr(replay_module, "start_downstream", stage)
-    report = replay(BAG, tmp_path / "out", ReplaySettings(()))
-    assert contents(tmp_path / "out") == contents(replayed)
-    assert report.counters["filter frames"] == report.frames
+    settings = ReplaySettings((), filter_name=filter_name)
+    reports = {}
+    for stage in (Downstream, ForkedDownstream):
+        monkeypatch.setattr(replay_module, "start_downstream", stage)
+        reports[stage] = replay(BAG, tmp_path / stage.__name__, settings)
+    assert contents(tmp_path / "Downstream") == contents(tmp_path / "ForkedDownstream")
+    assert reports[Downstream].counters == reports[ForkedDownstream].counters
+
+
+class Owner:
+    """In a cycle, as ROS nodes are; notes the process that takes it down."""
+
+    def __init__(self, notes: Path) -> None:
+        self._notes, self._own = notes, self
+
+    def __del__(self) -> None:
+        with self._notes.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+
+def test_the_other_process_does_not_take_down_what_it_inherits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Collecting(Downstream):
+        def finish(self) -> stages.Written:
+            gc.collect()
+            return super().finish()
+
+    monkeypatch.setattr(stages, "Downstream", Collecting)
+    monkeypatch.setattr(replay_module, "start_downstream", ForkedDownstream)
+    notes = tmp_path / "notes"
+    thresholds = gc.get_threshold()
+    gc.set_threshold(10**9)  # the garbage is still there at the fork
+    try:
+        Owner(notes)
+        replay(BAG, tmp_path / "out", ReplaySettings(()))
+    finally:
+        gc.set_threshold(*thresholds)
+    assert gc.isenabled()
+    gc.collect()
+    assert notes.read_text() == f"{os.getpid()}\n"
+
+
+def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ending(Downstream):
+        def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+            time.sleep(0.2)  # until more has come, which stays unread
+            os._exit(7)
+
+    monkeypatch.setattr(stages, "Downstream", Ending)
+    stage = ForkedDownstream(ReplaySettings(("kinect1",)), tmp_path / "out", {}, overwrite=False)
+    for _ in range(300):
+        stage.take(graph.FUSED, b"", 0)
+    with pytest.raises(BagError, match="ended with code 7"):
+        stage.finish()
 
 
 MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.MODEL_COVARIANCE, graph.segments_topic("body1"))
