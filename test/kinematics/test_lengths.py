@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking.cdr import decode_skeletons
-from body_tracking.filters.lengths import LengthEstimate, SegmentLengths, proportions
 from body_tracking.graph import FUSED
+from body_tracking.kinematics.lengths import LengthEstimate, SegmentLengths, proportions
 from body_tracking.kinematics.upper_body import LENGTHS
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.recording.importer import import_files
