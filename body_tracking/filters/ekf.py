@@ -29,11 +29,11 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 from scipy.stats import chi2
 
-from body_tracking.filters.lengths import SegmentLengths, proportions
 from body_tracking.filters.linear import check_fields
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import InverseKinematics
+from body_tracking.kinematics.lengths import SegmentLengths, proportions
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody

@@ -6,7 +6,7 @@ node receives, in any convention; :class:`LengthChanges` tells when a person's l
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 
 import numpy as np
 
@@ -15,11 +15,12 @@ from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import Fit, InverseKinematics
+from body_tracking.kinematics.lengths import SkeletonLengths
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.motion import joint_densities
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
 POSITIONAL = "positional"
 """The convention of :mod:`body_tracking.kinematics.positional`, which needs no model."""
@@ -32,123 +33,9 @@ _POOR = 4.0
 """Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
 _STEPS, _TOLERANCE = 4, 2e-3
 """Of a fit that starts from the frame before: at most so many steps, until one is smaller than this, rad and m."""
-_EACH, _THEN_EVERY, _FRAMES = 30, 6, 300
-"""Lengths are taken from each of the first frames, then from every so many, and the median is over the last of them."""
 _GREATEST_RATE = 10.0
 """rad/s and m/s: standard deviation of a rate of which nothing is known."""
-_ENOUGH = 10
-"""Frames in which a length must have been seen to be taken from them."""
-
 _TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
-_ARM = {"clavicle": "SHOULDER", "upper_arm": "ELBOW", "forearm": "WRIST", "hand": "HAND", "hand_tip": "HAND_TIP"}
-_SIDES = ("left", "right")
-
-
-def _bones() -> dict[str, tuple[Joint, Joint]]:
-    """The lengths that are distances between two joints."""
-    bones = {
-        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
-        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-        "neck": (Joint.SPINE_SHOULDER, Joint.NECK),
-        "head": (Joint.NECK, Joint.HEAD),
-    }
-    for side in _SIDES:
-        start = Joint.SPINE_SHOULDER
-        for length, name in _ARM.items():
-            end = Joint[f"{name}_{side.upper()}"]
-            bones[f"{length}_{side}"] = start, end
-            start = end
-    return bones
-
-
-_BONES = _bones()
-
-
-class RunningLengths:
-    """The segment lengths of ``upper_body`` as medians over frames.
-
-    Attributes:
-        lengths: (21,) metres; those that were never seen are the other side's, or in proportion to the others.
-        stddev: (21,) metres, of the medians; infinity where never seen.
-    """
-
-    def __init__(self, model: UpperBody) -> None:
-        self._average = model.default_lengths()
-        names = model.length_names
-        self._column = {name: number for number, name in enumerate(names)}
-        self._bone_columns: IntArray = np.array([self._column[name] for name in _BONES], dtype=np.intp)
-        self._starts, self._ends = (np.array([pair[k] for pair in _BONES.values()], dtype=np.intp) for k in (0, 1))
-        other = dict(zip(_SIDES, reversed(_SIDES), strict=True))
-        self._other_side: IntArray = np.array(
-            [
-                self._column[f"{name.rsplit('_', 1)[0]}_{other[side]}"] if side in other else number
-                for number, name in enumerate(names)
-                for side in (name.rsplit("_", 1)[-1],)
-            ],
-            dtype=np.intp,
-        )
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the person."""
-        self._count = 0
-        self._seen: deque[FloatArray] = deque(maxlen=_FRAMES)
-        self.lengths: FloatArray = self._average
-        self.stddev: FloatArray = np.full(len(self._average), np.inf)
-
-    def update(self, positions: FloatArray) -> None:
-        """Take the positions of a frame: (25, 3) metres, NaN where not known."""
-        self._count += 1
-        if self._count > _EACH and self._count % _THEN_EVERY:
-            return
-        self._seen.append(self._measured(positions))
-        ordered = np.sort(np.array(self._seen), axis=0)  # NaN last
-        count = np.isfinite(ordered).sum(axis=0)
-        median = _middle(ordered, count)
-        spread = 1.4826 * _middle(np.sort(np.abs(ordered - median), axis=0), count)
-        enough = count >= min(_ENOUGH, len(self._seen))
-        known = enough & (median > 0.0)
-        both = np.where(known, median, np.where(known[self._other_side], median[self._other_side], np.nan))
-        found = np.isfinite(both)
-        scale = float(np.median(both[found] / self._average[found])) if found.any() else 1.0
-        self.lengths = np.where(found, both, scale * self._average)
-        # pi / 2 is the variance of a median against that of a mean
-        self.stddev = np.where(known, spread * np.sqrt(0.5 * np.pi / np.maximum(count, 1)), np.inf)
-
-    def _measured(self, positions: FloatArray) -> FloatArray:
-        """(21,) metres of one frame."""
-        lengths = np.empty(len(self._average))
-        bones = positions[self._ends] - positions[self._starts]
-        lengths[self._bone_columns] = np.sqrt((bones * bones).sum(axis=1))
-        base = positions[Joint.SPINE_BASE]
-        hips = positions[[Joint.HIP_LEFT, Joint.HIP_RIGHT]] - base
-        across = _unit(hips[0] - hips[1])
-        out = hips @ across
-        lengths[self._column["hip_width_left"]], lengths[self._column["hip_width_right"]] = out[0], -out[1]
-        below = hips.mean(axis=0) - across * out.mean()
-        lengths[self._column["hip_drop"]] = np.sqrt(below @ below)
-        for side in _SIDES:
-            wrist, hand, thumb = (positions[Joint[f"{name}_{side.upper()}"]] for name in ("WRIST", "HAND", "THUMB"))
-            direction = _unit(hand - wrist)
-            along = float((thumb - wrist) @ direction)
-            aside = thumb - wrist - along * direction
-            lengths[self._column[f"thumb_along_{side}"]] = along
-            lengths[self._column[f"thumb_out_{side}"]] = np.sqrt(aside @ aside)
-        return lengths
-
-
-def _middle(ordered: FloatArray, count: IntArray) -> FloatArray:
-    """(n,) medians of the first ``count`` of each sorted column; NaN where there is none."""
-    columns = np.arange(ordered.shape[1])
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(ordered) - 1)
-    result: FloatArray = 0.5 * (ordered[low, columns] + ordered[high, columns])
-    return result
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    size = np.sqrt(vector @ vector)
-    direction: FloatArray = vector / size if size > 0.0 else np.full(3, np.nan)
-    return direction
 
 
 class SkeletonFit:
@@ -165,7 +52,7 @@ class SkeletonFit:
 
     def __init__(self, model: UpperBody | None = None) -> None:
         self.model = model or UpperBody()
-        self.lengths = RunningLengths(self.model)
+        self.lengths = SkeletonLengths()
         self.counters: Counter[str] = Counter()
         self._inverse = InverseKinematics(self.model)
         self._densities = joint_densities()[self.model.joints]
@@ -189,11 +76,9 @@ class SkeletonFit:
         """
         if self._last is not None and not 0 <= skeleton.stamp_ns - self._last.stamp_ns <= _GAP_NS:
             self._last = None
-        points = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-        self.lengths.update(points)
-        joints, lengths = self.model.joints, self.lengths.lengths
-        positions = points[joints]
+        positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)[self.model.joints]
         variance = self._variance(skeleton)
+        self.lengths.update(skeleton.stamp_ns, positions, variance)
         measured = np.isfinite(positions).all(axis=1) & np.isfinite(variance)
         fit = self._fit(skeleton.stamp_ns, positions, np.sqrt(variance), measured)
         if fit is None:
@@ -212,7 +97,7 @@ class SkeletonFit:
             fit.q,
             velocity,
             covariance,
-            lengths,
+            self.lengths.lengths,
             self.lengths.stddev,
         )
         return self._last

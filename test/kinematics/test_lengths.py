@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking.cdr import decode_skeletons
-from body_tracking.filters.lengths import LengthEstimate, SegmentLengths, proportions
 from body_tracking.graph import FUSED
+from body_tracking.kinematics.lengths import LengthEstimate, SegmentLengths, SkeletonLengths, proportions
 from body_tracking.kinematics.upper_body import LENGTHS
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.recording.importer import import_files
@@ -190,6 +190,60 @@ def test_two_sensors_are_gathered_apart() -> None:
             seen = seen.seen(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
     assert len(seen.blocks) >= 8
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
+
+
+def test_a_sensor_of_few_frames_is_learnt_from_too() -> None:
+    times, points, lengths = somebody(10, 12.0, rate=2.0)
+    seen = learnt(times, points)
+    assert len(seen.blocks) >= 4
+    assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
+
+
+def test_only_as_many_blocks_are_kept_as_the_memory_has() -> None:
+    times, points, lengths = somebody(11, 12.0)
+    seen = SegmentLengths(memory=3)
+    taller = np.where((times < 6.0)[:, None, None], points, 1.1 * points)
+    for time, frame in zip(times, taller, strict=True):
+        seen = seen.seen("", round(time * NANOSECONDS), frame, EVERY, np.zeros(len(POINTS)), BASE)
+    assert len(seen.blocks) == 3
+    assert_allclose(seen.estimate().lengths, 1.1 * lengths, rtol=0.0, atol=1e-6)
+
+
+def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> None:
+    times, points, lengths = somebody(12, 0.9)
+    for count in (1, 2, 3, 4, len(times)):
+        seen = learnt(times[:count], points[:count])
+        assert not seen.blocks
+        assert not seen.estimate().seen.any()
+        estimate = seen.begun("", np.zeros(len(POINTS))).estimate()
+        assert estimate.seen.all()
+        assert_allclose(estimate.lengths, lengths, rtol=0.0, atol=1e-6)
+
+
+# --- of filtered skeletons
+
+
+def test_lengths_of_skeletons_are_there_at_once_and_never_jump() -> None:
+    times, points, lengths = somebody(13, 12.0)
+    told = SkeletonLengths()
+    course = []
+    for time, frame in zip(times, np.where((times < 3.5)[:, None, None], 0.9 * points, points), strict=True):
+        told.update(round(time * NANOSECONDS), frame, BASE)
+        course.append(told.lengths)
+    assert_allclose(course[0], 0.9 * lengths, rtol=0.0, atol=1e-6)
+    assert_allclose(course[-1], lengths, rtol=0.02)  # the blocks of the later pose are the more
+    assert (np.abs(np.diff(course, axis=0)) < 0.01 * lengths).all()  # of the tenth that was to be gone
+    told.reset()
+    assert np.isinf(told.stddev).all()
+    assert_allclose(told.lengths, MODEL.default_lengths())
+
+
+def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> None:
+    times, points, lengths = somebody(14, 140.0, rate=10.0)
+    told = SkeletonLengths()
+    for time, frame in zip(times, np.where((times < 80.0)[:, None, None], 0.85 * points, points), strict=True):
+        told.update(round(time * NANOSECONDS), frame, BASE)
+    assert_allclose(told.lengths, lengths, rtol=0.005)
 
 
 def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """How long a person's segments are, from the distances between the points of many frames.
 
-Beside the filter, and independent of the pose that it believes in: a wrong pose spoils no length here. What a skeleton
-sensor shows of one bone differs from pose to pose by a tenth and more, for seconds, and these errors are by far the
-greatest; averaging frames as if each were new would soon be sure of a wrong length. Therefore
+Independent of the pose that a filter or a fit believes in: a wrong pose spoils no length here. :class:`SegmentLengths`
+gathers what sensors show; :class:`SkeletonLengths` is for who has filtered skeletons and asks after every frame.
 
-- frames are gathered into blocks of a second; the mean squared distances in a block, less what white noise adds to
-  them, tell its lengths. Frames far from the block's median do not count;
+What a sensor shows of one bone differs from pose to pose by a tenth and more, for seconds, and these errors are by far
+the greatest; averaging frames as if each were new would soon be sure of a wrong length. Therefore
+
+- frames are gathered into blocks of a second (longer where there are few); the mean squared distances in a block, less
+  what white noise adds to them, tell its lengths. Frames far from the block's median do not count;
 - over the blocks a mean is taken that single strange poses do not move (Huber 1964), each weighed by how much the
   sensors' points are worth by the measurement model: a body seen from the side is not seen well;
 - its variance is that of the blocks: the part that two interleaved halves of a block do not share is white and
@@ -21,12 +23,14 @@ from typing import Final
 import numpy as np
 
 from body_tracking.kinematics.upper_body import LENGTHS, UpperBody
+from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 
 _BLOCK_NS = NANOSECONDS
 _FEWEST_FRAMES = 4
 """Frames from which on a block counts: two for each of its halves."""
-_MOST_BLOCKS = 240
+_LONGEST_NS = 4 * _BLOCK_NS
+"""What a block waits for these."""
 _FAR = 4.0
 """Standard deviations from the median of a block from which a frame does not count in it."""
 _HUBER = 1.345
@@ -135,6 +139,17 @@ _INVOLVED: Final = np.array(
     [[float(point in column) for point in range(len(_POINT))] for column in _FACTORS.T]  # (k, 19)
 )
 _LIMB: Final = np.array([name.startswith(("upper_arm", "forearm")) for name in LENGTHS])
+_MIRRORED: Final = {"left": "right", "right": "left"}
+_OTHER_SIDE: Final = np.array(
+    [LENGTHS.index("_".join(_MIRRORED.get(part, part) for part in name.split("_"))) for name in LENGTHS], dtype=np.intp
+)
+_NO_NOISE: Final = np.zeros(len(_POINT))
+_UNSEEN: Final = (INFERRED_FACTOR * BASE_STDDEV[_MODEL.joints]) ** 2
+"""(19,) square metres: what a point that was not seen in a frame counts for in the worth of its block."""
+_FOLLOW_TIME = 1.0
+"""Seconds in which lengths that are told after every frame follow what the blocks say."""
+_SKELETONS_MEMORY = 60
+"""Blocks: who takes the place of another person, unnoticed, has their own lengths after half of it."""
 
 
 def _lengths_of(products: FloatArray) -> FloatArray:
@@ -161,6 +176,10 @@ def _lengths_of(products: FloatArray) -> FloatArray:
         drops.append(of[f"hip_width_{side}"] - width**2)
     found["hip_drop"] = root(0.5 * (drops[0] + drops[1]))
     return np.stack([found[name] if name in found else root(of[name]) for name in LENGTHS], axis=-1)
+
+
+_Frame = tuple[int, FloatArray, BoolArray, FloatArray]
+"""Stamp, points (19, 3), which of them count (19,), their variance by the measurement model (19,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,10 +210,12 @@ class LengthEstimate:
     Attributes:
         lengths: (21,) metres.
         covariance: (21, 21) square metres.
+        seen: (21,) which of them the points showed; the others are what these and the average person make likely.
     """
 
     lengths: FloatArray
     covariance: FloatArray
+    seen: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,12 +224,14 @@ class SegmentLengths:
 
     Attributes:
         persistence: seconds, the time constant of the autocorrelation of errors in a length.
+        memory: blocks that are kept; older ones are forgotten.
         blocks: the finished blocks.
     """
 
     persistence: float = 3.0
+    memory: int = 240
     blocks: tuple[_Block, ...] = ()
-    _gathered: dict[str, tuple[tuple[int, FloatArray, BoolArray, FloatArray], ...]] = field(default_factory=dict)
+    _gathered: dict[str, tuple[_Frame, ...]] = field(default_factory=dict)
 
     def seen(
         self,
@@ -235,23 +258,36 @@ class SegmentLengths:
         """
         frames = self._gathered.get(sensor, ())
         blocks = self.blocks
-        if frames and not 0 <= stamp_ns - frames[0][0] < _BLOCK_NS:
+        longest = _BLOCK_NS if len(frames) >= _FEWEST_FRAMES else _LONGEST_NS
+        if frames and not 0 <= stamp_ns - frames[0][0] < longest:
             if len(frames) >= _FEWEST_FRAMES:
-                stamps, positions, counted, variances = zip(*frames, strict=True)
-                shown = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
-                mean = np.mean(variances, axis=0)
-                slow_variance = slow * (_SHARES @ mean) + _LIMB * (stretch * _DEFAULT) ** 2
-                block = _block(stamps[0], shown, white, slow_variance, mean)
-                blocks = (*blocks[1 - _MOST_BLOCKS :], block)
+                blocks = (*blocks, _block(frames, white, slow, stretch))[-self.memory :]
             frames = ()
         frames = (*frames, (stamp_ns, points, tracked, model))
-        return SegmentLengths(self.persistence, blocks, {**self._gathered, sensor: frames})
+        return SegmentLengths(self.persistence, self.memory, blocks, {**self._gathered, sensor: frames})
+
+    def begun(self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0) -> SegmentLengths:
+        """With the frames of a sensor's unfinished block as one more block, for who cannot wait for it.
+
+        Args:
+            sensor: whose block it is.
+            white: see :meth:`seen`.
+            slow: see :meth:`seen`.
+            stretch: see :meth:`seen`.
+        """
+        frames = self._gathered.get(sensor, ())
+        if not frames:
+            return self
+        # the first few, again and again: what they differ by among themselves is all that is known of their noise
+        frames *= -(-_FEWEST_FRAMES // len(frames))
+        blocks = (*self.blocks, _block(frames, white, slow, stretch))[-self.memory :]
+        return SegmentLengths(self.persistence, self.memory, blocks, self._gathered)
 
     def estimate(self) -> LengthEstimate:
         """All that is known; an average person where nothing was seen."""
         prior = proportions()
         if not self.blocks:
-            return LengthEstimate(_DEFAULT, prior)
+            return LengthEstimate(_DEFAULT, prior, np.zeros(len(LENGTHS), dtype=np.bool_))
         products = np.stack([block.products for block in self.blocks])
         lengths = np.stack([block.lengths for block in self.blocks])
         seen = np.isfinite(lengths)
@@ -266,7 +302,7 @@ class SegmentLengths:
         middle = _lengths_of(_location(products, worth_of_products, np.zeros(products.shape[1]))[0])
         known = np.isfinite(centre) & np.isfinite(middle)
         if not known.any():
-            return LengthEstimate(_DEFAULT, prior)
+            return LengthEstimate(_DEFAULT, prior, known)
         # variance of a block that is worth as much as one on average
         spread = (worth * off**2).sum(axis=0) / np.maximum(count - 1, 1)
         excess = np.maximum(spread - whiteness, 0.0)
@@ -283,26 +319,80 @@ class SegmentLengths:
         rows = np.flatnonzero(known)
         gain = np.linalg.solve(prior[np.ix_(rows, rows)] + np.diag(variance[rows]), prior[rows]).T
         covariance = prior - gain @ prior[rows]
-        return LengthEstimate(mean + gain @ (middle - mean)[rows], 0.5 * (covariance + covariance.T))
+        return LengthEstimate(mean + gain @ (middle - mean)[rows], 0.5 * (covariance + covariance.T), known)
 
 
-def _block(stamp_ns: int, frames: FloatArray, white: FloatArray, slow: FloatArray, model: FloatArray) -> _Block:
-    """What some frames (n, 19, 3) say."""
+class SkeletonLengths:
+    """The lengths that the filtered skeletons of one person show, from the first frame on and after every one.
+
+    Before a first block is complete, the frames so far are one. Every block can move a length by centimetres, and a
+    pose that is fitted with it by degrees: the lengths go there gradually. The points count as free of white noise,
+    which a filter has taken away, and no slow errors are stated: what was seen outweighs the average person.
+
+    Attributes:
+        lengths: (21,) metres; those that were never seen are the other side's, or in proportion to the others.
+        stddev: (21,) metres; infinity where never seen.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._seen = SegmentLengths(memory=_SKELETONS_MEMORY)
+        self._frames, self._stamp_ns = 0, 0
+        self._target: FloatArray = _DEFAULT
+        self.lengths: FloatArray = _DEFAULT
+        self.stddev: FloatArray = np.full(len(LENGTHS), np.inf)
+
+    def update(self, stamp_ns: int, points: FloatArray, variance: FloatArray) -> None:
+        """Take one frame.
+
+        Args:
+            stamp_ns: when it was captured.
+            points: (19, 3) metres, the points of the model, in any frame; NaN where not known.
+            variance: (19,) square metres per axis, of the points; infinity where not known.
+        """
+        known: BoolArray = np.isfinite(points).all(axis=1) & np.isfinite(variance)
+        model = np.where(known, variance, _UNSEEN)
+        before = self._seen.blocks
+        self._seen = self._seen.seen("", stamp_ns, points, known, _NO_NOISE, model)
+        if self._seen.blocks is not before:
+            self._take(self._seen.estimate())
+        elif not before:
+            self._take(self._seen.begun("", _NO_NOISE).estimate())
+        elapsed = abs(stamp_ns - self._stamp_ns) / NANOSECONDS
+        self._frames, self._stamp_ns = self._frames + 1, stamp_ns
+        share = max(1.0 / self._frames, 1.0 - float(np.exp(-elapsed / _FOLLOW_TIME)))
+        self.lengths = self.lengths + share * (self._target - self.lengths)
+
+    def _take(self, estimate: LengthEstimate) -> None:
+        seen = estimate.seen
+        from_other = ~seen & seen[_OTHER_SIDE]
+        self._target = np.where(from_other, estimate.lengths[_OTHER_SIDE], estimate.lengths)
+        self.stddev = np.where(seen, np.sqrt(estimate.covariance.diagonal()), np.inf)
+
+
+def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: float) -> _Block:
+    """What some frames say; see :meth:`SegmentLengths.seen` for the rest."""
+    stamps, positions, counted, variances = zip(*frames, strict=True)
+    points = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
+    model = np.mean(variances, axis=0)
     a, b, c, d = _FACTORS
-    products = ((frames[:, b] - frames[:, a]) * (frames[:, d] - frames[:, c])).sum(axis=-1)
+    products = ((points[:, b] - points[:, a]) * (points[:, d] - points[:, c])).sum(axis=-1)
     with np.errstate(invalid="ignore"):
         middle = _nanmedian(products)
-        scale = _NORMAL * _nanmedian(np.abs(products - middle))
+        scale = np.maximum(_NORMAL * _nanmedian(np.abs(products - middle)), _SUREST**2)  # rounding is no outlier
         products = np.where(np.abs(products - middle) <= _FAR * scale, products, np.nan)
     raised = _RAISED @ white
     whole, even, odd = (_lengths_of(_nanmean(part) - raised) for part in (products, products[::2], products[1::2]))
     seen = np.isfinite(even) & np.isfinite(odd)
     return _Block(
-        stamp_ns,
+        stamps[0],
         _nanmean(products) - raised,
         np.where(seen, whole, np.nan),
         np.where(seen, 0.25 * (even - odd) ** 2, np.nan),
-        slow,
+        slow * (_SHARES @ model) + _LIMB * (stretch * _DEFAULT) ** 2,
         model,
     )
 
