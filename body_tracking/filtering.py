@@ -55,7 +55,7 @@ PREDICT_AFTER = Parameter(
     max=3600.0,
     live=True,
 )
-DEFAULT_ORDER_WAIT = 0.03
+DEFAULT_ORDER_WAIT = 0.05
 """Seconds."""
 
 ORDER_WAIT = Parameter(

@@ -55,7 +55,6 @@ _TRACKED, _INFERRED = np.uint8(TrackingState.TRACKED), np.uint8(TrackingState.IN
 _EYE3 = np.eye(_DIMENSIONS)
 _UNKNOWN = np.zeros((N_JOINTS, _DIMENSIONS, _DIMENSIONS))
 _UNKNOWN[:] = np.diag([np.inf] * _DIMENSIONS)
-_LOWER = np.asfortranarray(np.tri(_DIMENSIONS * N_JOINTS))
 _START_FRAMES = 4
 """Frames of one sensor that tell its noise."""
 _WAIT_NS = NANOSECONDS // 2
@@ -87,6 +86,8 @@ _LEAST_ERROR = 0.004
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
 _SLOW_PERIOD_NS = NANOSECONDS // 15
+_SLOW_STEP = 0.02
+"""Share by which a scale changes at least: what it did to the state before has to be put right each time."""
 _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
@@ -957,7 +958,7 @@ class ExtendedKalmanFilter:
             (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
         """
         least = self._least_slow(sensor.white, measurement)
-        unchanged = np.maximum(sensor.slow, least), sensor.slow_estimate, sensor.slow_information
+        unchanged = _kept(sensor.slow, np.maximum(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
         if sensor.weight.max() < 2.0 * _POOL:
             return unchanged  # what is white is not known yet, and would be taken for slow
         if sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
@@ -984,7 +985,8 @@ class ExtendedKalmanFilter:
         estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
         # an error is taken for real when it stands out: else every sensor would have a little of it
         real = estimate * np.sqrt(total) > _SIGNIFICANT
-        return np.maximum(np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), least), estimate, total
+        scales = np.maximum(np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), least)
+        return _kept(sensor.slow, scales), estimate, total
 
     def _least_slow(self, white: FloatArray, measurement: _Measurement) -> FloatArray:
         """(2,) the scales that there are at least: what a sensor's points do not tremble by, they are wrong by."""
@@ -1496,15 +1498,20 @@ def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tu
     return tuple(each for each in names if each != name), crosses[:, kept]
 
 
-def _cholesky(matrix: FloatArray, *, clean: bool = True) -> FloatArray:
-    """The lower factor, without zeros above it if not ``clean``; numpy's takes three times as long on one so small.
+def _kept(before: FloatArray, after: FloatArray) -> FloatArray:
+    """(2,) the new scales of slow errors, or the very same as before where they hardly differ."""
+    return before if (np.abs(after - before) <= _SLOW_STEP * before).all() else after
+
+
+def _cholesky(matrix: FloatArray) -> FloatArray:
+    """The lower factor; numpy's takes three times as long on one so small.
 
     Raises:
         LinAlgError: the matrix is not positive definite, or not finite.
     """
     factor: FloatArray
     # the transpose of a symmetric matrix need not be brought into Fortran's order
-    factor, failed = dpotrf(matrix.T, lower=1, clean=clean)
+    factor, failed = dpotrf(matrix.T, lower=1)
     if failed or not math.isfinite(float(factor.trace())):
         raise np.linalg.LinAlgError("not positive definite")
     return factor
@@ -1517,8 +1524,7 @@ def _whitening(covariance: FloatArray) -> FloatArray:
         LinAlgError: as of :func:`_cholesky`.
     """
     inverse: FloatArray
-    inverse, _ = dtrtri(_cholesky(covariance, clean=False), lower=1, overwrite_c=1)
-    inverse *= _LOWER[: len(inverse), : len(inverse)]  # LAPACK leaves something above the diagonal
+    inverse, _ = dtrtri(_cholesky(covariance), lower=1, overwrite_c=1)  # above the diagonal it stays 0
     return inverse
 
 

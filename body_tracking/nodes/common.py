@@ -60,6 +60,7 @@ from body_tracking.skeleton import NANOSECONDS, Skeleton
 RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+_SHORTEST_ALARM_NS = NANOSECONDS // 1000
 
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
@@ -149,6 +150,50 @@ class Monitor:
         if self.last_reason:
             values["last malformed"] = self.last_reason
         return values
+
+
+class Alarm:
+    """Calls once when a time has come.
+
+    To set a timer wakes the node up and costs more than to let it go off in vain: one that goes off earlier than it is
+    needed is left as it is, and set anew then.
+
+    Args:
+        node: whose.
+        ring: what is called.
+        now: nanoseconds, in the clock of the times that are given.
+    """
+
+    def __init__(self, node: Node, ring: Callable[[], None], now: Callable[[], int]) -> None:
+        self._ring, self._now = ring, now
+        self._wanted_ns: int | None = None
+        self._set_ns: int | None = None
+        self._timer = node.create_timer(1.0, self._on_timer, clock=STEADY)
+        self._timer.cancel()
+
+    def at(self, time_ns: int | None) -> None:
+        """Call at this time instead of any that was given before; None for not at all."""
+        self._wanted_ns = time_ns
+        if time_ns is not None and (self._set_ns is None or time_ns < self._set_ns):
+            self._set(time_ns)
+
+    def _set(self, time_ns: int) -> None:
+        self._set_ns = time_ns
+        # not at once where simulated time stands still
+        self._timer.timer_period_ns = max(_SHORTEST_ALARM_NS, time_ns - self._now())
+        self._timer.reset()
+
+    def _on_timer(self) -> None:
+        self._timer.cancel()
+        self._set_ns = None
+        wanted_ns = self._wanted_ns
+        if wanted_ns is None:
+            return
+        if wanted_ns > self._now():
+            self._set(wanted_ns)
+            return
+        self._wanted_ns = None
+        self._ring()
 
 
 class GraphNode(Node):

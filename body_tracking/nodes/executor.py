@@ -11,6 +11,7 @@ shutdown.)
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from typing import Any
 
@@ -22,6 +23,8 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.waitable import NumberOfEntities
 
+_LOOK_PERIOD_NS = 100_000_000
+"""Nanoseconds between two looks at services and events while messages keep coming: each costs as much as a message."""
 _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
@@ -29,7 +32,7 @@ class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
     Messages and timers take a short way with a wait set that is kept; everything else (services, events, guard
-    conditions) goes rclpy's own.
+    conditions) goes rclpy's own, and is answered within a tenth of a second.
     """
 
     def __init__(self, node: Node) -> None:
@@ -81,7 +84,10 @@ class LeanExecutor(SingleThreadedExecutor):
                 used.enter_context(entity.handle)
             for waitable in waitables:
                 used.enter_context(waitable)
-            wait_set = _rclpy.WaitSet(
+            usual = _rclpy.WaitSet(
+                count.num_subscriptions, count.num_guard_conditions, count.num_timers, 0, 0, 0, context
+            )
+            everything = _rclpy.WaitSet(
                 count.num_subscriptions,
                 count.num_guard_conditions,
                 count.num_timers,
@@ -90,21 +96,27 @@ class LeanExecutor(SingleThreadedExecutor):
                 count.num_events,
                 context,
             )
+            looked_ns = 0
             while not self._changed:
+                since_ns = time.monotonic_ns() - looked_ns
+                whole = since_ns >= _LOOK_PERIOD_NS
+                wait_set = everything if whole else usual
                 wait_set.clear_entities()
                 for subscription in subscriptions:
                     wait_set.add_subscription(subscription.handle)
                 for timer in timers:
                     wait_set.add_timer(timer.handle)
-                for client in clients:
-                    wait_set.add_client(client.handle)
-                for service in services:
-                    wait_set.add_service(service.handle)
                 for guard in guards:
                     wait_set.add_guard_condition(guard.handle)
-                for waitable in waitables:
-                    waitable.add_to_wait_set(wait_set)
-                wait_set.wait(-1)
+                if whole:
+                    looked_ns = time.monotonic_ns()
+                    for client in clients:
+                        wait_set.add_client(client.handle)
+                    for service in services:
+                        wait_set.add_service(service.handle)
+                    for waitable in waitables:
+                        waitable.add_to_wait_set(wait_set)
+                wait_set.wait(-1 if whole else _LOOK_PERIOD_NS - since_ns)
                 if not self._context.ok():
                     return
                 executed = _execute_timers(timers)
@@ -114,8 +126,19 @@ class LeanExecutor(SingleThreadedExecutor):
                         return
                     only_message = subscription._callback_type is _MESSAGE_ONLY
                     subscription.callback(*(taken[:1] if only_message else taken))
-                if not executed and not self._changed:
-                    self._spin_once_impl(0)
+                if not self._changed and _others_ready(wait_set, waitables if whole else []):
+                    if executed:
+                        looked_ns = 0  # they are still ready when there is nothing else to do
+                    else:
+                        self._spin_once_impl(0)
+
+
+def _others_ready(wait_set: Any, waitables: list[Any]) -> bool:
+    """Whether anything but messages and timers is; a timer that is set anew wakes us up for nothing."""
+    kinds = ("guard_condition", "client", "service")
+    return any(wait_set.get_ready_entities(kind) for kind in kinds) or any(
+        waitable.is_ready(wait_set) for waitable in waitables
+    )
 
 
 def _take_all(subscriptions: list[Any], wait_set: Any) -> list[tuple[Any, Any]]:

@@ -19,7 +19,7 @@ from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.messages import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, Alarm, GraphNode, run
 from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
@@ -51,9 +51,7 @@ class FusionNode(GraphNode):
         self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose)
         for sensor in self.sensors:
             self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
-        self.deadline_ns: int | None = None
-        self.timer = self.create_timer(1.0, self.on_deadline, clock=STEADY)
-        self.timer.cancel()
+        self.alarm = Alarm(self, self.on_deadline, time.monotonic_ns)
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""
@@ -72,8 +70,6 @@ class FusionNode(GraphNode):
 
     def on_deadline(self) -> None:
         """Nothing more to wait for."""
-        self.timer.cancel()
-        self.deadline_ns = None
         self.publish(self.fusion.poll(time.monotonic_ns()))
 
     def publish(self, fused: list[Skeleton]) -> None:
@@ -81,15 +77,7 @@ class FusionNode(GraphNode):
         for skeleton in fused:
             cloud = encode_skeletons([skeleton])
             self.send(self.output, cloud, skeleton.stamp_ns, self.last_sent_ns)
-        deadline_ns = self.fusion.deadline_ns
-        if deadline_ns == self.deadline_ns:
-            return
-        self.deadline_ns = deadline_ns
-        if deadline_ns is None:
-            self.timer.cancel()
-        else:
-            self.timer.timer_period_ns = max(1, deadline_ns - time.monotonic_ns())
-            self.timer.reset()
+        self.alarm.at(self.fusion.deadline_ns)
 
     def time_jumped_back(self, topic: str) -> None:
         """Start anew; poses and clocks stay."""

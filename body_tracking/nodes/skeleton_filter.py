@@ -36,6 +36,7 @@ from body_tracking.nodes.common import (
     SENSORS,
     STEADY,
     WORLD_FRAME,
+    Alarm,
     GraphNode,
     run,
 )
@@ -104,9 +105,7 @@ class SkeletonFilterNode(GraphNode):
         self.advertise(self.values)
         self.connect(self.values)
         self.create_timer(PERIOD_NS / NANOSECONDS, self.on_timer, clock=STEADY)
-        self.deadline_ns: int | None = None
-        self.deadline = self.create_timer(1.0, self.on_deadline, clock=STEADY)
-        self.deadline.cancel()
+        self.alarm = Alarm(self, self.on_deadline, self.now_ns)
 
     def advertise(self, values: Mapping[str, Value]) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
@@ -165,7 +164,7 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_sensor(sensor, skeletons, self.now_ns())
-        self.await_deadline()
+        self.alarm.at(self.stage.deadline_ns)
 
     def on_timer(self) -> None:
         """Publish what is to be expected where nothing comes."""
@@ -175,23 +174,9 @@ class SkeletonFilterNode(GraphNode):
 
     def on_deadline(self) -> None:
         """A frame has waited long enough."""
-        self.deadline.cancel()
-        self.deadline_ns = None
-        self.on_timer()
-        self.await_deadline()
-
-    def await_deadline(self) -> None:
-        """Set the timer for the frame that cannot wait longer."""
         assert self.stage is not None
-        deadline_ns = self.stage.deadline_ns
-        if deadline_ns == self.deadline_ns:
-            return
-        self.deadline_ns = deadline_ns
-        if deadline_ns is None:
-            self.deadline.cancel()
-        else:  # not at once where simulated time stands still
-            self.deadline.timer_period_ns = max(NANOSECONDS // 1000, deadline_ns - self.now_ns())
-            self.deadline.reset()
+        self.on_timer()
+        self.alarm.at(self.stage.deadline_ns)
 
     def wanted(self, topic: str) -> bool:
         """Whether anybody listens."""
