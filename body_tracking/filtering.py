@@ -248,6 +248,11 @@ class FilterStage:
         """When :meth:`poll` should be called for a frame that waits, in the clock of ``now_ns``; None without one."""
         return self._ordering.deadline_ns
 
+    @property
+    def poll_at_ns(self) -> int | None:
+        """When it should be called for that, or for a predicted frame."""
+        return min((time for time in (self.deadline_ns, self._prediction.due_ns) if time is not None), default=None)
+
     def reset(self) -> None:
         """Forget the person, because time jumped back; poses and clocks stay."""
         self._filter.reset()
@@ -285,10 +290,13 @@ class FilterStage:
             skeleton = skeleton or self._model_filter.filtered
             assert skeleton is not None
             self._publish(graph.FILTERED, encode_skeletons([skeleton]), stamp_ns)
-        if self._wanted(graph.MODEL_STATE) or self._wanted(graph.MODEL_STATE_STDDEV):
+        state_wanted, stddev_wanted = self._wanted(graph.MODEL_STATE), self._wanted(graph.MODEL_STATE_STDDEV)
+        if state_wanted or stddev_wanted:
             state, stddev = encode_model_state(estimate, model)
-            self._publish(graph.MODEL_STATE, state, stamp_ns)
-            self._publish(graph.MODEL_STATE_STDDEV, stddev, stamp_ns)
+            if state_wanted:
+                self._publish(graph.MODEL_STATE, state, stamp_ns)
+            if stddev_wanted:
+                self._publish(graph.MODEL_STATE_STDDEV, stddev, stamp_ns)
         if self._wanted(graph.MODEL_COVARIANCE):
             self._publish(graph.MODEL_COVARIANCE, encode_covariance(estimate), stamp_ns)
         if self._wanted(self._segments_topic):

@@ -405,7 +405,7 @@ class ExtendedKalmanFilter:
         self._tangent = slice(0, self._nv)
         self._lengths = slice(self._nv, self._observed)
         self._velocities = slice(self._observed, self._size)
-        self._balls = [slice(int(rows[0]), int(rows[-1]) + 1) for rows in self.model.ball_v]
+        self._ball_rows = self.model.ball_v.reshape(-1)
         self._base_variance = BASE_STDDEV[self.model.joints] ** 2
         self._gate = float(chi2.ppf(p.gate_probability, _DIMENSIONS))
         self._group, self._first_log_density = self._groups()
@@ -687,8 +687,7 @@ class ExtendedKalmanFilter:
 
     def _turned_back(self, errors: FloatArray, turns: FloatArray) -> None:
         """Turn the rows (85, n) of the base's and the shoulders' rotation in place, by (3, 3, 3) for each of these."""
-        for rows, turn in zip(self._balls, turns, strict=True):
-            errors[rows] = turn @ errors[rows]
+        errors[self._ball_rows] = (turns @ errors.take(self.model.ball_v, axis=0)).reshape(len(self._ball_rows), -1)
 
     def _turning_back(self, step: FloatArray) -> FloatArray:
         """(32, 32) how an error of the tangent is seen from the moved configuration (adjoint, Sola eq. 82)."""
@@ -1553,7 +1552,11 @@ def _typical(variances: FloatArray, weight: float) -> float:
 
 def _third_difference(stamps: Sequence[int]) -> FloatArray:
     """(4,) factors of the third divided difference at these nanoseconds; their squares sum up to 1."""
-    t = [(stamp - stamps[0]) / NANOSECONDS for stamp in stamps]
-    factors = np.array([1.0 / math.prod(a - b for b in t if b != a) for a in t])
-    result: FloatArray = factors / np.sqrt(factors @ factors)
-    return result
+    b, c, d = ((stamp - stamps[0]) / NANOSECONDS for stamp in stamps[1:])
+    factors = (
+        -1.0 / (b * c * d),
+        1.0 / (b * (b - c) * (b - d)),
+        1.0 / (c * (c - b) * (c - d)),
+        1.0 / (d * (d - b) * (d - c)),
+    )
+    return np.array(factors) / math.hypot(*factors)

@@ -15,20 +15,21 @@ _USUAL = 1.0 / 30.0
 
 
 class Rhythm:
-    """The rhythm of one sensor's frames."""
+    """The rhythm of one sensor's frames.
+
+    Attributes:
+        period: seconds between frames, by the median: a lost frame does not make a sensor slower.
+    """
 
     def __init__(self) -> None:
         self._steps: deque[float] = deque(maxlen=7)
+        self.period = _USUAL
         self._in_vain = 0  # outputs in a row for which its frame was due and did not come in time
 
     def note(self, step: float) -> None:
         """A frame was captured so many seconds after the one before."""
         self._steps.append(step)
-
-    @property
-    def period(self) -> float:
-        """Seconds between frames, by the median: a lost frame does not make a sensor slower."""
-        return sorted(self._steps)[len(self._steps) // 2] if self._steps else _USUAL
+        self.period = sorted(self._steps)[len(self._steps) // 2]
 
     def due(self, age: float, silence: float) -> bool:
         """Whether another frame should have been captured by a time.

@@ -60,7 +60,10 @@ from body_tracking.skeleton import NANOSECONDS, Skeleton
 RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_SHORTEST_ALARM_NS = NANOSECONDS // 1000
+_FRAMES_KEPT = 16
+"""Half a second of a sensor's frames, more than sensors offer to keep: a node that is held up so long loses none."""
+_ALARM_NS = NANOSECONDS // 1000, NANOSECONDS // 10
+"""At least, as simulated time may stand still, and at most, as it may run fast, so long a timer is set for."""
 
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
@@ -179,8 +182,8 @@ class Alarm:
 
     def _set(self, time_ns: int) -> None:
         self._set_ns = time_ns
-        # not at once where simulated time stands still
-        self._timer.timer_period_ns = max(_SHORTEST_ALARM_NS, time_ns - self._now())
+        least, most = _ALARM_NS
+        self._timer.timer_period_ns = min(max(least, time_ns - self._now()), most)
         self._timer.reset()
 
     def _on_timer(self) -> None:
@@ -292,7 +295,9 @@ class GraphNode(Node):
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
-        return self.listen(topic, PointCloud2, self.skeleton_qos(), convert, raw=True)
+        qos = self.skeleton_qos()
+        qos.depth = max(qos.depth, _FRAMES_KEPT)
+        return self.listen(topic, PointCloud2, qos, convert, raw=True)
 
     def time_jumped_back(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""

@@ -26,7 +26,6 @@ from body_tracking.filtering import (
     filter_parameters,
     filter_table,
 )
-from body_tracking.filters.prediction import PERIOD_NS
 from body_tracking.messages import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import (
@@ -34,7 +33,6 @@ from body_tracking.nodes.common import (
     REFERENCE,
     RELIABLE,
     SENSORS,
-    STEADY,
     WORLD_FRAME,
     Alarm,
     GraphNode,
@@ -44,7 +42,7 @@ from body_tracking.parameters import Value
 from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.sensors import check_sensor_name
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.skeleton import Skeleton
 
 PARAMETERS = (
     FILTER,
@@ -104,8 +102,7 @@ class SkeletonFilterNode(GraphNode):
         """Connect."""
         self.advertise(self.values)
         self.connect(self.values)
-        self.create_timer(PERIOD_NS / NANOSECONDS, self.on_timer, clock=STEADY)
-        self.alarm = Alarm(self, self.on_deadline, self.now_ns)
+        self.alarm = Alarm(self, self.on_alarm, self.now_ns)
 
     def advertise(self, values: Mapping[str, Value]) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
@@ -158,25 +155,21 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_fused(skeletons[0], self.now_ns())
+        self.alarm.at(self.stage.poll_at_ns)
 
     def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Filter and publish."""
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_sensor(sensor, skeletons, self.now_ns())
-        self.alarm.at(self.stage.deadline_ns)
+        self.alarm.at(self.stage.poll_at_ns)
 
-    def on_timer(self) -> None:
-        """Publish what is to be expected where nothing comes."""
+    def on_alarm(self) -> None:
+        """A frame has waited long enough, or nothing has come for so long that it is to be said what is expected."""
         assert self.stage is not None
         self.sent_ns = None
         self.stage.poll(self.now_ns())
-
-    def on_deadline(self) -> None:
-        """A frame has waited long enough."""
-        assert self.stage is not None
-        self.on_timer()
-        self.alarm.at(self.stage.deadline_ns)
+        self.alarm.at(self.stage.poll_at_ns)
 
     def wanted(self, topic: str) -> bool:
         """Whether anybody listens."""
