@@ -82,11 +82,7 @@ def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events
 
 def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:
     _, published, _ = staged(events[:60], lambda topic: topic == graph.MODEL_STATE)
-    assert {topic for topic, _ in published} == {
-        graph.MODEL_STATE,
-        graph.MODEL_STATE_STDDEV,
-        graph.urdf_topic(graph.DEFAULT_BODY),
-    }
+    assert {topic for topic, _ in published} == {graph.MODEL_STATE, graph.urdf_topic(graph.DEFAULT_BODY)}
     _, everything, _ = staged(events[:60])
     wanted = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
     assert wanted == [stamp_ns for topic, stamp_ns in everything if topic == graph.FILTERED]

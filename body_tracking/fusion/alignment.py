@@ -16,7 +16,7 @@ import numpy as np
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.fusion.fusion import WORLD, FusionError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
-from body_tracking.fusion.sides import Sides
+from body_tracking.fusion.sides import Sides, agree, headings_of, put_right
 from body_tracking.measurement import joint_stddev, viewing_angle
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
@@ -40,6 +40,7 @@ class _Seen:
     variance: FloatArray
     states: np.ndarray
     angle: float
+    headings: list[float]
     body: int
 
 
@@ -176,28 +177,24 @@ class SensorAlignment:
             or (source.newest is not None and abs(seen.stamp_ns - source.newest.stamp_ns) <= FRESH * NANOSECONDS)
         }
         frames = [frame for frame in fresh.values() if frame is not None]
-        own = list(fresh).index(sensor)
-        # as np.stack does, which takes several times as long for a few small arrays; copies, as they are put right
-        points = np.concatenate([frame.positions for frame in frames]).reshape(-1, N_JOINTS, 3)
-        variance = np.concatenate([frame.variance for frame in frames]).reshape(-1, N_JOINTS)
-        states = np.concatenate([frame.states for frame in frames]).reshape(-1, N_JOINTS)
-        # What is repaired in the others' frames was counted when these came.
+        angles, headings = [frame.angle for frame in frames], [frame.headings for frame in frames]
+        believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, self.counters)
+        points, variance, states = seen.positions, seen.variance, seen.states
         counted: Counter[str] = Counter()
-        angles = [frame.angle for frame in frames]
-        self._sides.settle(seen.stamp_ns, tuple(fresh), angles, points, variance, states, counted)
-        known = np.isfinite(variance[own])
-        self.counters["reversals_accepted"] += counted["reversals_accepted"]
-        self.counters["repaired"] += counted["repaired"] > 0 and not np.array_equal(
-            points[own], seen.positions, equal_nan=True
-        )
-        self.counters["turned_joints"] += int(np.count_nonzero(np.isfinite(seen.variance) & ~known))
+        if not agree(seen.headings, believed):
+            points, variance, states = points.copy(), variance.copy(), states.copy()
+            put_right(seen.headings, believed, points, variance, states, counted)
+        known = np.isfinite(variance)
+        self.counters["repaired"] += counted["repaired"] > 0
+        if counted["turned"]:
+            self.counters["turned_joints"] += int(np.count_nonzero(np.isfinite(seen.variance) & ~known))
         covariances = np.zeros((N_JOINTS, 3, 3))
-        covariances[:, _DIAGONAL, _DIAGONAL] = variance[own][:, None]
+        covariances[:, _DIAGONAL, _DIAGONAL] = variance[:, None]
         return Skeleton(
             seen.stamp_ns,
             self.world,
-            np.where(known[:, None], points[own], np.nan),
-            np.where(known, states[own], 0).astype(np.uint8),
+            np.where(known[:, None], points, np.nan),
+            np.where(known, states, 0).astype(np.uint8),
             frames[0].body,
             covariances,
         )
@@ -209,4 +206,5 @@ def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Seen:
     states = np.where(known, skeleton.states, 0)
     angle = viewing_angle(positions)
     variance = joint_stddev(positions, states, angle) ** 2
-    return _Seen(stamp_ns, pose.apply(positions), variance, states, float(angle), skeleton.body)
+    placed = pose.apply(positions)
+    return _Seen(stamp_ns, placed, variance, states, float(angle), headings_of(placed), skeleton.body)

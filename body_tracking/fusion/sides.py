@@ -57,6 +57,49 @@ def _headings(ends: Sequence[Sequence[float]]) -> list[float]:
     return found
 
 
+def headings_of(points: FloatArray) -> list[float]:
+    """The headings of the upper and the lower body, radians, of (25, 3) joints in world; NaN where not known."""
+    return _headings(points[_ENDS].tolist())
+
+
+def agree(headings: Sequence[float], believed: Sequence[float]) -> bool:
+    """Whether nothing is to be put right, as far as that is known."""
+    return not any(math.cos(a - b) < SAME_SENSE for a, b in zip(headings, believed, strict=True))
+
+
+def put_right(
+    headings: Sequence[float],
+    believed: Sequence[float],
+    points: FloatArray,
+    variance: FloatArray,
+    states: np.ndarray,
+    counters: Counter[str],
+) -> None:
+    """Repair or reject, in place, what one sensor sees turned around or with its sides swapped.
+
+    Args:
+        headings: of both halves, as :func:`headings_of` says.
+        believed: those that are taken for true.
+        points: (25, 3) metres in world.
+        variance: (25,) square metres.
+        states: (25,).
+        counters: counts ``repaired`` and ``turned``.
+    """
+    for half, joints in enumerate(HALVES):
+        agreement = math.cos(headings[half] - believed[half])
+        if not agreement < SAME_SENSE:  # NaN for an axis that is not known: nothing to be said
+            continue
+        if agreement < -SAME_SENSE:
+            other = MIRROR[joints]
+            points[joints] = points[other]
+            variance[joints] = 2.0 * variance[other]
+            states[joints] = states[other]
+            counters["repaired"] += 1
+        else:
+            variance[joints] = np.inf
+            counters["turned"] += 1
+
+
 class Sides:
     """Decides whom to believe on left and right, and keeps the output from turning faster than a person can.
 
@@ -101,35 +144,30 @@ class Sides:
             states: (k, 25).
             counters: counts ``repaired``, ``turned`` and ``reversals_accepted``.
         """
-        headings = [_headings(ends) for ends in points[:, _ENDS].tolist()]
-        believed = self._believed(stamp, names, angles, headings, counters)
+        headings = [headings_of(each) for each in points]
+        believed = self.believed(stamp, names, angles, headings, counters)
         for index, found in enumerate(headings):
-            for half, joints in enumerate(HALVES):
-                agreement = math.cos(found[half] - believed[half])
-                if not agreement < SAME_SENSE:  # NaN for an axis that is not known: nothing to be said
-                    continue
-                if agreement < -SAME_SENSE:
-                    other = MIRROR[joints]
-                    points[index, joints] = points[index, other]
-                    variance[index, joints] = 2.0 * variance[index, other]
-                    states[index, joints] = states[index, other]
-                    counters["repaired"] += 1
-                else:
-                    variance[index, joints] = np.inf
-                    counters["turned"] += 1
+            put_right(found, believed, points[index], variance[index], states[index], counters)
 
-    def _believed(
+    def believed(
         self,
         stamp: int,
         names: Sequence[str],
         angles: Sequence[float],
-        headings: list[list[float]],
+        headings: Sequence[Sequence[float]],
         counters: Counter[str],
     ) -> list[float]:
-        """The headings that are taken for true.
+        """The headings of both halves that are taken for true, radians.
 
         They are those of the believed sensor; another takes over that sees the body more from the front for a while
         and agrees with it. While the believed one is missing for a moment, its last headings stand.
+
+        Args:
+            stamp: reference time, nanoseconds.
+            names: k sensors.
+            angles: k angles under which they see the body, radians.
+            headings: k times what :func:`headings_of` says of what they see.
+            counters: counts ``reversals_accepted``.
         """
         known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
         recent = self.trusted is not None and stamp - self._trusted_ns <= TRUST_AFTER
