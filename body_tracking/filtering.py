@@ -34,7 +34,7 @@ from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.skeleton import Skeleton
+from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
 INPUT = Parameter(
@@ -63,6 +63,19 @@ ORDER_WAIT = Parameter(
     DEFAULT_ORDER_WAIT,
     "sensors' frames: one waits at most this long for another sensor's older one that is due; 0 for the least delay, "
     "with frames that come late then taken into account by going back",
+    unit="s",
+    min=0.0,
+    max=1.0,
+    live=True,
+)
+DEFAULT_OUTPUT_INTERVAL = 0.008
+"""Seconds."""
+
+OUTPUT_INTERVAL = Parameter(
+    "output_interval",
+    DEFAULT_OUTPUT_INTERVAL,
+    "sensors' frames: one captured sooner than this after the last one that was answered is taken without an output of "
+    "its own; 0 for an output after each",
     unit="s",
     min=0.0,
     max=1.0,
@@ -103,6 +116,7 @@ class FilterSettings:
         body: the person's id in topics.
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: seconds that a sensor's frame waits at most for an older one.
+        output_interval: seconds of capture time that there are at least between two outputs.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -114,6 +128,7 @@ class FilterSettings:
     body: str = graph.DEFAULT_BODY
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
+    output_interval: float = DEFAULT_OUTPUT_INTERVAL
 
 
 def filter_table() -> tuple[Parameter, ...]:
@@ -138,6 +153,7 @@ class FilterStage:
         settings: which one.
         publish: takes a topic, a serialised message and its capture time.
         wanted: whether to make messages of a topic at all; always when None.
+        steady: the clock, nanoseconds, by which frames wait; when None, that of ``now_ns``, which may stand still.
 
     Attributes:
         by_sensor: it takes sensors' frames, not fused ones.
@@ -155,6 +171,7 @@ class FilterStage:
         settings: FilterSettings,
         publish: Callable[[str, bytes, int], None],
         wanted: Callable[[str], bool] | None = None,
+        steady: Callable[[], int] | None = None,
     ) -> None:
         self._filter = make_filter(settings.filter_name, **settings.parameters)
         role = graph.role_of(graph.GraphOptions(filter_name=settings.filter_name, filter_input=settings.input))
@@ -162,7 +179,10 @@ class FilterStage:
         self.alignment: SensorAlignment | None = None
         if self.by_sensor:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
+        self._steady = steady
         self._ordering = Ordering(settings.sensors, settings.order_wait)
+        self._output_interval_ns = round(settings.output_interval * NANOSECONDS) if self.by_sensor else 0
+        self._answered_ns: int | None = None
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
         self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
@@ -226,15 +246,19 @@ class FilterStage:
         aligned = self.alignment.push(sensor, subject)
         if aligned is not None:
             self.poll(now_ns)
-            self._take(self._ordering.push(sensor, aligned, now_ns), now_ns)
+            waiting_ns = now_ns if self._steady is None else self._steady()
+            self._take(self._ordering.push(sensor, aligned, waiting_ns), now_ns)
 
     def poll(self, now_ns: int) -> None:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
         if self._model_filter is None:
             return
-        # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
-        while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
-            self._take(self._ordering.poll(deadline_ns), deadline_ns)
+        if self._steady is not None:
+            self._take(self._ordering.poll(self._steady()), now_ns)
+        else:
+            # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
+            while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
+                self._take(self._ordering.poll(deadline_ns), deadline_ns)
         while (stamp_ns := self._prediction.due(now_ns)) is not None:
             predicted = self._model_filter.predict(stamp_ns)
             if predicted is None:
@@ -245,13 +269,13 @@ class FilterStage:
 
     @property
     def deadline_ns(self) -> int | None:
-        """When :meth:`poll` should be called for a frame that waits, in the clock of ``now_ns``; None without one."""
+        """When :meth:`poll` is to be called for a frame that waits, in the clock by which it does; None without one."""
         return self._ordering.deadline_ns
 
     @property
-    def poll_at_ns(self) -> int | None:
-        """When it should be called for that, or for a predicted frame."""
-        return min((time for time in (self.deadline_ns, self._prediction.due_ns) if time is not None), default=None)
+    def due_ns(self) -> int | None:
+        """When it should be called for a predicted frame, in the clock of ``now_ns``; None where none is to come."""
+        return self._prediction.due_ns
 
     def reset(self) -> None:
         """Forget the person, because time jumped back; poses and clocks stay."""
@@ -265,16 +289,26 @@ class FilterStage:
         self._subjects[sensor].reset()
 
     def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
-        """Filter frames that go on together, and publish what is known after the last one.
+        """Filter frames, and publish what is known after each that does not follow another one closely.
 
-        What was known in between is of no use to anybody any more.
+        That is told by their stamps, not by when they arrived: a recording gives the same output at any rate.
         """
         assert self._model_filter is not None
-        stamps = [skeleton.stamp_ns for sensor, skeleton in frames if self._model_filter.take(skeleton, sensor)]
+        for sensor, skeleton in frames:
+            if not self._model_filter.take(skeleton, sensor):
+                continue
+            self._prediction.arrived(skeleton.stamp_ns, now_ns)
+            since_ns = None if self._answered_ns is None else skeleton.stamp_ns - self._answered_ns
+            if since_ns is None or not 0 <= since_ns < self._output_interval_ns:
+                self._answered_ns = skeleton.stamp_ns
+                self._answer()
+
+    def _answer(self) -> None:
+        """Publish what the filter knows."""
+        assert self._model_filter is not None
         estimate = self._model_filter.estimate
-        if not stamps or estimate is None:
+        if estimate is None:
             return
-        self._prediction.arrived(stamps[-1], now_ns)
         self._send(None, estimate)
         if self._lengths.news(estimate.stamp_ns, estimate.lengths):
             from body_tracking.kinematics.urdf import urdf

@@ -125,7 +125,7 @@ def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
     file = tmp_path / "parameters.yaml"
     file.write_text(
         "fusion: {ros__parameters: {max_wait: 1.0}}\n"
-        f"skeleton_filter: {{ros__parameters: {{filter: {filter_name}, predict_after: 1000.0}}}}\n"
+        f"skeleton_filter: {{ros__parameters: {{filter: {filter_name}, predict_after: 1000.0, order_wait: 1.0}}}}\n"
     )
     graph_up = up("--bag", BAG, "--record", tmp_path / "live", "--reliable", "--params-file", file)
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
@@ -135,6 +135,7 @@ def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
         ("kinect1", "kinect2"),
         filter_name=filter_name,
         predict_after=1000.0,
+        order_wait=1.0,
         fusion=FusionParameters(max_wait=1.0),
     )
     replay(BAG, tmp_path / "offline", settings)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from body_tracking.filtering import (
     FILTER,
     INPUT,
     ORDER_WAIT,
+    OUTPUT_INTERVAL,
     PREDICT_AFTER,
     FilterSettings,
     FilterStage,
@@ -52,6 +54,7 @@ PARAMETERS = (
     WORLD_FRAME,
     BODY,
     ORDER_WAIT,
+    OUTPUT_INTERVAL,
     PREDICT_AFTER,
     *filter_table(),
     RELIABLE,
@@ -88,8 +91,9 @@ class SkeletonFilterNode(GraphNode):
             graph.check_body(given["body"]),
             given["predict_after"],
             given["order_wait"],
+            given["output_interval"],
         )
-        before, stage = self.stage, FilterStage(settings, self.publish, self.wanted)
+        before, stage = self.stage, FilterStage(settings, self.publish, self.wanted, time.monotonic_ns)
         if before is not None and before.by_sensor and stage.by_sensor:
             stage.alignment = before.alignment  # latched poses come once
         self.stage = stage
@@ -102,7 +106,8 @@ class SkeletonFilterNode(GraphNode):
         """Connect."""
         self.advertise(self.values)
         self.connect(self.values)
-        self.alarm = Alarm(self, self.on_alarm, self.now_ns)
+        self.waiting = Alarm(self, self.on_alarm, time.monotonic_ns)
+        self.silence = Alarm(self, self.on_alarm, self.now_ns)
 
     def advertise(self, values: Mapping[str, Value]) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
@@ -155,21 +160,27 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_fused(skeletons[0], self.now_ns())
-        self.alarm.at(self.stage.poll_at_ns)
+        self.set_alarms()
 
     def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Filter and publish."""
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.on_sensor(sensor, skeletons, self.now_ns())
-        self.alarm.at(self.stage.poll_at_ns)
+        self.set_alarms()
 
     def on_alarm(self) -> None:
         """A frame has waited long enough, or nothing has come for so long that it is to be said what is expected."""
         assert self.stage is not None
         self.sent_ns = None
         self.stage.poll(self.now_ns())
-        self.alarm.at(self.stage.poll_at_ns)
+        self.set_alarms()
+
+    def set_alarms(self) -> None:
+        """For what is due next."""
+        assert self.stage is not None
+        self.waiting.at(self.stage.deadline_ns)
+        self.silence.at(self.stage.due_ns)
 
     def wanted(self, topic: str) -> bool:
         """Whether anybody listens."""
