@@ -34,7 +34,7 @@ from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.skeleton import Skeleton
 
 FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
 INPUT = Parameter(
@@ -63,19 +63,6 @@ ORDER_WAIT = Parameter(
     DEFAULT_ORDER_WAIT,
     "sensors' frames: one waits at most this long for another sensor's older one that is due; 0 for the least delay, "
     "with frames that come late then taken into account by going back",
-    unit="s",
-    min=0.0,
-    max=1.0,
-    live=True,
-)
-DEFAULT_OUTPUT_INTERVAL = 0.008
-"""Seconds."""
-
-OUTPUT_INTERVAL = Parameter(
-    "output_interval",
-    DEFAULT_OUTPUT_INTERVAL,
-    "sensors' frames: one captured sooner than this after the last one that was answered is taken without an output of "
-    "its own; 0 for an output after each",
     unit="s",
     min=0.0,
     max=1.0,
@@ -116,7 +103,6 @@ class FilterSettings:
         body: the person's id in topics.
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: seconds that a sensor's frame waits at most for an older one.
-        output_interval: seconds of capture time that there are at least between two outputs.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -128,7 +114,6 @@ class FilterSettings:
     body: str = graph.DEFAULT_BODY
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
-    output_interval: float = DEFAULT_OUTPUT_INTERVAL
 
 
 def filter_table() -> tuple[Parameter, ...]:
@@ -181,8 +166,6 @@ class FilterStage:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
         self._steady = steady
         self._ordering = Ordering(settings.sensors, settings.order_wait)
-        self._output_interval_ns = round(settings.output_interval * NANOSECONDS) if self.by_sensor else 0
-        self._answered_ns: int | None = None
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
         self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
@@ -289,32 +272,20 @@ class FilterStage:
         self._subjects[sensor].reset()
 
     def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
-        """Filter frames, and publish what is known after each that does not follow another one closely.
-
-        That is told by their stamps, not by when they arrived: a recording gives the same output at any rate.
-        """
+        """Filter frames, and publish what is known after each: a recording gives the same output at any rate."""
         assert self._model_filter is not None
         for sensor, skeleton in frames:
             if not self._model_filter.take(skeleton, sensor):
                 continue
+            estimate = self._model_filter.estimate
+            assert estimate is not None  # a frame was taken
             self._prediction.arrived(skeleton.stamp_ns, now_ns)
-            since_ns = None if self._answered_ns is None else skeleton.stamp_ns - self._answered_ns
-            if since_ns is None or not 0 <= since_ns < self._output_interval_ns:
-                self._answered_ns = skeleton.stamp_ns
-                self._answer()
+            self._send(None, estimate)
+            if self._lengths.news(estimate.stamp_ns, estimate.lengths):
+                from body_tracking.kinematics.urdf import urdf
 
-    def _answer(self) -> None:
-        """Publish what the filter knows."""
-        assert self._model_filter is not None
-        estimate = self._model_filter.estimate
-        if estimate is None:
-            return
-        self._send(None, estimate)
-        if self._lengths.news(estimate.stamp_ns, estimate.lengths):
-            from body_tracking.kinematics.urdf import urdf
-
-            text = urdf(self._model_filter.model, estimate.lengths, self._body)
-            self._publish(self._urdf_topic, encode_string(text), estimate.stamp_ns)
+                text = urdf(self._model_filter.model, estimate.lengths, self._body)
+                self._publish(self._urdf_topic, encode_string(text), estimate.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
         """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""

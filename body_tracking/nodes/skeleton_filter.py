@@ -21,7 +21,6 @@ from body_tracking.filtering import (
     FILTER,
     INPUT,
     ORDER_WAIT,
-    OUTPUT_INTERVAL,
     PREDICT_AFTER,
     FilterSettings,
     FilterStage,
@@ -54,7 +53,6 @@ PARAMETERS = (
     WORLD_FRAME,
     BODY,
     ORDER_WAIT,
-    OUTPUT_INTERVAL,
     PREDICT_AFTER,
     *filter_table(),
     RELIABLE,
@@ -91,7 +89,6 @@ class SkeletonFilterNode(GraphNode):
             graph.check_body(given["body"]),
             given["predict_after"],
             given["order_wait"],
-            given["output_interval"],
         )
         before, stage = self.stage, FilterStage(settings, self.publish, self.wanted, time.monotonic_ns)
         if before is not None and before.by_sensor and stage.by_sensor:

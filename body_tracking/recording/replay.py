@@ -25,7 +25,6 @@ from body_tracking.filtering import (
     FILTER,
     INPUT,
     ORDER_WAIT,
-    OUTPUT_INTERVAL,
     PREDICT_AFTER,
     filter_parameters,
     filter_table,
@@ -267,9 +266,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     calibration, _ = parameters_for("calibration", CalibrationParameters, file, {**_SHARED, "calibration_file": ""})
     fusion, shared = parameters_for("fusion", FusionParameters, file, _SHARED)
     own = {**_SHARED, "body": ""}
-    filtering, _ = values_for(
-        "skeleton_filter", (FILTER, INPUT, ORDER_WAIT, OUTPUT_INTERVAL, PREDICT_AFTER, *filter_table()), file, own
-    )
+    filtering, _ = values_for("skeleton_filter", (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, *filter_table()), file, own)
     values_for("joint_angles", ANGLES, file, own)
     # What one node is told and another must know: from the command line, else from the file.
     chosen = graph.with_file(graph.GraphOptions(filter_name=args.filter or "", convention=args.convention or ""), file)
@@ -281,7 +278,6 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         chosen.filter_input or graph.AUTO,
         float(str(filtering["predict_after"])),
         float(str(filtering["order_wait"])),
-        float(str(filtering["output_interval"])),
         chosen.convention or graph.AUTO,
         chosen.angles_input or graph.AUTO,
         args.body,

@@ -29,7 +29,6 @@ from body_tracking.cdr import (
 )
 from body_tracking.filtering import (
     DEFAULT_ORDER_WAIT,
-    DEFAULT_OUTPUT_INTERVAL,
     DEFAULT_PREDICT_AFTER,
     FilterSettings,
     FilterStage,
@@ -74,7 +73,6 @@ class ReplaySettings:
         filter_input: what it filters; ``graph.AUTO`` for what is its own.
         predict_after: seconds without a frame after which predicted ones are made.
         order_wait: seconds that a sensor's frame waits at most for another's older one, where the filter takes these.
-        output_interval: seconds of capture time that there are then at least between two outputs.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
         angles_input: what they are made of; ``graph.AUTO`` for what is the filter's own.
         body: the id in topics and names of angles.
@@ -90,7 +88,6 @@ class ReplaySettings:
     filter_input: str = graph.AUTO
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
-    output_interval: float = DEFAULT_OUTPUT_INTERVAL
     convention: str = graph.AUTO
     angles_input: str = graph.AUTO
     body: str = graph.DEFAULT_BODY
@@ -125,7 +122,6 @@ class ReplaySettings:
             body=self.body,
             predict_after=self.predict_after,
             order_wait=self.order_wait,
-            output_interval=self.output_interval,
         )
 
 
