@@ -242,7 +242,8 @@ class FilterStage:
             # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
             while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
                 self._take(self._ordering.poll(deadline_ns), deadline_ns)
-        while (stamp_ns := self._prediction.due(now_ns)) is not None:
+        # what waits is of a time that must not be told before
+        while self.deadline_ns is None and (stamp_ns := self._prediction.due(now_ns)) is not None:
             predicted = self._model_filter.predict(stamp_ns)
             if predicted is None:
                 self._prediction.stop()
@@ -257,8 +258,10 @@ class FilterStage:
 
     @property
     def due_ns(self) -> int | None:
-        """When it should be called for a predicted frame, in the clock of ``now_ns``; None where none is to come."""
-        return self._prediction.due_ns
+        """When it should be called for a predicted frame, in the clock of ``now_ns``; None where none is to come
+        before a frame that waits.
+        """
+        return self._prediction.due_ns if self.deadline_ns is None else None
 
     def reset(self) -> None:
         """Forget the person, because time jumped back; poses and clocks stay."""
@@ -272,7 +275,7 @@ class FilterStage:
         self._subjects[sensor].reset()
 
     def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
-        """Filter frames, and publish what is known after each: a recording gives the same output at any rate."""
+        """Filter frames, and publish what is known after each that does not come after newer ones."""
         assert self._model_filter is not None
         for sensor, skeleton in frames:
             if not self._model_filter.take(skeleton, sensor):

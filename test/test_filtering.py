@@ -86,3 +86,13 @@ def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:
     _, everything, _ = staged(events[:60])
     wanted = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
     assert wanted == [stamp_ns for topic, stamp_ns in everything if topic == graph.FILTERED]
+
+
+def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event]) -> None:
+    rng = np.random.default_rng(1)
+    kept = [event for event in events if rng.uniform() > 0.2]
+    for settings in ({}, {"order_wait": 0.3}):
+        stage, published, _ = staged(kept, **settings)
+        assert stage.counters["predicted frames"] >= 0
+        stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.FILTERED]
+        assert len(stamps) > 50 and stamps == sorted(stamps)

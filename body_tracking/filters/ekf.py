@@ -126,8 +126,9 @@ _MOST_GROWN = 100.0
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
-_STRAINED = 16.0
-"""Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to."""
+_STRAINED = 4.0
+"""Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
+with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 5."""
 _MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
@@ -455,6 +456,7 @@ class ExtendedKalmanFilter:
         self._newest: Skeleton | None = None
         self._history: deque[tuple[_State, _Measurement]] = deque()
         self._waiting: list[_Measurement] = []
+        self._started_by: tuple[str, int] | None = None
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
 
@@ -583,11 +585,10 @@ class ExtendedKalmanFilter:
         """Whether this sensor's frame of this stamp was taken before."""
         if measurement.stamp_ns > state.stamp_ns:
             return False
-        if last is not None and last.stamps and last.stamps[-1] == measurement.stamp_ns:
+        if last is not None and measurement.stamp_ns in last.stamps:
             return True
-        return any(
-            (each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for _, each in self._history
-        )
+        own = measurement.sensor, measurement.stamp_ns
+        return own == self._started_by or any((each.sensor, each.stamp_ns) == own for _, each in self._history)
 
     # --- time
 
@@ -1104,6 +1105,7 @@ class ExtendedKalmanFilter:
         except ModelError:
             self.counters["no_trunk"] += 1
             return None
+        self._started_by = measurement.sensor, measurement.stamp_ns
         state = self._new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
         state = state.but(fresh=True, sensors=state.sensors if learnt is None else learnt)
         sensor = state.sensors.get(measurement.sensor) or self._unknown_sensor(measurement)

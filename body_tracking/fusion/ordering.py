@@ -57,6 +57,7 @@ class Ordering:
         self._sources = {sensor: _Source() for sensor in sensors}
         self._waiting: list[_Waiting] = []
         self._arrived = 0
+        self._left_ns: int | None = None
 
     def push(self, sensor: str, skeleton: Skeleton, now_ns: int) -> list[tuple[str, Skeleton]]:
         """Take one frame.
@@ -75,8 +76,9 @@ class Ordering:
         stamp_ns = skeleton.stamp_ns
         if source.newest_ns is not None and stamp_ns < source.newest_ns - CLOCK_JUMP * NANOSECONDS:
             ready += self.flush()
+            source = self._sources[sensor]
         if source.newest_ns is None or stamp_ns > source.newest_ns:
-            if source.newest_ns is not None and (step := (stamp_ns - source.newest_ns) / NANOSECONDS) < SILENCE:
+            if source.newest_ns is not None and (step := (stamp_ns - source.newest_ns) / NANOSECONDS) < CLOCK_JUMP:
                 source.rhythm.note(step)
             source.newest_ns = stamp_ns
         self._arrived += 1
@@ -90,14 +92,18 @@ class Ordering:
             now_ns: as in :meth:`push`.
         """
         ready = []
-        while self._waiting:
+        while (deadline_ns := self.deadline_ns) is not None:
             first = self._waiting[0]
             due = self._due(first.stamp_ns)
-            if now_ns < first.deadline_ns and any(rhythm.worth_waiting for rhythm in due):
+            waited = now_ns >= deadline_ns
+            if not waited and any(rhythm.worth_waiting for rhythm in due):
                 break
-            for source in self._sources.values():
-                source.rhythm.answered(came=source.rhythm not in due)
-            self.counters["in vain"] += bool(due)
+            # a frame that comes after newer ones have left says nothing of whether it is worth waiting for its like
+            if self._left_ns is None or first.stamp_ns >= self._left_ns:
+                self._left_ns = first.stamp_ns
+                for source in self._sources.values():
+                    source.rhythm.answered(came=source.rhythm not in due)
+            self.counters["in vain"] += waited and bool(due) and self._wait_ns > 0
             del self._waiting[0]
             ready.append((first.sensor, first.skeleton))
         return ready
@@ -106,6 +112,7 @@ class Ordering:
         """All frames that wait, in the order of their capture; what comes next is of another time."""
         ready = [(each.sensor, each.skeleton) for each in self._waiting]
         self._waiting.clear()
+        self._left_ns = None
         for sensor in self._sources:
             self._sources[sensor] = _Source()
         return ready
@@ -113,7 +120,8 @@ class Ordering:
     @property
     def deadline_ns(self) -> int | None:
         """When :meth:`poll` should be called, in the clock of ``now_ns``; None while nothing waits."""
-        return self._waiting[0].deadline_ns if self._waiting else None
+        # an older frame that came later does not make those behind it wait longer
+        return min((each.deadline_ns for each in self._waiting), default=None)
 
     def _due(self, stamp_ns: int) -> list[Rhythm]:
         """Those of the sensors whose frame captured up to a time should be here and is not."""

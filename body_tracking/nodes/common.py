@@ -61,9 +61,9 @@ RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FRAMES_KEPT = 16
-"""Half a second of a sensor's frames, more than sensors offer to keep: a node that is held up so long loses none."""
-_ALARM_NS = NANOSECONDS // 1000, NANOSECONDS // 10
-"""At least, as simulated time may stand still, and at most, as it may run fast, so long a timer is set for."""
+"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none."""
+_ALARM_NS = NANOSECONDS // 200, NANOSECONDS // 10
+"""For at least so long, as simulated time may stand still, and at most, as it may run fast, a timer is set by it."""
 
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
@@ -164,11 +164,11 @@ class Alarm:
     Args:
         node: whose.
         ring: what is called.
-        now: nanoseconds, in the clock of the times that are given.
+        now: nanoseconds, in the clock of the times that are given; None for ``time.monotonic_ns``.
     """
 
-    def __init__(self, node: Node, ring: Callable[[], None], now: Callable[[], int]) -> None:
-        self._ring, self._now = ring, now
+    def __init__(self, node: Node, ring: Callable[[], None], now: Callable[[], int] | None = None) -> None:
+        self._ring, self._now, self._steady = ring, now or time.monotonic_ns, now is None
         self._wanted_ns: int | None = None
         self._set_ns: int | None = None
         self._timer = node.create_timer(1.0, self._on_timer, clock=STEADY)
@@ -182,8 +182,11 @@ class Alarm:
 
     def _set(self, time_ns: int) -> None:
         self._set_ns = time_ns
-        least, most = _ALARM_NS
-        self._timer.timer_period_ns = min(max(least, time_ns - self._now()), most)
+        remaining_ns = max(1, time_ns - self._now())
+        if not self._steady:
+            least, most = _ALARM_NS
+            remaining_ns = min(max(least, remaining_ns), most)
+        self._timer.timer_period_ns = remaining_ns
         self._timer.reset()
 
     def _on_timer(self) -> None:

@@ -32,7 +32,7 @@ class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
     Messages and timers take a short way with a wait set that is kept; everything else (services, events, guard
-    conditions) goes rclpy's own, and is answered within a tenth of a second.
+    conditions) goes rclpy's own, and is looked at ten times a second while messages keep coming.
     """
 
     def __init__(self, node: Node) -> None:
@@ -97,6 +97,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 context,
             )
             looked_ns = 0
+            ready_since_ns: int | None = None
             while not self._changed:
                 since_ns = time.monotonic_ns() - looked_ns
                 whole = since_ns >= _LOOK_PERIOD_NS
@@ -126,11 +127,14 @@ class LeanExecutor(SingleThreadedExecutor):
                         return
                     only_message = subscription._callback_type is _MESSAGE_ONLY
                     subscription.callback(*(taken[:1] if only_message else taken))
-                if not self._changed and _others_ready(wait_set, waitables if whole else []):
-                    if executed:
-                        looked_ns = 0  # they are still ready when there is nothing else to do
-                    else:
-                        self._spin_once_impl(0)
+                if self._changed or not _others_ready(wait_set, waitables if whole else []):
+                    ready_since_ns = None
+                    continue
+                looked_ns = 0  # there may be several, or they are still ready when there is nothing else to do
+                ready_since_ns = ready_since_ns or time.monotonic_ns()
+                # a node that messages keep busy all the time answers, too
+                if not executed or time.monotonic_ns() - ready_since_ns > _LOOK_PERIOD_NS:
+                    self._spin_once_impl(0)
 
 
 def _others_ready(wait_set: Any, waitables: list[Any]) -> bool:

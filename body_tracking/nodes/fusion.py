@@ -51,7 +51,7 @@ class FusionNode(GraphNode):
         self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose)
         for sensor in self.sensors:
             self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
-        self.alarm = Alarm(self, self.on_deadline, time.monotonic_ns)
+        self.alarm = Alarm(self, self.on_deadline)
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""

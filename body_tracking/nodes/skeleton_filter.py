@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, 
 from std_msgs.msg import String
 
 from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
 from body_tracking.filtering import (
     FILTER,
     INPUT,
@@ -103,7 +104,7 @@ class SkeletonFilterNode(GraphNode):
         """Connect."""
         self.advertise(self.values)
         self.connect(self.values)
-        self.waiting = Alarm(self, self.on_alarm, time.monotonic_ns)
+        self.waiting = Alarm(self, self.on_alarm)
         self.silence = Alarm(self, self.on_alarm, self.now_ns)
 
     def advertise(self, values: Mapping[str, Value]) -> None:
@@ -170,8 +171,12 @@ class SkeletonFilterNode(GraphNode):
         """A frame has waited long enough, or nothing has come for so long that it is to be said what is expected."""
         assert self.stage is not None
         self.sent_ns = None
-        self.stage.poll(self.now_ns())
-        self.set_alarms()
+        try:
+            self.stage.poll(self.now_ns())
+        except BodyTrackingError as error:
+            self.malformed("a frame that waited", str(error), "refused")
+        finally:
+            self.set_alarms()
 
     def set_alarms(self) -> None:
         """For what is due next."""
@@ -185,7 +190,7 @@ class SkeletonFilterNode(GraphNode):
 
     def publish(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
         """One message of the filter."""
-        if topic == graph.FILTERED:
+        if topic in (graph.FILTERED, graph.MODEL_STATE):
             self.send(self.outputs[topic], cdr, stamp_ns, self.sent_ns)
         else:
             self.outputs[topic].publish(cdr)

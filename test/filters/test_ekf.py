@@ -367,6 +367,16 @@ def test_a_repeated_frame_counts_once() -> None:
     assert_same(known(once), known(twice), 1e-12)
 
 
+@pytest.mark.parametrize("after", range(4, 12))
+def test_the_frame_that_it_was_started_by_counts_once(after: int) -> None:
+    skeletons = measured(somebody(8, 1.0)).skeletons
+    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    run(once, skeletons)
+    run(twice, [*skeletons[:after], skeletons[0], *skeletons[after:]])
+    assert twice.counters["repeated_stamps"] == 1
+    assert_same(known(once), known(twice), 1e-12)
+
+
 def test_a_start_in_another_order_is_the_same_start() -> None:
     skeletons = measured(somebody(8, 1.0)).skeletons
     in_order, shuffled = ExtendedKalmanFilter(), ExtendedKalmanFilter()

@@ -115,3 +115,38 @@ def test_a_jump_back_in_time_lets_go_of_what_waits() -> None:
     assert stamps(ordering.push("a", frame(now), now)) == []
     assert stamps(ordering.push("a", frame(0), now + 10 * MS)) == [now, 0]
     assert ordering.deadline_ns is None
+
+
+def test_a_sensor_that_is_always_too_late_is_soon_not_waited_for() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    events = sorted(
+        (k * PERIOD + delay, k * PERIOD, name) for name, delay in (("a", 0), ("b", 70 * MS)) for k in range(40)
+    )
+    waited = 0
+    for now_ns, stamp_ns, sensor in events:
+        while (deadline_ns := ordering.deadline_ns) is not None and deadline_ns < now_ns:
+            ordering.poll(deadline_ns)
+        left = ordering.push(sensor, frame(stamp_ns), now_ns)
+        waited += sensor == "a" and left == []
+    assert 1 <= waited <= PATIENCE
+
+
+def test_an_older_frame_makes_those_behind_it_wait_no_longer() -> None:
+    ordering = Ordering(("a", "b", "c"), 0.02)
+    now = known(ordering, {"a": 20 * MS, "b": 10 * MS, "c": 0})
+    assert ordering.push("a", frame(now + 20 * MS), now + 20 * MS) == []
+    assert ordering.push("b", frame(now + 10 * MS), now + 35 * MS) == []
+    assert ordering.deadline_ns == now + 40 * MS
+    assert stamps(ordering.poll(now + 40 * MS)) == [now + 10 * MS, now + 20 * MS]
+
+
+def test_a_slow_sensor_holds_nobody_up_between_its_frames() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    waits = []
+    for k in range(120):
+        if k % 15 == 0:
+            ordering.push("b", frame(k * PERIOD), k * PERIOD)
+        now_ns = k * PERIOD + 10 * MS
+        waits.append(ordering.push("a", frame(now_ns), now_ns) == [])
+        ordering.poll(now_ns + 20 * MS)
+    assert not any(waits[30:])

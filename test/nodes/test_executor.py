@@ -110,6 +110,30 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
     spinning.thread.join(10.0)
 
 
+@pytest.mark.parametrize("work", [0.0, 0.03])
+def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> None:
+    publisher = node.create_publisher(String, "text", 10)
+    node.create_subscription(String, "text", lambda message: time.sleep(work), 10)
+    node.create_timer(0.02, lambda: publisher.publish(String(data="more")), clock=STEADY)
+    node.create_service(Trigger, "ask", lambda _, response: Trigger.Response(success=True, message="here"))
+    spinning = Spinning(node)
+    other = rclpy.Context()
+    rclpy.init(context=other, domain_id=node.context.get_domain_id())
+    caller = rclpy.create_node("caller", context=other)
+    executor = SingleThreadedExecutor(context=other)
+    executor.add_node(caller)
+    client = caller.create_client(Trigger, "ask")
+    assert client.wait_for_service(10.0)
+    futures = [client.call_async(Trigger.Request()) for _ in range(5)]
+    end = time.monotonic() + 20.0
+    while not all(future.done() for future in futures) and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.1)
+    assert all(future.done() and future.result().message == "here" for future in futures)
+    rclpy.try_shutdown(context=other)
+    rclpy.shutdown()
+    spinning.thread.join(10.0)
+
+
 def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
     spinning = Spinning(node)
     time.sleep(0.3)
