@@ -92,7 +92,6 @@ def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event
     rng = np.random.default_rng(1)
     kept = [event for event in events if rng.uniform() > 0.2]
     for settings in ({}, {"order_wait": 0.3}):
-        stage, published, _ = staged(kept, **settings)
-        assert stage.counters["predicted frames"] >= 0
+        _, published, _ = staged(kept, **settings)
         stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.FILTERED]
         assert len(stamps) > 50 and stamps == sorted(stamps)

@@ -51,6 +51,23 @@ def until(condition: object, timeout: float = 10.0) -> bool:
     return True
 
 
+def answers(node: rclpy.node.Node, count: int) -> list[str]:
+    """What the service "ask" says to so many requests at once, of those that it answers in time."""
+    other = rclpy.Context()
+    rclpy.init(context=other, domain_id=node.context.get_domain_id())
+    caller = rclpy.create_node("caller", context=other)
+    executor = SingleThreadedExecutor(context=other)
+    executor.add_node(caller)
+    client = caller.create_client(Trigger, "ask")
+    assert client.wait_for_service(10.0)
+    futures = [client.call_async(Trigger.Request()) for _ in range(count)]
+    end = time.monotonic() + 20.0
+    while not all(future.done() for future in futures) and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.1)
+    rclpy.try_shutdown(context=other)
+    return [future.result().message for future in futures if future.done()]
+
+
 def test_messages_timers_and_services_are_served_while_others_come_and_go(node: rclpy.node.Node) -> None:
     texts: list[str] = []
     later: list[str] = []
@@ -70,17 +87,7 @@ def test_messages_timers_and_services_are_served_while_others_come_and_go(node: 
     assert until(lambda: len(texts) >= 10 and len(later) >= 3)
     assert texts == [str(number + 1) for number in range(len(texts))]
 
-    other = rclpy.Context()
-    rclpy.init(context=other, domain_id=node.context.get_domain_id())
-    caller = rclpy.create_node("caller", context=other)
-    executor = SingleThreadedExecutor(context=other)
-    executor.add_node(caller)
-    client = caller.create_client(Trigger, "ask")
-    assert client.wait_for_service(10.0)
-    future = client.call_async(Trigger.Request())
-    executor.spin_until_future_complete(future, timeout_sec=10.0)
-    assert future.result().message == "here"
-    rclpy.try_shutdown(context=other)
+    assert answers(node, 1) == ["here"]
 
     node.destroy_timer(timer)
     time.sleep(0.1)
@@ -117,19 +124,7 @@ def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> 
     node.create_timer(0.02, lambda: publisher.publish(String(data="more")), clock=STEADY)
     node.create_service(Trigger, "ask", lambda _, response: Trigger.Response(success=True, message="here"))
     spinning = Spinning(node)
-    other = rclpy.Context()
-    rclpy.init(context=other, domain_id=node.context.get_domain_id())
-    caller = rclpy.create_node("caller", context=other)
-    executor = SingleThreadedExecutor(context=other)
-    executor.add_node(caller)
-    client = caller.create_client(Trigger, "ask")
-    assert client.wait_for_service(10.0)
-    futures = [client.call_async(Trigger.Request()) for _ in range(5)]
-    end = time.monotonic() + 20.0
-    while not all(future.done() for future in futures) and time.monotonic() < end:
-        executor.spin_once(timeout_sec=0.1)
-    assert all(future.done() and future.result().message == "here" for future in futures)
-    rclpy.try_shutdown(context=other)
+    assert answers(node, 5) == ["here"] * 5
     rclpy.shutdown()
     spinning.thread.join(10.0)
 
