@@ -8,7 +8,8 @@ default.
 All is measured from outside: frames by the recording and by what the nodes say in ``/diagnostics``, processor time by
 the system's account of each process over the steady part, delays by the capture stamps of what this process receives.
 Delays count from capture, with the time that the sensor took to deliver (``delay`` in the table of sensors), and from
-delivery. A frame that comes after a later one has no output of its own: the filter takes the later ones again with it.
+delivery, and so include how long the filter lets a frame wait for an older one that is due. One that comes after a
+later one even so has no output of its own: the filter takes the later ones again with it.
 
 The bars: no frame that a sensor delivered is lost or refused, and the filter takes less than 30 % of one core. They are
 meant for a machine that does nothing else; the table says what else it did.

@@ -128,7 +128,7 @@ _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and how many it takes to see them lean."""
 _STRAINED = 4.0
 """Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
-with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 5."""
+with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 2 to 5."""
 _MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
