@@ -1,0 +1,700 @@
+"""Marker trajectories as truth: joint centres and arm angles from C3D files with Vicon's Plug-in Gait markers.
+
+Source: Vicon, "Plug-in Gait Reference Guide" (marker placement, joint centres by the chord function, segments, angles);
+Davis, Ounpuu, Tyburski and Gage, Human Movement Science 10 (1991), for the hip. Gaps shorter than 0.2 s are filled by
+splines and the trajectories smoothed by splines under generalised cross-validation (Woltring 1986), as Schlagenhauf
+did (2017, 5.6.3).
+
+Joint centres. From the same markers and measurements, unsmoothed, shoulder, elbow, wrist, hand and hip are Vicon's own
+to below a micrometre. With ``r`` the marker's radius and :func:`chord` the chord function:
+
+- thorax: z from the middle of T10 and STRN to that of C7 and CLAV; x from the middle of C7 and T10 to that of CLAV and
+  STRN, at a right angle to z; y to the left; origin ``r`` behind CLAV.
+- shoulder: chord from the thorax's origin and SHO, downwards at a right angle to x, by shoulder offset + r.
+- elbow: chord from the shoulder and ELB, medially along the normal of the plane of shoulder, ELB and the middle of WRA
+  and WRB, by half the elbow's width + r.
+- wrist: from the middle of WRA and WRB, at a right angle to the wrist bar and to the line to the elbow, towards the
+  palm, by half the wrist's width + r.
+- hand: chord from the wrist and FIN, towards the palm in the plane of wrist, FIN and the middle of WRA and WRB, by half
+  the hand's thickness + r.
+- hips: regression on leg length and pelvis (Davis 1991); without a leg length that of Harrington et al., J. Biomech. 40
+  (2007), on the pelvis alone.
+
+Where they go among the Kinect's joints: Shoulder, Elbow, Wrist, Hand and Hip to the centres; SpineBase to the middle of
+the hips. Approximated, because Plug-in Gait knows no such points: SpineShoulder is the middle of C7 and CLAV, SpineMid
+that of T10 and STRN, Head that of the four head markers. Neck, thumbs, hand tips and legs stay unknown.
+
+Other approximations. A measurement that is not known is estimated: the shoulder lies 12 % of the distance between the
+acromia from its marker and the elbow 40 mm from its own (both as in ``benchmarks/kinect_vs_vicon.py``); the wrist is
+40 mm wide and the hand 30 mm thick, as Vicon supposes before they are measured, and so is an offset of the shoulder of
+50 mm where one acromion is not seen. The splines are cubic, Vicon's quintic.
+
+Where not to trust it. The elbow is set off from ELB at a right angle to the plane of shoulder, ELB and wrist, which is
+along the flexion axis only while the elbow is bent. Of a straight arm in a T-pose, palm down and the markers in their
+places, Plug-in Gait makes a flexion of 27 degrees and an elbow that is off by 64 mm; of a true flexion of 30 degrees 37
+(16 mm), of 60 degrees 63 (7 mm), of 90 degrees 91 (3 mm). What Vicon writes is computed so, too.
+
+Angles. Elbow flexion: between the lines from shoulder to elbow and from elbow to wrist, 0 straight. Shoulder: the
+rotation of the humerus (z from elbow to shoulder, x towards the wrist at a right angle to z, y to the left) against the
+thorax is ``Rx(a) Ry(b) Rz(c)`` about x, then the turned y, then the twice turned z; flexion = -b, and abduction and
+internal rotation = a, -c on the left and -a, c on the right. This is what Vicon writes as ``LShoulderAngles`` (to a few
+ten-thousandths of a degree from Vicon's own segments), although its guide names the order flexion, abduction, rotation.
+All are 0 for a hanging arm with the forearm forward; at a flexion of 90 degrees the other two are undetermined.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import solveh_banded
+from scipy.optimize import minimize_scalar
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, Joint
+
+LONGEST_GAP = 0.2
+"""Seconds from which on a gap is left open (Schlagenhauf 2017, 5.6.3)."""
+
+THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")
+ARM_MARKERS = ("SHO", "ELB", "WRA", "WRB")
+"""Without L and R."""
+MARKERS: tuple[str, ...] = (
+    *("LFHD", "RFHD", "LBHD", "RBHD"),
+    *THORAX_MARKERS,
+    *(side + name for side in "LR" for name in (*ARM_MARKERS, "FIN")),
+    *("LASI", "RASI", "LPSI", "RPSI"),
+)
+"""The markers that are used; SACR stands in for LPSI and RPSI."""
+
+ACROMION_TO_SHOULDER = 0.12
+"""Shoulder centre from the acromion marker, in distances between the acromia."""
+HALF_ELBOW = 0.040
+"""Elbow centre from the middle of its marker, m."""
+SHOULDER_OFFSET, WRIST_WIDTH, HAND_THICKNESS = 0.050, 0.040, 0.030
+"""Vicon's values before they are measured, m."""
+MARKER_DIAMETER = 0.014
+"""Vicon's default, m."""
+
+_SIDE = np.array([1.0, -1.0])
+"""Left and right."""
+_SHOULDERS = (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT)
+_ELBOWS = (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT)
+_WRISTS = (Joint.WRIST_LEFT, Joint.WRIST_RIGHT)
+_HANDS = (Joint.HAND_LEFT, Joint.HAND_RIGHT)
+_HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
+
+_MODELLED: tuple[tuple[tuple[Joint, Joint], str, str], ...] = (
+    (_SHOULDERS, "SJC", "CLO"),
+    (_ELBOWS, "EJC", "HUO"),
+    (_WRISTS, "WJC", "RAO"),
+    (_HIPS, "HJC", "FEP"),
+)
+"""Vicon's joint centres, without L and R: points of that name, or the origin of the segment that begins there."""
+_HAND_END = "HNO"
+"""Vicon's hand centre is half way from the wrist to here."""
+
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
+"""Axis of the file that points up to the cyclic exchange that makes it z."""
+
+_LEAST_TO_SMOOTH = 5
+_SMOOTHEST = 8.0
+_ROUGHEST = -4.0
+"""Decades of the smoothing parameter, in sample intervals cubed."""
+
+_BLOCK = 512
+_BIG_ENDIAN = 86
+"""C3D's number for processors of this kind."""
+
+
+class MarkerError(BodyTrackingError):
+    """A file does not hold the marker trajectories that are needed; the text says what it holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """Of a subject, metres, NaN where unknown. Arrays are (2,): left, right.
+
+    Attributes:
+        shoulder_offset: acromion, without its marker, to the shoulder's centre.
+        elbow_width: between the epicondyles.
+        wrist_width: thickness of the wrist under the bar.
+        hand_thickness: at the knuckles.
+        leg_length: spine of the ilium to the medial malleolus.
+        asis_distance: between the anterior superior spines of the ilium.
+        marker_diameter: of all markers.
+    """
+
+    shoulder_offset: FloatArray
+    elbow_width: FloatArray
+    wrist_width: FloatArray
+    hand_thickness: FloatArray
+    leg_length: FloatArray
+    asis_distance: float
+    marker_diameter: float = MARKER_DIAMETER
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, float]) -> Measurements:
+        """From Vicon's names (``LShoulderOffset`` or ``LeftShoulderOffset`` ...) and millimetres; 0 is unknown."""
+
+        def value(*names: str) -> float:
+            return next((1e-3 * values[name] for name in names if values.get(name, 0.0) > 0.0), np.nan)
+
+        def both(name: str) -> FloatArray:
+            return np.array([value(short + name, long + name) for short, long in (("L", "Left"), ("R", "Right"))])
+
+        diameter = value("MarkerDiameter")
+        return cls(
+            both("ShoulderOffset"),
+            both("ElbowWidth"),
+            both("WristWidth"),
+            both("HandThickness"),
+            both("LegLength"),
+            value("InterAsisDistance"),
+            diameter if diameter > 0.0 else MARKER_DIAMETER,
+        )
+
+    def completed(self, markers: Mapping[str, FloatArray]) -> tuple[Measurements, tuple[str, ...]]:
+        """The same with estimates (module docstring) for what is unknown, and the names of what was estimated.
+
+        Leg lengths are not estimated.
+
+        Args:
+            markers: (n, 3) metres each; all of :data:`MARKERS`, NaN where unknown.
+        """
+
+        def median_distance(a: str, b: str) -> float:
+            distance = np.linalg.norm(markers[a] - markers[b], axis=1)
+            distance = distance[np.isfinite(distance)]
+            return float(np.median(distance)) if distance.size else np.nan
+
+        radius = 0.5 * self.marker_diameter
+        offset = ACROMION_TO_SHOULDER * median_distance("LSHO", "RSHO") - radius
+        estimates = {
+            "shoulder_offset": offset if offset > 0.0 else SHOULDER_OFFSET,
+            "elbow_width": 2.0 * (HALF_ELBOW - radius),
+            "wrist_width": WRIST_WIDTH,
+            "hand_thickness": HAND_THICKNESS,
+            "asis_distance": median_distance("LASI", "RASI"),
+        }
+        used: dict[str, Any] = {
+            name: np.where(np.isnan(getattr(self, name)), estimate, getattr(self, name))
+            for name, estimate in estimates.items()
+        }
+        estimated = tuple(name for name in used if not np.array_equal(used[name], getattr(self, name), equal_nan=True))
+        width = float(used.pop("asis_distance"))
+        return replace(self, **used, asis_distance=width), estimated
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmAngles:
+    """Plug-in Gait's angles of both arms (module docstring), radians, NaN where unknown.
+
+    Attributes:
+        elbow: (n, 2) flexion, left and right.
+        shoulder: (n, 2, 3) flexion, abduction, internal rotation, left and right.
+    """
+
+    elbow: FloatArray
+    shoulder: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A marker that is not seen for so long that nothing is made up for it; ends are stamps of unseen frames, s."""
+
+    marker: str
+    first: float
+    last: float
+
+    def __str__(self) -> str:
+        return f"{self.marker} from {self.first:.2f} s to {self.last:.2f} s"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerTruth:
+    """What the markers of one subject tell.
+
+    Attributes:
+        stamps: (n,) s since the start of the trial, of which the file may be a part.
+        rate: frames per second.
+        positions: (n, 25, 3) metres, z up, in the axes of the marker system; NaN where unknown.
+        thorax: (n, 3, 3) axes of the thorax as columns: forward, left, up.
+        angles: of the arms, from ``positions`` and ``thorax``.
+        missing: the names of :data:`MARKERS` that the file does not hold or that are never seen.
+        gaps: what was left open.
+        measurements: those used.
+        estimated: the names of the measurements that are estimates.
+        vicon_positions: (n, 25, 3) metres, the joint centres that Vicon wrote into the file; NaN where none.
+        vicon_angles: those that Vicon wrote into the file; NaN where none.
+    """
+
+    stamps: FloatArray
+    rate: float
+    positions: FloatArray
+    thorax: FloatArray
+    angles: ArmAngles
+    missing: tuple[str, ...]
+    gaps: tuple[Gap, ...]
+    measurements: Measurements
+    estimated: tuple[str, ...]
+    vicon_positions: FloatArray
+    vicon_angles: ArmAngles
+
+
+def read_plug_in_gait(
+    path: Path | str,
+    *,
+    subject: str | None = None,
+    measurements: Measurements | None = None,
+    smoothing: bool = True,
+) -> MarkerTruth:
+    """Joint centres and arm angles from a C3D file.
+
+    Args:
+        path: of the file.
+        subject: the prefix of the markers' names (``subject:LSHO``); needed where the file holds several subjects.
+        measurements: instead of those in the file, such as :func:`read_measurements` gives.
+        smoothing: of the trajectories; without it, only gaps are filled.
+
+    Raises:
+        MarkerError: no C3D file, one that is cut off, without the markers of the thorax and of an arm, several
+            subjects and none chosen, nothing but gaps, or ezc3d is not installed.
+    """
+    path = Path(path)
+    trial = _read(path, subject)
+    points = trial.points
+    if "SACR" in points:
+        points = {"LPSI": points["SACR"], "RPSI": points["SACR"]} | points
+    missing = tuple(name for name in MARKERS if name not in points or np.isnan(points[name]).all())
+    _require(path, trial, missing)
+    unseen = np.full((trial.frames, 3), np.nan)
+    markers = {name: fill_gaps(points.get(name, unseen), trial.rate) for name in MARKERS}
+    gaps = tuple(
+        Gap(name, float(trial.stamps[first]), float(trial.stamps[end - 1]))
+        for name in MARKERS
+        if name not in missing
+        for first, end in _runs(np.isnan(markers[name][:, 0]))
+    )
+    if smoothing:
+        markers = {name: smooth(each) for name, each in markers.items()}
+    used, estimated = (measurements or Measurements.from_parameters(trial.processing)).completed(markers)
+    positions, thorax = joint_centres(markers, used)
+    if not np.isfinite(positions[:, _WRISTS]).any():
+        raise MarkerError(
+            f"{path}: no arm can be placed in any of {trial.frames} frames"
+            + (f"; markers not seen for {LONGEST_GAP} s or longer: {'; '.join(map(str, gaps))}" if gaps else "")
+        )
+    return MarkerTruth(
+        trial.stamps,
+        trial.rate,
+        positions,
+        thorax,
+        arm_angles(positions, thorax),
+        missing,
+        gaps,
+        used,
+        estimated,
+        *_vicon(trial),
+    )
+
+
+def read_measurements(path: Path | str) -> Measurements:
+    """From the subject file (.vsk) that Vicon keeps beside its recordings.
+
+    Raises:
+        MarkerError: no such file, not XML, or none of the measurements in it.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise MarkerError(f"{path}: {error.strerror or error}") from error
+    except ElementTree.ParseError as error:
+        raise MarkerError(f"{path}: not a subject file of Vicon's (.vsk): {error}") from error
+    values = {}
+    for each in root.iter("StaticParameter"):
+        try:
+            values[each.get("NAME", "")] = float(each.get("VALUE", ""))
+        except ValueError:
+            continue  # a parameter with a formula in place of a value
+    found = Measurements.from_parameters(values)
+    if all(np.isnan(getattr(found, each.name)).all() for each in fields(found) if each.name != "marker_diameter"):
+        raise MarkerError(f"{path}: no measurements among its {len(values)} parameters (LeftElbowWidth, ...)")
+    return found
+
+
+def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, towards: FloatArray) -> FloatArray:
+    """Plug-in Gait's chord function: the joint centre next to a marker.
+
+    It lies ``distance`` from the marker, sees the other joint and the marker under a right angle, and lies in the plane
+    of ``joint``, ``marker`` and ``towards``, on the side of the latter.
+
+    Args:
+        distance: (...) m, marker to centre.
+        joint: (..., 3) centre of the joint at the other end of the segment.
+        marker: (..., 3).
+        towards: (..., 3).
+
+    Returns:
+        (..., 3), NaN where the joint is nearer to the marker than ``distance``.
+    """
+    span = joint - marker
+    length = np.linalg.norm(span, axis=-1, keepdims=True)
+    along = span / length
+    across = _rejected(towards - marker, along)
+    with np.errstate(invalid="ignore"):
+        sine = np.asarray(distance)[..., None] / length
+        centre: FloatArray = marker + sine * length * (sine * along + np.sqrt(1.0 - sine**2) * across)
+    return centre
+
+
+def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> tuple[FloatArray, FloatArray]:
+    """Joint centres as the module's docstring tells.
+
+    Args:
+        markers: (n, 3) metres each; all of :data:`MARKERS`, NaN where unknown.
+        measurements: NaN where unknown; what depends on these is unknown, but for the hips.
+
+    Returns:
+        (n, 25, 3) positions, metres, and (n, 3, 3) axes of the thorax as columns; NaN where unknown.
+    """
+    positions = np.full((len(markers["CLAV"]), N_JOINTS, 3), np.nan)
+    radius = 0.5 * measurements.marker_diameter
+
+    def both(name: str) -> FloatArray:
+        return np.stack([markers["L" + name], markers["R" + name]], axis=1)
+
+    side = _SIDE[:, None]
+    up, down = markers["C7"] + markers["CLAV"], markers["T10"] + markers["STRN"]
+    z = _unit(up - down)
+    x = _rejected(markers["CLAV"] + markers["STRN"] - markers["C7"] - markers["T10"], z)
+    thorax = np.stack([x, np.cross(z, x), z], axis=-1)
+    origin = (markers["CLAV"] - radius * x)[:, None]
+
+    acromion, lateral = both("SHO"), both("ELB")
+    shoulder = chord(
+        measurements.shoulder_offset + radius,
+        origin,
+        acromion,
+        acromion + side * np.cross(acromion - origin, x[:, None]),
+    )
+    bar = both("WRB") - both("WRA")
+    dorsal = 0.5 * (both("WRA") + both("WRB"))
+    elbow = chord(
+        0.5 * measurements.elbow_width + radius,
+        shoulder,
+        lateral,
+        lateral - side * np.cross(shoulder - lateral, dorsal - lateral),
+    )
+    palm = side * _unit(np.cross(bar, dorsal - elbow))
+    wrist = dorsal + (0.5 * measurements.wrist_width + radius)[:, None] * palm
+    finger = both("FIN")
+    hand = chord(0.5 * measurements.hand_thickness + radius, wrist, finger, 2.0 * finger - dorsal)
+    hips = _hips(both("ASI"), both("PSI"), measurements)
+
+    for joints, centres in ((_SHOULDERS, shoulder), (_ELBOWS, elbow), (_WRISTS, wrist), (_HANDS, hand), (_HIPS, hips)):
+        positions[:, joints] = centres
+    positions[:, Joint.SPINE_BASE] = hips.mean(axis=1)
+    positions[:, Joint.SPINE_SHOULDER] = 0.5 * up
+    positions[:, Joint.SPINE_MID] = 0.5 * down
+    positions[:, Joint.HEAD] = 0.5 * (both("FHD") + both("BHD")).mean(axis=1)
+    return positions, thorax
+
+
+def _hips(anterior: FloatArray, posterior: FloatArray, measurements: Measurements) -> FloatArray:
+    """(n, 2, 3) m from the (n, 2, 3) markers of the spines of the ilium."""
+    y = _unit(anterior[:, 0] - anterior[:, 1])
+    middle = anterior.mean(axis=1)
+    x = _rejected(middle - posterior.mean(axis=1), y)
+    axes = np.stack([x, y, np.cross(x, y)], axis=-1)
+    width, leg = measurements.asis_distance, measurements.leg_length
+    if np.isfinite(leg).all():
+        # Davis 1991, in metres, angles in radians
+        c = 0.115 * leg.mean() - 0.0153
+        theta, beta = 0.5, 0.314
+        behind = 0.1288 * leg - 0.04856 + 0.5 * measurements.marker_diameter
+        forward = c * math.cos(theta) * math.sin(beta) - behind * math.cos(beta)
+        upward = -c * math.cos(theta) * math.cos(beta) - behind * math.sin(beta)
+        outward = np.full(2, 0.5 * width - c * math.sin(theta))
+        place = np.broadcast_to(np.stack([forward, _SIDE * outward, upward], axis=-1), (len(x), 2, 3))
+    else:
+        # Harrington 2007
+        depth = np.linalg.norm(middle - posterior.mean(axis=1), axis=-1)[:, None] + 0.0 * _SIDE
+        forward = -0.24 * depth - 0.0099
+        upward = np.full_like(depth, -0.30 * width - 0.0109)
+        outward = np.full_like(depth, 0.33 * width + 0.0073)
+        place = np.stack([forward, _SIDE * outward, upward], axis=-1)
+    hips: FloatArray = middle[:, None] + np.einsum("nij,nsj->nsi", axes, place)
+    return hips
+
+
+def arm_angles(positions: FloatArray, thorax: FloatArray) -> ArmAngles:
+    """Angles of both arms by Plug-in Gait's convention (module docstring).
+
+    Args:
+        positions: (n, 25, 3).
+        thorax: (n, 3, 3) its axes as columns: forward, left, up.
+    """
+    upper = positions[:, _SHOULDERS] - positions[:, _ELBOWS]
+    forearm = positions[:, _WRISTS] - positions[:, _ELBOWS]
+    elbow = np.arctan2(np.linalg.norm(np.cross(upper, forearm), axis=-1), -(upper * forearm).sum(axis=-1))
+    z = _unit(upper)
+    x = _rejected(forearm, z)
+    humerus = np.einsum("nji,nsjk->nsik", thorax, np.stack([x, np.cross(z, x), z], axis=-1))
+    a = np.arctan2(-humerus[..., 1, 2], humerus[..., 2, 2])
+    b = np.arctan2(humerus[..., 0, 2], np.hypot(humerus[..., 0, 0], humerus[..., 0, 1]))
+    c = np.arctan2(-humerus[..., 0, 1], humerus[..., 0, 0])
+    shoulder = np.stack([-b, _SIDE * a, -_SIDE * c], axis=-1)
+    return ArmAngles(elbow, shoulder)
+
+
+def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> FloatArray:
+    """A trajectory with its gaps shorter than ``longest`` filled by cubic splines.
+
+    A spline goes through all that is known between two longer gaps. What precedes the first known sample and follows
+    the last one stays unknown.
+
+    Args:
+        values: (n, 3), NaN where unknown.
+        rate: samples per second.
+        longest: s; a gap of as many missing samples as this holds, or more, is left open.
+    """
+    filled = values.copy()
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    missing = np.diff(known) - 1
+    breaks = np.flatnonzero(missing >= rate * longest - 1e-6) + 1  # 20 frames at 100 Hz are 0.2 s in spite of rounding
+    for each in np.split(known, breaks):
+        if len(each) > 1 and each[-1] - each[0] >= len(each):
+            inside = np.arange(each[0], each[-1] + 1)
+            unknown = np.setdiff1d(inside, each, assume_unique=True)
+            filled[unknown] = CubicSpline(each, values[each])(unknown)
+    return filled
+
+
+def smooth(values: FloatArray) -> FloatArray:
+    """Every stretch of known samples replaced by its smoothing spline under generalised cross-validation.
+
+    The cubic spline minimises the squared residuals plus ``lambda`` times the integral of the squared second
+    derivative. One ``lambda`` serves the coordinates of a stretch together and minimises (Craven and Wahba 1979;
+    Woltring, Adv. Eng. Softw. 8, 1986)::
+
+        GCV = mean squared residual / (1 - trace of the influence matrix / n)^2
+
+    It is the spline of ``scipy.interpolate.make_smoothing_spline``, whose search takes seconds for each coordinate of a
+    minute: here the samples are equidistant, so that the residuals come from one banded system (Reinsch 1967) and the
+    trace from the eigenvalues, known in closed form (within 0.5 % from 20 samples on).
+
+    Args:
+        values: (n, k), equidistant in time, NaN where unknown. Stretches of fewer than 5 samples are left as they are.
+    """
+    smoothed = values.copy()
+    for first, end in _runs(np.isfinite(values.sum(axis=1))):
+        if end - first >= _LEAST_TO_SMOOTH:
+            smoothed[first:end] -= _gcv_residual(values[first:end])
+    return smoothed
+
+
+def _gcv_residual(values: FloatArray) -> FloatArray:
+    """(n, k) what the smoothing spline takes away."""
+    n = len(values)
+    curvature = np.diff(values, 2, axis=0)
+    roughness = np.repeat([[1.0], [-4.0], [6.0]], n - 2, axis=1)  # of Q'Q and R in Reinsch's names
+    spread = np.repeat([[0.0], [1.0 / 6.0], [2.0 / 3.0]], n - 2, axis=1)
+    frequency = (np.arange(1, n - 1) + 0.5) * np.pi / n
+    eigenvalues = 3.0 * (2.0 - 2.0 * np.cos(frequency)) ** 2 / (2.0 + np.cos(frequency))
+
+    def residual(decade: float) -> FloatArray:
+        weight = 10.0**decade
+        solved = solveh_banded(spread + weight * roughness, curvature)
+        taken: FloatArray = weight * np.diff(np.pad(solved, ((2, 2), (0, 0))), 2, axis=0)
+        return taken
+
+    def gcv(decade: float) -> float:
+        trace = 2.0 + (1.0 / (1.0 + 10.0**decade * eigenvalues)).sum()
+        return float((residual(decade) ** 2).mean() / (1.0 - trace / n) ** 2)
+
+    decades = np.linspace(_ROUGHEST, _SMOOTHEST, 25)
+    best = decades[np.argmin([gcv(decade) for decade in decades])]
+    step = decades[1] - decades[0]
+    bounds = (max(best - step, _ROUGHEST), min(best + step, _SMOOTHEST))
+    found = minimize_scalar(gcv, bounds=bounds, method="bounded", options={"xatol": 0.01})
+    return residual(found.x if found.fun < gcv(best) else best)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """One subject of a file: (n, 3) of each point in the file's units and axes, NaN where it is not seen."""
+
+    points: dict[str, FloatArray]
+    rate: float
+    stamps: FloatArray
+    angle_unit: float
+    processing: dict[str, float]
+
+    @property
+    def frames(self) -> int:
+        return len(self.stamps)
+
+
+def _read(path: Path, subject: str | None) -> _Trial:
+    frames = _announced_frames(path)
+    try:
+        ezc3d: Any = importlib.import_module("ezc3d")
+    except ImportError as error:
+        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
+    try:
+        file = ezc3d.c3d(str(path))
+        parameters = file["parameters"]
+        header = file["header"]["points"]
+        data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(1, 2, 0)
+        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0]
+    # what it raises for a damaged file depends on where the damage is
+    except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
+        raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
+
+    def values(group: str, name: str) -> list[Any]:
+        return list(parameters[group][name]["value"]) if group in parameters and name in parameters[group] else []
+
+    def value(group: str, name: str, default: Any) -> Any:
+        return next(iter(values(group, name)), default)
+
+    labels = values("POINT", "LABELS")
+    for number in range(2, 100):  # a parameter holds at most 255 names
+        labels += values("POINT", f"LABELS{number}")
+    labels = [label.strip() for label in labels[: len(data)]]
+    if not labels or not data.shape[1]:
+        raise MarkerError(f"{path}: {len(labels)} points in {data.shape[1]} frames: there are no trajectories in it")
+    if data.shape[1] < frames:
+        raise MarkerError(f"{path}: cut off after {data.shape[1]} of {frames} frames")
+    rate = float(value("POINT", "RATE", header["frame_rate"]))
+    unit, up = value("POINT", "UNITS", "mm").strip(), value("POINT", "Y_SCREEN", "+Z").strip().upper()
+    if not rate > 0.0:
+        raise MarkerError(f"{path}: {rate} frames per second")
+    if unit not in _UNITS:
+        raise MarkerError(f"{path}: unit of length {unit!r}, expected one of {', '.join(_UNITS)}")
+    if up not in _UP_FIRST:
+        raise MarkerError(f"{path}: the axis that points up (POINT:Y_SCREEN) is {up!r}, expected +X, +Y or +Z")
+    seen = np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1) & (residuals >= 0.0)
+    data = np.where(seen[..., None], data, np.nan)
+    chosen = _of_subject(path, labels, subject)
+    angles = set(values("POINT", "ANGLES")) | {label for label in labels if label.endswith("Angles")}
+    points = {
+        name: data[index] if labels[index] in angles else _UNITS[unit] * data[index][:, _UP_FIRST[up]]
+        for name, index in chosen.items()
+    }
+    numbers = {name: value("PROCESSING", name, None) for name in parameters.get("PROCESSING", {}) if name[0] != "_"}
+    return _Trial(
+        points,
+        rate,
+        (int(header["first_frame"]) + np.arange(data.shape[1])) / rate,
+        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
+        {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
+    )
+
+
+def _announced_frames(path: Path) -> int:
+    """Frames by the file's header; also finds what ezc3d does not survive: folders, cut off parameters."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise MarkerError(f"{path}: not a file")
+        with path.open("rb") as stream:
+            head = stream.read(256 * _BLOCK)
+    except OSError as error:
+        raise MarkerError(f"{path}: {error.strerror or error}") from error
+    if not size:
+        raise MarkerError(f"{path}: the file is empty")
+    if size < _BLOCK or head[1] != 0x50 or head[0] < 2:
+        raise MarkerError(f"{path}: not a C3D file ({size} bytes that do not begin as one)")
+    start = (head[0] - 1) * _BLOCK
+    if size < start + 4 or size < start + head[start + 2] * _BLOCK:
+        raise MarkerError(f"{path}: cut off after {size} bytes, before the end of its parameters")
+    order = ">u2" if head[start + 3] == _BIG_ENDIAN else "<u2"
+    first, last = np.frombuffer(head[6:10], dtype=order)
+    return int(last) - int(first) + 1
+
+
+def _of_subject(path: Path, labels: list[str], subject: str | None) -> dict[str, int]:
+    """Names without prefix, and the places of their points."""
+    split = [tuple(label.rpartition(":")[::2]) for label in labels]
+    named = {prefix for prefix, name in split if name in MARKERS}
+    if subject is not None and subject not in named:
+        raise MarkerError(f"{path}: no subject {subject!r}; found {_listed(named)}")
+    if subject is None and len(named) > 1:
+        raise MarkerError(f"{path}: {len(named)} subjects, choose one of {_listed(named)}")
+    if not named:
+        return {name: index for index, (_, name) in enumerate(split)}
+    chosen = subject if subject is not None else next(iter(named))
+    places = {name: index for index, (prefix, name) in enumerate(split) if prefix == chosen}
+    counts = Counter(name for prefix, name in split if prefix == chosen)
+    twice = [name for name in MARKERS if counts[name] > 1]
+    if twice:
+        raise MarkerError(f"{path}: more than one point is called {_listed(twice)}")
+    return places
+
+
+def _require(path: Path, trial: _Trial, missing: tuple[str, ...]) -> None:
+    lacking = [name for name in THORAX_MARKERS if name in missing]
+    arms = [[side + name for name in ARM_MARKERS if side + name in missing] for side in "LR"]
+    if all(arms):
+        lacking += [*arms[0], *arms[1]]
+    if not lacking:
+        return
+    never = [name for name in lacking if name in trial.points]
+    found = [name for name in MARKERS if name not in missing]
+    others = [name for name in trial.points if name not in MARKERS and not name.startswith("*")]
+    text = f"{path}: without the markers {_listed(lacking)}"
+    if never:
+        text += f" ({_listed(never)}: named but never seen)"
+    raise MarkerError(
+        f"{text}; needed are {_listed(THORAX_MARKERS)} and of one side {_listed(ARM_MARKERS)}; found "
+        f"{_listed(found)} of Plug-in Gait's and {len(others)} other points ({_listed(others, 10)})"
+    )
+
+
+def _vicon(trial: _Trial) -> tuple[FloatArray, ArmAngles]:
+    """What Vicon computed itself."""
+    unknown = np.full((trial.frames, 3), np.nan)
+    positions = np.full((trial.frames, N_JOINTS, 3), np.nan)
+    for joints, centre, origin in _MODELLED:
+        for joint, side in zip(joints, "LR", strict=True):
+            positions[:, joint] = trial.points.get(side + centre, trial.points.get(side + origin, unknown))
+    for hand, wrist, side in zip(_HANDS, _WRISTS, "LR", strict=True):
+        positions[:, hand] = 0.5 * (positions[:, wrist] + trial.points.get(side + _HAND_END, unknown))
+    positions[:, Joint.SPINE_BASE] = positions[:, _HIPS].mean(axis=1)
+
+    def angles(name: str) -> FloatArray:
+        return trial.angle_unit * np.stack([trial.points.get(f"{side}{name}Angles", unknown) for side in "LR"], axis=1)
+
+    return positions, ArmAngles(angles("Elbow")[..., 0], angles("Shoulder"))
+
+
+def _runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """(first, end) of every run of true flags; the end is not in it."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
+
+
+def _rejected(vectors: FloatArray, axis: FloatArray) -> FloatArray:
+    """Unit vectors of what is at a right angle to a unit axis."""
+    return _unit(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
+
+
+def _listed(names: Iterable[str], most: int = 100) -> str:
+    listed = [name or "(no prefix)" for name in names]
+    return (", ".join(listed[:most]) + (", ..." if len(listed) > most else "")) or "none"
