@@ -44,8 +44,9 @@ _DIPOLE = 1e-7
 """T m / A: mu0 / (4 pi)."""
 _MICRO = 1e-6
 _STEP = 1e-4
-"""Seconds of the central differences. What moves with 5 Hz is told with an error of 2e-6 of its amplitude, and of 1e-6
-m/s2 by rounding; where the jerk jumps, the acceleration is rounded off over so long."""
+"""Seconds h of the central differences, whose errors are h^2 (w''/6 + w x w'/3) of the angular rate, h^2 a''/12 of the
+acceleration, and 1e-6 m/s2 by rounding: with 35 rad/s at 5 Hz 1e-4 rad/s, with 100 m/s2 at 5 Hz 1e-4 m/s2. Where the
+jerk jumps, the acceleration is rounded off over so long."""
 _AT_ONCE = 8192
 """Instants for which a motion is asked at once: a body model takes a kilobyte for each."""
 _GRID = 0.01
