@@ -531,7 +531,7 @@ def _compose(
 def _two_handed_wave(rng: np.random.Generator | None) -> _Exercise:
     """Upper arms out, forearms up, both swinging in the frontal plane (thesis 4.3.3)."""
     start = _posture(elevation=92.0, plane=10.0, twist=-70.0, elbow=100.0, pronation=10.0)
-    return _Exercise(start, 5, 1.6, _Swing(out=_posture(elevation=18.0, elbow=-60.0)))
+    return _Exercise(start, 5, 1.6, _Swing(out=_posture(elevation=14.0, elbow=-75.0)))
 
 
 def _slow_down(rng: np.random.Generator | None) -> _Exercise:
@@ -544,7 +544,7 @@ def _move_along(rng: np.random.Generator | None) -> _Exercise:
     """The left arm points to the left; the right hand goes round an ellipse (thesis 4.3.4)."""
     start = _posture(elevation_left=86.0, plane_left=8.0, elbow_left=5.0, pronation_left=15.0)
     start += _posture(elevation_right=72.0, plane_right=28.0, twist_right=-30.0, elbow_right=75.0, pronation_right=25.0)
-    out = _posture(plane_right=60.0, twist_right=45.0, elbow_right=15.0, trunk_axial=5.0)
+    out = _posture(plane_right=60.0, twist_right=45.0, elbow_right=15.0, trunk_axial=3.0, plane_left=3.0)
     return _Exercise(start, 5, 1.8, _Swing(out=out, sine=_posture(elevation_right=20.0, elbow_right=-20.0)))
 
 
