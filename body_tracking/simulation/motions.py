@@ -11,19 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.simulation.figure import Pose
+from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import FloatArray
 
 TPOSE_S = 3.0
 """Seconds of T-pose at the beginning."""
 _MOVE_S = 1.0
 _END_S = 1.5
-
-
-def minimum_jerk(share: FloatArray) -> FloatArray:
-    """0 before 0, 1 after 1, minimum-jerk between (Flash and Hogan 1985)."""
-    x = np.clip(share, 0.0, 1.0)
-    result: FloatArray = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    return result
 
 
 def _step(time: FloatArray, start: float, duration: float) -> FloatArray:

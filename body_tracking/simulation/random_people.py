@@ -19,7 +19,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.simulation.motions import minimum_jerk
+from body_tracking.simulation.trajectories import WAVE_BAND, Moves, Waves
 from body_tracking.skeleton import (
     N_JOINTS,
     NANOSECONDS,
@@ -53,9 +53,6 @@ _PEAK_OF_MEAN = 1.875
 _SHORTEST_MOVE = np.radians(90.0)
 """Shortest duration of a move, seconds, times its greatest rate: 0.9 s of the trunk, 0.45 s of an arm."""
 
-_WAVES = 3
-_WAVE_BAND = (0.05, 0.8)
-"""Hertz."""
 _WAVE_SHARE = 0.25
 """Amplitude of the waves as a share of half the range, in its middle; at its ends there are none."""
 _RESTLESSNESS = 0.04
@@ -138,60 +135,6 @@ class RandomPerson:
             side = 1.0 if name.endswith("_left") else -1.0 if name.endswith("_right") else 0.0
             lengths[number] *= factors[kind] * (1.0 + side * apart[kind])
         return cls(stature, lengths)
-
-
-class _Course:
-    """Minimum-jerk moves one after the other, with rests between; always between two of its targets.
-
-    ``half`` (d,) makes radians of its shares, ``rate`` is the greatest of its moves in radians per second.
-    """
-
-    def __init__(self, start: FloatArray, half: FloatArray | float = 1.0, rate: float = 1.0) -> None:
-        self.half, self.rate = half, rate
-        self._begins: list[float] = []
-        self._durations: list[float] = []
-        self._targets = [start]
-
-    @property
-    def target(self) -> FloatArray:
-        """Where it is after the last move."""
-        return self._targets[-1]
-
-    @property
-    def end(self) -> float:
-        """When the last move ends."""
-        return self._begins[-1] + self._durations[-1] if self._begins else -np.inf
-
-    def move(self, begin: float, duration: float, target: FloatArray) -> None:
-        """Append a move; no sooner than the last one ends."""
-        self._begins.append(max(begin, self.end))
-        self._durations.append(duration)
-        self._targets.append(target)
-
-    def at(self, times: FloatArray) -> FloatArray:
-        """(n, d) at (n,) seconds."""
-        result: FloatArray = np.tile(self._targets[0], (len(times), 1))
-        if self._begins:
-            share = minimum_jerk((times[:, None] - np.array(self._begins)) / np.array(self._durations))
-            result += share @ np.diff(np.array(self._targets), axis=0)
-        return result
-
-
-class _Waves:
-    """(d,) sums of sinusoids that stay between -1 and 1."""
-
-    def __init__(self, rng: np.random.Generator, size: int, fastest: float) -> None:
-        low, high = _WAVE_BAND[0], max(fastest, 2.0 * _WAVE_BAND[0])
-        self._rates = 2.0 * np.pi * low * (high / low) ** rng.random((size, _WAVES))
-        self._phases = rng.uniform(0.0, 2.0 * np.pi, (size, _WAVES))
-        amplitudes = rng.uniform(0.2, 1.0, (size, _WAVES))
-        self._amplitudes = amplitudes / amplitudes.sum(axis=1, keepdims=True)
-
-    def at(self, times: FloatArray) -> FloatArray:
-        """(n, d) at (n,) seconds."""
-        waves = np.sin(times[:, None, None] * self._rates + self._phases)
-        result: FloatArray = (self._amplitudes * waves).sum(axis=2)
-        return result
 
 
 def _share(degrees: FloatArray, where: IntArray) -> FloatArray:
@@ -279,16 +222,16 @@ class RandomMotion:
             raise RandomPeopleError(f"a motion of {duration} s")
         low, high = TEMPI
         self.tempo = low * (high / low) ** rng.random() if tempo is None else tempo
-        fastest = _WAVE_BAND[1] * min(self.tempo, 1.0)
-        self._waves = _Waves(rng, len(_NAMES), fastest)
-        self._pelvis = _Waves(rng, 3, fastest)
-        self._sway = _Waves(rng, 6, 0.5)
-        self._trunk = _Course(_draw_trunk(rng), _HALF[_TRUNK], _TRUNK_RATE)
-        self._neck = _Course(_draw_neck(rng), _HALF[_NECK], _NECK_RATE)
+        fastest = WAVE_BAND[1] * min(self.tempo, 1.0)
+        self._waves = Waves(rng, len(_NAMES), fastest)
+        self._pelvis = Waves(rng, 3, fastest)
+        self._sway = Waves(rng, 6, 0.5)
+        self._trunk = Moves(_draw_trunk(rng), _HALF[_TRUNK], _TRUNK_RATE)
+        self._neck = Moves(_draw_neck(rng), _HALF[_NECK], _NECK_RATE)
         left, right = _draw_arm(rng), _draw_arm(rng) * _MIRROR_ARM
-        self._arms = (_Course(left, _HALF[_ARMS[0]], _ARM_RATE), _Course(right, _HALF[_ARMS[1]], _ARM_RATE))
-        self._activity = _Course(np.zeros(1))
-        self._base = _Course(np.array([*self._draw_place(rng), 0.0, rng.uniform(-np.pi, np.pi)]))
+        self._arms = (Moves(left, _HALF[_ARMS[0]], _ARM_RATE), Moves(right, _HALF[_ARMS[1]], _ARM_RATE))
+        self._activity = Moves(np.zeros(1))
+        self._base = Moves(np.array([*self._draw_place(rng), 0.0, rng.uniform(-np.pi, np.pi)]))
         self._choreograph(rng, duration, list(postures), full_turns)
 
     def configuration(self, times: FloatArray) -> FloatArray:
@@ -332,7 +275,7 @@ class RandomMotion:
         radius, direction = 0.6 * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
         return np.array([2.0 + radius * np.cos(direction), radius * np.sin(direction)])
 
-    def _reach(self, course: _Course, begin: float, target: FloatArray, slower: float) -> None:
+    def _reach(self, course: Moves, begin: float, target: FloatArray, slower: float) -> None:
         """A move as fast as the tempo allows, or slower by a factor."""
         way = float(np.abs((target - course.target) * course.half).max())
         course.move(begin, slower * max(_PEAK_OF_MEAN * way, _SHORTEST_MOVE) / (course.rate * self.tempo), target)
@@ -359,7 +302,7 @@ class RandomMotion:
         self._activity.move(begin, ramp, np.ones(1))
         together = rng.random() < 0.35
         left, right = self._arms
-        parts: tuple[tuple[_Course, float, Callable[[np.random.Generator], FloatArray]], ...] = (
+        parts: tuple[tuple[Moves, float, Callable[[np.random.Generator], FloatArray]], ...] = (
             (self._trunk, 0.7, _draw_trunk),
             (self._neck, 0.6, _draw_neck),
             (left, 0.85, _draw_arm),

@@ -1,0 +1,109 @@
+"""What of a body a sensor cannot see because the body itself stands before it: rays against capsules of flesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, IntArray
+
+
+class OcclusionError(BodyTrackingError):
+    """Capsules that are no body."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsules:
+    """The flesh of a body: a capsule round each line between two joints, a ball where both are the same.
+
+    Attributes:
+        starts: (k,) :class:`~body_tracking.skeleton.Joint` indices.
+        ends: (k,) the same.
+        radii: (k,) metres, greater than zero.
+
+    Raises:
+        OcclusionError: shapes that differ, indices that are no joint's, or a radius that is not greater than zero.
+    """
+
+    starts: IntArray
+    ends: IntArray
+    radii: FloatArray
+
+    def __post_init__(self) -> None:
+        shapes = self.starts.shape, self.ends.shape, self.radii.shape
+        if len(shapes[0]) != 1 or len(set(shapes)) > 1:
+            raise OcclusionError(f"capsules: starts, ends and radii of shapes {shapes}, expected (k,) each")
+        for name, joints in (("starts", self.starts), ("ends", self.ends)):
+            if ((joints < 0) | (joints >= N_JOINTS)).any():
+                raise OcclusionError(f"capsules {name}: {joints.tolist()}, expected joints 0 to {N_JOINTS - 1}")
+        if not (np.isfinite(self.radii) & (self.radii > 0.0)).all():
+            raise OcclusionError(f"capsule radii: {self.radii.tolist()}, expected metres greater than zero")
+
+
+def cover(sight: FloatArray, capsules: Capsules) -> FloatArray:
+    """How deep each joint lies behind the body.
+
+    A joint is looked for where the skin over it faces the sensor: as far before its centre as the widest capsule that
+    ends in it reaches. The line of sight to there passes the axis of a capsule at a distance d; the joint is covered
+    by 1 - d / radius. A capsule never covers the joints it ends in, nor one that lies within half its radius of its
+    axis, as the joints of the spine do; from there to its surface its cover grows to the whole.
+
+    Args:
+        sight: (n, 25, 3) metres, the joints in the sensor's optical frame.
+        capsules: the flesh.
+
+    Returns:
+        (n, 25) 0 where the joint is seen, to 1 where its line of sight goes through the middle of another part.
+    """
+    distance = np.linalg.norm(sight, axis=2, keepdims=True)
+    reach = sight * (1.0 - np.minimum(_own_radii(capsules)[:, None] / np.maximum(distance, 1e-9), 1.0))
+    result = np.zeros(sight.shape[:2])
+    joints = np.arange(N_JOINTS)
+    for start, end, radius in zip(capsules.starts, capsules.ends, capsules.radii, strict=True):
+        foreign: BoolArray = (joints != start) & (joints != end)
+        one, other = sight[:, None, start], sight[:, None, end]
+        within = _distance_to_segment(sight[:, foreign], one, other)
+        miss = _distance_of_rays(reach[:, foreign], one, other)
+        share = np.clip(1.0 - miss / radius, 0.0, 1.0) * np.clip(2.0 * within / radius - 1.0, 0.0, 1.0)
+        result[:, foreign] = np.maximum(result[:, foreign], share)
+    return result
+
+
+def _own_radii(capsules: Capsules) -> FloatArray:
+    """(25,) metres: the widest capsule that ends in each joint, 0 where none does."""
+    radii = np.zeros(N_JOINTS)
+    np.maximum.at(radii, capsules.starts, capsules.radii)
+    np.maximum.at(radii, capsules.ends, capsules.radii)
+    return radii
+
+
+def _distance_to_segment(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    """(..., 3) points to their (...) distances from the segment."""
+    axis = end - start
+    square = np.maximum((axis * axis).sum(axis=-1), 1e-12)
+    along = np.clip(((points - start) * axis).sum(axis=-1) / square, 0.0, 1.0)
+    result: FloatArray = np.linalg.norm(points - start - along[..., None] * axis, axis=-1)
+    return result
+
+
+def _distance_of_rays(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    """The (...) least distances between the lines of sight from the origin to (..., 3) points and the segment.
+
+    Closest points of two segments as Ericson 2005, Real-Time Collision Detection, 5.1.9, with s along the ray and t
+    along the segment.
+    """
+    axis = end - start
+    a = np.maximum((points * points).sum(axis=-1), 1e-12)
+    e = np.maximum((axis * axis).sum(axis=-1), 1e-12)
+    b = (points * axis).sum(axis=-1)
+    c = -(points * start).sum(axis=-1)
+    f = -(axis * start).sum(axis=-1)
+    determinant = a * e - b * b
+    parallel = determinant <= 1e-9 * a * e
+    s = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, determinant), 0.0, 1.0))
+    t = np.clip((b * s + f) / e, 0.0, 1.0)
+    s = np.clip((b * t - c) / a, 0.0, 1.0)
+    result: FloatArray = np.linalg.norm(s[..., None] * points - start - t[..., None] * axis, axis=-1)
+    return result
