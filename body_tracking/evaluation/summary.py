@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking import graph
+from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import JOINT_STATE, POINT_CLOUD, MessageError, cloud_to_skeletons, to_nanoseconds
 from body_tracking.recording.rosbag2 import BagReader, deserialize
@@ -192,7 +193,7 @@ def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
     skeletons: dict[int, Skeleton] = {}
     for raw in bag.messages([topic]):
         try:
-            skeleton = cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0]
+            skeleton = (decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr)))[0]
         except MessageError:
             continue  # a damaged frame is not shown
         skeletons[skeleton.stamp_ns] = skeleton
