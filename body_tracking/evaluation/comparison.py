@@ -540,15 +540,23 @@ def _compare(
 
 def _positional(found: Trajectory, curve: Curve) -> AngleComparison:
     """The angles of both skeletons at the estimate's own instants."""
-    mine, stddev = _angles(found.positions, found.covariances)
+    mine, stddev = skeleton_angles(found.positions, found.covariances)
     positions = curve.at(found.times)
-    true, shown = _angles(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
+    true, shown = skeleton_angles(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
     true = np.where(np.isfinite(shown), true, np.nan)
     return AngleComparison(ANGLE_NAMES, found.times, mine, true, stddev, angle_errors(mine, true, stddev))
 
 
-def _angles(positions: FloatArray, covariances: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """(n, 13) radians and their standard deviations, of skeletons (n, 25, 3)."""
+def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """The angles of ``kinematics.positional`` over time.
+
+    Args:
+        positions: (n, 25, 3) metres, z up, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres; None where none are stated.
+
+    Returns:
+        (n, 13) radians, NaN where unknown, and their standard deviations, infinite where unknown.
+    """
     angles = [
         positional_angles(
             Skeleton(0, "", each, _TRACKED, covariances=None if covariances is None else covariances[number])
