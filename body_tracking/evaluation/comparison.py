@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +40,16 @@ from body_tracking.evaluation.summary import (
     read_joint_states,
     read_skeletons,
 )
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
+from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages import (
     POINT_CLOUD,
     TIME_REFERENCE,
     TRANSFORM,
+    coordinates_to_configuration,
     time_reference_to_clock,
     transform_to_pose,
 )
@@ -63,11 +68,14 @@ from body_tracking.skeleton import (
 
 TRUE_CALIBRATION = "/ground_truth/calibration"
 TRUE_CLOCK = "/ground_truth/calibration/clock"
+TRUE_COORDINATES = "/ground_truth/model_state"
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
 """A true angle that would not stand out of 10 mm of doubt in every joint, as the plane of a hanging arm, counts not."""
+_EXACT, _AMPLIFIED = 1e-6, 10.0
+"""Radians: so well known is the body model's true pose; an angle that makes more than ten times of it counts not."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
 
 
@@ -120,6 +128,7 @@ class Recorded:
         covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
         angles: by name; None where there are none.
         sensors: calibration by sensor.
+        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
     """
 
     source: Path
@@ -130,6 +139,7 @@ class Recorded:
     covariances: FloatArray | None = None
     angles: AngleSeries | None = None
     sensors: Mapping[str, SensorClaims] = field(default_factory=dict)
+    coordinates: AngleSeries | None = None
 
     @property
     def joints(self) -> BoolArray:
@@ -277,7 +287,8 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         skeletons = _skeletons(bag, TRUE_SKELETON, "; the truth is a bag from a simulation or what replay made of it")
         ids = (body,) if body is not None else bodies(bag)
         angles = read_joint_states(bag, TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
-        return _recorded(path, TRUE_SKELETON, skeletons, angles, _sensors(bag, TRUE_CALIBRATION, TRUE_CLOCK))
+        made = _recorded(path, TRUE_SKELETON, skeletons, angles, _sensors(bag, TRUE_CALIBRATION, TRUE_CLOCK))
+        return replace(made, coordinates=read_joint_states(bag, TRUE_COORDINATES, ""))
 
 
 def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
@@ -406,9 +417,13 @@ def evaluate(
         if p.own_clock:
             raise EvaluationError(f"{estimate.source} and {truth.source}: {error}") from error
         notes.append(f"not aligned: {error}")
+    true_angles = _true_angles(estimate.angles, truth)
+    mine = estimate.angles
+    if mine is not None and true_angles is not None and mine.names != true_angles.names:
+        notes.append("estimate and truth have different sets of angles: one name may mean two things")
     comparisons = []
     for number, (name, alignment) in enumerate(alignments.items()):
-        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, p))
+        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, true_angles, p))
         done(0.3 + 0.7 * (number + 1) / len(alignments))
     last = comparisons[-1]
     moved = last.alignment.apply(whole)
@@ -502,6 +517,7 @@ def _compare(
     curve: Curve,
     estimate: Recorded,
     truth: Recorded,
+    true_angles: AngleSeries | None,
     p: EvaluationParameters,
 ) -> Comparison:
     moved = alignment.apply(whole)
@@ -521,9 +537,11 @@ def _compare(
             f"{estimate.source} knows {known(own.positions).mean():.0%} of the positions there, "
             f"{truth.source} {known(curve.at(own.times)).mean():.0%}"
         )
-    # From the first estimate on every frame of the truth counts, also those that the estimate has left out.
+    # From the first estimate on every frame of the truth counts, also those that the estimate has left out; but to its
+    # end only where the truth was recorded apart from it.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
-    counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | (all_times > last + p.max_gap))]
+    lost = (all_times > last + p.max_gap) & (not p.own_clock)
+    counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
     off = off_track(moved.at(counted, p.max_gap).positions, curve.at(counted), p.beyond)
     return Comparison(
         name,
@@ -534,7 +552,7 @@ def _compare(
         errors,
         np.where(estimate.joints, off, np.nan),
         _positional(own, curve),
-        _named(estimate, truth, whole, moved, p),
+        _named(estimate, true_angles, whole, moved, int(truth.stamps_ns[0]), p),
     )
 
 
@@ -566,21 +584,50 @@ def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None
     return np.stack([each.position for each in angles]), np.stack([each.position_stddev for each in angles])
 
 
+def _true_angles(mine: AngleSeries | None, truth: Recorded) -> AngleSeries | None:
+    """The true angles in the convention of the estimate's where the truth has the model's coordinates, or its own."""
+    if mine is None or truth.coordinates is None:
+        return truth.angles
+    model = UpperBody()
+    of_names = {convention(name, model).names: name for name in CONVENTIONS}
+    if mine.names not in of_names or truth.coordinates.names != model.coordinate_names:
+        return truth.angles
+    exact = _EXACT**2 * np.eye(2 * model.nv)
+    lengths = model.default_lengths()  # no angle depends on them
+    rates = np.zeros(model.nv)
+    series: list[JointAngles] = []
+    for stamp_ns, tangent in zip(truth.coordinates.stamps_ns, truth.coordinates.position, strict=True):
+        q, _ = coordinates_to_configuration(tangent, rates, model)
+        estimate = ModelEstimate(int(stamp_ns), truth.frame_id, 0, q, rates, exact, lengths, np.zeros_like(lengths))
+        series.append(angles_of(estimate, model, of_names[mine.names], series[-1] if series else None))
+    stddev = np.stack([each.position_stddev for each in series])
+    return AngleSeries(
+        truth.coordinates.stamps_ns,
+        mine.names,
+        np.stack([each.position for each in series]),
+        np.where(stddev > _AMPLIFIED * _EXACT, np.inf, stddev),
+    )
+
+
 def _named(
-    estimate: Recorded, truth: Recorded, whole: Trajectory, moved: Trajectory, p: EvaluationParameters
+    estimate: Recorded,
+    theirs: AngleSeries | None,
+    whole: Trajectory,
+    moved: Trajectory,
+    zero_ns: int,
+    p: EvaluationParameters,
 ) -> AngleComparison | None:
     """The angles that have the same name in both; those that change with the frame are not turned with it."""
-    mine, theirs = estimate.angles, truth.angles
+    mine = estimate.angles
     if mine is None or theirs is None:
         return None
     names = tuple(name for name in mine.names if name in theirs.names)
     if not names:
         return None
-    zero_ns = int(truth.stamps_ns[0])
     shift = moved.times[0] - whole.times[0]
     times = (mine.stamps_ns - estimate.stamps_ns[0]) / NANOSECONDS + whole.times[0] + shift
     found, stddev = (values[:, [mine.names.index(name) for name in names]] for values in (mine.known, mine.stddev))
-    position = theirs.position[:, [theirs.names.index(name) for name in names]]
+    position = theirs.known[:, [theirs.names.index(name) for name in names]]
     true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), p.max_gap).at(times)
     return AngleComparison(names, times, found, true, stddev, angle_errors(found, true, stddev))
 

@@ -23,7 +23,11 @@ from body_tracking.evaluation.comparison import (
 )
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.summary import AngleSeries, EvaluationError
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of
+from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import ANGLE_NAMES
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Joint
 
 TWIST = Path(__file__).resolve().parents[2] / "bags" / "tpose_torso_twist"
@@ -136,6 +140,32 @@ def test_angles_are_matched_by_name_and_passed_over_the_cut() -> None:
     assert named is not None and named.names == ("turn",)
     assert named.errors.frames[0] == len(at) - 20
     assert named.errors.offset[0] == pytest.approx(0.01, abs=1e-4) and named.errors.covered[0] == 1.0
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_the_models_true_coordinates_give_the_true_angles_in_the_estimates_convention(name: str) -> None:
+    model = UpperBody()
+    stamps = truth().stamps_ns
+    tangent = np.zeros((len(stamps), model.nv))
+    for coordinate, least, most in (("elbow_flexion_left", 0.3, 1.8), ("shoulder_y_right", 0.1, 0.6)):
+        tangent[:, model.coordinate_names.index(coordinate)] = np.linspace(least, most, len(stamps))
+    zeros = np.zeros_like(tangent)
+    right = replace(truth(), coordinates=AngleSeries(stamps, model.coordinate_names, tangent, zeros))
+    sure = 1e-10 * np.eye(2 * model.nv)
+    lengths = model.default_lengths()
+    said: list[JointAngles] = []
+    for stamp, each in zip(stamps, tangent, strict=True):
+        q = model.integrate(model.neutral(), each)
+        posture = ModelEstimate(int(stamp), "world", 0, q, zeros[0], sure, lengths, 0.0 * lengths)
+        said.append(angles_of(posture, model, name, said[-1] if said else None))
+    position, stddev = (np.stack([getattr(each, part) for each in said]) for part in ("position", "position_stddev"))
+    mine = estimate(angles=AngleSeries(stamps, said[0].names, position + 0.02, stddev))
+    named = evaluate(mine, right).comparisons[0].named
+    assert named is not None and named.names == said[0].names
+    compared = named.errors.frames > 0
+    assert compared.mean() > 0.7
+    assert_allclose(named.errors.offset[compared], 0.02, atol=1e-5)
+    assert_allclose(named.errors.fixed_rmse[compared], 0.0, atol=1e-5)
 
 
 def test_a_truth_with_a_clock_and_a_frame_of_its_own_is_found_by_its_movement() -> None:
