@@ -129,6 +129,7 @@ class Recorded:
         angles: by name; None where there are none.
         sensors: calibration by sensor.
         coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
+        warnings: what the file itself lacks, a line each.
     """
 
     source: Path
@@ -140,6 +141,7 @@ class Recorded:
     angles: AngleSeries | None = None
     sensors: Mapping[str, SensorClaims] = field(default_factory=dict)
     coordinates: AngleSeries | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def joints(self) -> BoolArray:
@@ -269,7 +271,7 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
         skeletons = _skeletons(bag, topic, "; make some with replay, or choose one with --topic")
         angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
         sensors = _sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK)
-        return _recorded(path, topic, skeletons, angles, sensors)
+        return replace(_recorded(path, topic, skeletons, angles, sensors), warnings=tuple(bag.warnings))
 
 
 def read_truth(path: Path, body: str | None = None) -> Recorded:
@@ -288,7 +290,8 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         ids = (body,) if body is not None else bodies(bag)
         angles = read_joint_states(bag, TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
         made = _recorded(path, TRUE_SKELETON, skeletons, angles, _sensors(bag, TRUE_CALIBRATION, TRUE_CLOCK))
-        return replace(made, coordinates=read_joint_states(bag, TRUE_COORDINATES, ""))
+        coordinates = read_joint_states(bag, TRUE_COORDINATES, "")
+        return replace(made, coordinates=coordinates, warnings=tuple(bag.warnings))
 
 
 def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
@@ -403,6 +406,8 @@ def evaluate(
         estimate.covariances,
     )
     curve = Curve(truth.seconds(zero_ns), truth.positions, p.max_gap)
+    if np.isnan(curve.span).any():
+        raise EvaluationError(f"{truth.source}: no joint is known twice within {p.max_gap:g} s")
     around = _own_clock_offset(whole, curve, estimate, truth) if p.own_clock else 0.0
     span = _span(whole.times - around, curve.span, estimate, truth)
     done(0.1)
@@ -453,7 +458,7 @@ def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
         raise EvaluationError(
             f"no joint is known in both: {estimate.source} knows {_joints(mine)}, {truth.source} {_joints(theirs)}"
         )
-    notes = []
+    notes = list(dict.fromkeys((*estimate.warnings, *truth.warnings)))
     for only, where in ((mine & ~theirs, estimate), (theirs & ~mine, truth)):
         if only.any():
             notes.append(f"not compared, since only {where.source} knows them: {_joints(only)}")
@@ -523,6 +528,11 @@ def _compare(
     moved = alignment.apply(whole)
     first, last = max(moved.times[0], curve.span[0]), min(moved.times[-1], curve.span[1])
     inside = (moved.times >= first) & (moved.times <= last)
+    if inside.sum() < 2:
+        raise EvaluationError(
+            f"{estimate.source} has {inside.sum()} frames from {first:.3f} to {last:.3f} s after the truth of "
+            f"{truth.source} begins, which is what both cover; at least 2 are needed"
+        )
     own = Trajectory(
         moved.times[inside],
         moved.positions[inside],

@@ -221,5 +221,14 @@ def test_what_cannot_be_compared_is_told_with_what_was_found() -> None:
     mine = replace(truth(), source=Path("mine"), positions=first)
     with pytest.raises(EvaluationError, match=r"do not overlap|no joint is known in both at any time"):
         evaluate(mine, replace(truth(), positions=second))
+    apart = replace(truth(), stamps_ns=truth().stamps_ns[0] + np.arange(250) * NANOSECONDS)
+    with pytest.raises(EvaluationError, match=r"no joint is known twice within 0.15 s"):
+        evaluate(estimate(), apart)
+    ends = estimate()
+    beyond = np.array([truth().stamps_ns[0] - NANOSECONDS, truth().stamps_ns[-1] + NANOSECONDS])
+    with pytest.raises(EvaluationError, match=r"mine has 0 frames from 0.000 to"):
+        evaluate(replace(ends, stamps_ns=beyond, positions=ends.positions[:2], covariances=None), truth())
+    warned = evaluate(estimate(warnings=("mine: cut off at byte 7",)), truth()).notes
+    assert warned == ("mine: cut off at byte 7",)
     frames = evaluate(estimate(frame_id="kinect1_optical_frame"), truth()).notes
     assert any("kinect1_optical_frame" in note for note in frames)
