@@ -30,6 +30,7 @@ from body_tracking.evaluation.metrics import (
     off_track,
     pose_errors,
 )
+from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
 from body_tracking.evaluation.summary import (
     TRUE_ANGLES,
     TRUE_SKELETON,
@@ -294,6 +295,26 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         return replace(made, coordinates=coordinates, warnings=tuple(bag.warnings))
 
 
+def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
+    """Joint centres from markers as the truth; its clock and frame are its own.
+
+    Args:
+        path: a C3D file with the markers of Plug-in Gait.
+        subject: whose; needed where the file holds several.
+        measurements: of the subject, a file of Vicon's; those in the C3D file where None.
+
+    Raises:
+        MarkerError: the files cannot be read, or too few markers are there.
+    """
+    measured = None if measurements is None else read_measurements(measurements)
+    markers = read_plug_in_gait(path, subject=subject, measurements=measured)
+    said = [f"{path}: not seen: {gap}" for gap in markers.gaps]
+    for names, what in ((markers.missing, "has no marker"), (markers.estimated, "estimates the subject's")):
+        if names:
+            said.append(f"{path}: {what} {', '.join(names)}")
+    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(said))
+
+
 def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
     """Joint centres from markers as the truth; its clock and frame are its own.
 
@@ -412,12 +433,17 @@ def evaluate(
     span = _span(whole.times - around, curve.span, estimate, truth)
     done(0.1)
     delay = find_delay(whole, curve, p.window, around)
+    if np.isnan(delay) and p.own_clock:
+        raise EvaluationError(
+            f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
+            "of their frames belong together"
+        )
     if np.isnan(delay):
         notes.append(f"no delay within {p.window:g} s could be found (still, or another clock?): aligned in space only")
     done(0.3)
     alignments = {} if p.own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
     try:
-        alignments[ALIGNED] = align(whole, curve, around if np.isnan(delay) else delay)
+        alignments[ALIGNED] = align(whole, curve, 0.0 if np.isnan(delay) else delay)
     except MetricsError as error:
         if p.own_clock:
             raise EvaluationError(f"{estimate.source} and {truth.source}: {error}") from error

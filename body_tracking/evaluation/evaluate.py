@@ -10,6 +10,7 @@ from body_tracking.evaluation.comparison import (
     Recorded,
     evaluate,
     read_estimate,
+    read_markers,
     read_truth,
 )
 from body_tracking.evaluation.plots import pictures
@@ -20,14 +21,18 @@ from body_tracking.recording.replay import Progress
 _DEFAULTS = EvaluationParameters()
 
 
-def truth_from(path: Path, body: str | None = None) -> tuple[Recorded, bool]:
-    """The truth of a file by its kind, and whether its clock and frame are its own.
+def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
+    """The truth by the kind of its file, and whether its clock and frame are its own.
 
     Raises:
-        BagError: neither a bag nor another file that can be read.
-        EvaluationError: it holds no truth.
+        BagError: neither a C3D file nor a bag that can be read.
+        EvaluationError: the bag holds no truth.
+        MarkerError: nothing can be made of the C3D file.
     """
-    return read_truth(path, body), False
+    path: Path = args.truth or args.estimate
+    if path.suffix.lower() == ".c3d":
+        return read_markers(path, args.subject, args.measurements), True
+    return read_truth(path, args.body), args.own_clock
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -41,14 +46,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("estimate", type=Path, metavar="EST", help="a bag as replay or bag_recorder writes it")
     parser.add_argument(
-        "--truth", type=Path, metavar="TRUTH", help="a bag with /ground_truth/skeleton (default: EST itself)"
+        "--truth",
+        type=Path,
+        metavar="TRUTH",
+        help="a bag with /ground_truth/skeleton (default: EST itself), or a C3D file with Plug-in Gait's markers",
     )
     parser.add_argument("--topic", help="skeletons to judge (default: /filtered/skeleton, else /fused/skeleton)")
     parser.add_argument("--body", metavar="ID", help="whose angles (default: the first in the recording)")
     parser.add_argument(
         "--own-clock",
         action="store_true",
-        help="clock and frame of TRUTH are its own: find the shift by the movement, and compare aligned only",
+        help="clock and frame of TRUTH are its own, as those of a C3D file always are: find the shift by the movement, "
+        "and compare aligned only",
+    )
+    parser.add_argument("--subject", metavar="NAME", help="whose markers, where a C3D file holds several people's")
+    parser.add_argument(
+        "--measurements", type=Path, metavar="FILE", help="the subject's, from Vicon (default: those in the C3D file)"
     )
     parser.add_argument(
         "--off-track",
@@ -71,9 +84,9 @@ def run(args: argparse.Namespace) -> int:
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)
         progress.at(100)
-        truth, own_clock = truth_from(args.truth or args.estimate, args.body)
+        truth, own_clock = truth_from(args)
         progress.at(200)
-        parameters = EvaluationParameters(beyond=1e-3 * args.off_track, own_clock=own_clock or args.own_clock)
+        parameters = EvaluationParameters(beyond=1e-3 * args.off_track, own_clock=own_clock)
         for path in (args.html, args.csv):
             if path is not None:
                 check_writable(path)

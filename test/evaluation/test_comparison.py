@@ -181,12 +181,14 @@ def test_a_truth_with_a_clock_and_a_frame_of_its_own_is_found_by_its_movement() 
     assert_allclose(aligned.alignment.rotation, TURN, atol=5e-3)
 
 
-def test_who_stands_still_is_aligned_in_space_only() -> None:
+def test_who_stands_still_is_aligned_in_space_only_and_needs_a_common_clock() -> None:
     still = np.broadcast_to(truth().positions[0], truth().positions.shape)
     mine = estimate(noise=0.01, positions=np.broadcast_to(still[0], (120, N_JOINTS, 3)))
     result = evaluate(mine, replace(truth(), positions=still))
     assert np.isnan(result.delay) and any("aligned in space only" in note for note in result.notes)
     assert result.comparisons[1].alignment.delay == 0.0
+    with pytest.raises(EvaluationError, match="do not show the same movement"):
+        evaluate(mine, replace(truth(), positions=still), EvaluationParameters(own_clock=True))
 
 
 def test_calibration_is_judged_where_the_person_is() -> None:

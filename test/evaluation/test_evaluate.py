@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from body_tracking.cli import main
-from body_tracking.evaluation.comparison import Evaluation, evaluate, read_estimate, read_truth
+from body_tracking.evaluation.comparison import Evaluation, evaluate, read_estimate, read_markers, read_truth
+from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.report import tables
 from body_tracking.messages import JOINT_STATE, POINT_CLOUD, skeletons_to_cloud
 from body_tracking.recording.replay import replay
@@ -145,6 +147,7 @@ def test_a_joint_is_off_track_by_the_distance_that_is_given(
         (["{wave}", "--body", "bob"], r"no joint angles of 'bob' \(there: body1\)"),
         (["{text}"], r"notes\.txt: not an mcap file"),
         (["{wave}", "--truth", "{text}"], r"notes\.txt: not an mcap file"),
+        (["{wave}", "--truth", "{nowhere}.c3d"], r"nowhere\.c3d"),
         (["{wave}", "--truth", "{nowhere}"], r"nowhere: no such recording"),
         (["{wave}", "--html", "{text}/page.html"], r"notes\.txt"),
         (["{wave}", "--off-track", "-1"], r"--off-track -1: must be more than 0"),
@@ -175,3 +178,33 @@ def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.C
     folder = bag_of(tmp_path / "typed", 0, "/filtered/skeleton", JOINT_STATE)
     assert main(["evaluate", str(folder)]) == 2
     assert f"/filtered/skeleton holds {JOINT_STATE}, expected {POINT_CLOUD}" in capsys.readouterr().err
+
+
+def test_markers_are_a_truth_whose_clock_and_frame_are_their_own(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An estimate that is the markers' own joint centres, elsewhere, at another time, 30 times a second, with noise."""
+    file = shared_data / "plug_in_gait" / "cgm__Test_Files__Movement_trial.c3d"
+    if not file.is_file():
+        pytest.skip(f"{file} is absent")
+    markers = read_markers(file)
+    times = markers.seconds(int(markers.stamps_ns[0]))
+    shown = Curve(times, markers.positions, 0.15).at(np.arange(0.2, times[-1] - 0.1, 1.0 / 30.0))
+    turn = Rotation.from_euler("zyx", [1.0, 0.2, -0.1]).as_matrix()
+    shown = shown @ turn.T + np.random.default_rng(1).normal(0.0, 0.01, shown.shape)
+    with BagWriter(tmp_path / "estimate") as bag:
+        bag.add_topic("/filtered/skeleton", POINT_CLOUD)
+        for number, positions in enumerate(shown):
+            states = np.where(np.isfinite(positions).all(axis=1), 2, 0).astype(np.uint8)
+            skeleton = Skeleton(10**12 + number * 33_333_333, "world", positions, states)
+            bag.write_message("/filtered/skeleton", skeletons_to_cloud((skeleton,), BAG_MESSAGES), number)
+    assert main(["evaluate", str(tmp_path / "estimate"), "--truth", str(file), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said["tables"]) == {"joints_aligned", "angles_aligned", "lengths"} and said["delay_ms"] is None
+    rows = said["tables"]["joints_aligned"]["rows"]
+    # 10 mm of noise along each axis, less by the lines between the frames; every joint within its own scatter
+    assert 10.0 < next(row for name, row in rows.items() if name.startswith("all"))["rms"] < 20.0
+    assert rows["WristLeft"]["jitter"] == pytest.approx(10.0, rel=0.3)
+    assert rows["WristLeft"]["off_track"] == 0.0
+    assert main(["evaluate", str(BAGS / "tpose_wave"), "--topic", "/kinect1/skeleton", "--truth", str(file)]) == 2
+    assert "do not show the same movement" in capsys.readouterr().err
