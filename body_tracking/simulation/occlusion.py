@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, IntArray
+from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, IntArray, Joint
+
+
+def _are(*names: str) -> BoolArray:
+    return np.array([joint.name.removesuffix("_LEFT").removesuffix("_RIGHT") in names for joint in Joint])
+
+
+_SPINE = _are("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK")
+_TRUNK: BoolArray = _SPINE | _are("SHOULDER", "HIP")
 
 
 class OcclusionError(BodyTrackingError):
@@ -42,33 +50,57 @@ class Capsules:
             raise OcclusionError(f"capsule radii: {self.radii.tolist()}, expected metres greater than zero")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Obstruction:
+    """What stands before the joints of a body.
+
+    Attributes:
+        cover: (n, 25) 0 where a joint is seen, to 1 where its line of sight goes through the middle of another part.
+        nearer: (n, 25) metres from a joint towards the sensor to the surface of what covers it most; 0 where none does.
+    """
+
+    cover: FloatArray
+    nearer: FloatArray
+
+
 def cover(sight: FloatArray, capsules: Capsules) -> FloatArray:
+    """(n, 25) how deep each joint lies behind the body; see :func:`obstruction`."""
+    return obstruction(sight, capsules).cover
+
+
+def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
     """How deep each joint lies behind the body.
 
     A joint is looked for where the skin over it faces the sensor: as far before its centre as the widest capsule that
     ends in it reaches. The line of sight to there passes the axis of a capsule at a distance d; the joint is covered
-    by 1 - d / radius. A capsule never covers the joints it ends in, nor one that lies within half its radius of its
-    axis, as the joints of the spine do; from there to its surface its cover grows to the whole.
+    by 1 - d / radius, and where the capsule is thinner than the joint's own, by the square of their ratio less. A
+    capsule never covers the joints it ends in, nor the trunk its spine, nor anything a joint that lies within half the
+    radius of its axis; from there to its surface the cover grows to the whole.
 
     Args:
         sight: (n, 25, 3) metres, the joints in the sensor's optical frame.
         capsules: the flesh.
-
-    Returns:
-        (n, 25) 0 where the joint is seen, to 1 where its line of sight goes through the middle of another part.
     """
     distance = np.linalg.norm(sight, axis=2, keepdims=True)
-    reach = sight * (1.0 - np.minimum(_own_radii(capsules)[:, None] / np.maximum(distance, 1e-9), 1.0))
-    result = np.zeros(sight.shape[:2])
+    own = _own_radii(capsules)
+    reach = sight * (1.0 - np.minimum(own[:, None] / np.maximum(distance, 1e-9), 1.0))
+    covered, nearer = np.zeros(sight.shape[:2]), np.zeros(sight.shape[:2])
     joints = np.arange(N_JOINTS)
     for start, end, radius in zip(capsules.starts, capsules.ends, capsules.radii, strict=True):
         foreign: BoolArray = (joints != start) & (joints != end)
+        if _TRUNK[start] and _TRUNK[end]:
+            foreign &= ~_SPINE
         one, other = sight[:, None, start], sight[:, None, end]
         within = _distance_to_segment(sight[:, foreign], one, other)
-        miss = _distance_of_rays(reach[:, foreign], one, other)
+        miss, along = _nearest_of_rays(reach[:, foreign], one, other)
         share = np.clip(1.0 - miss / radius, 0.0, 1.0) * np.clip(2.0 * within / radius - 1.0, 0.0, 1.0)
-        result[:, foreign] = np.maximum(result[:, foreign], share)
-    return result
+        share *= (radius / np.maximum(own[foreign], radius)) ** 2
+        surface = along - np.sqrt(np.maximum(radius**2 - miss**2, 0.0))
+        more = share > covered[:, foreign]
+        covered[:, foreign] = np.where(more, share, covered[:, foreign])
+        way = np.maximum(distance[:, foreign, 0] - surface, 0.0)
+        nearer[:, foreign] = np.where(more, way, nearer[:, foreign])
+    return Obstruction(covered, nearer)
 
 
 def _own_radii(capsules: Capsules) -> FloatArray:
@@ -88,11 +120,14 @@ def _distance_to_segment(points: FloatArray, start: FloatArray, end: FloatArray)
     return result
 
 
-def _distance_of_rays(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """The (...) least distances between the lines of sight from the origin to (..., 3) points and the segment.
+def _nearest_of_rays(points: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the lines of sight from the origin to (..., 3) points come nearest to the segment.
 
     Closest points of two segments as Ericson 2005, Real-Time Collision Detection, 5.1.9, with s along the ray and t
     along the segment.
+
+    Returns:
+        (...) metres between the two, and (...) metres along the line of sight.
     """
     axis = end - start
     a = np.maximum((points * points).sum(axis=-1), 1e-12)
@@ -105,5 +140,5 @@ def _distance_of_rays(points: FloatArray, start: FloatArray, end: FloatArray) ->
     s = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, determinant), 0.0, 1.0))
     t = np.clip((b * s + f) / e, 0.0, 1.0)
     s = np.clip((b * t - c) / a, 0.0, 1.0)
-    result: FloatArray = np.linalg.norm(s[..., None] * points - start - t[..., None] * axis, axis=-1)
-    return result
+    miss: FloatArray = np.linalg.norm(s[..., None] * points - start - t[..., None] * axis, axis=-1)
+    return miss, s * np.sqrt(a)
