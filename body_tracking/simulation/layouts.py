@@ -1,0 +1,108 @@
+"""Where the sensors stand round a person: the nine layouts of the dual-Kinect thesis, and any others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from body_tracking.calibration.result import SensorPose
+from body_tracking.errors import BodyTrackingError
+from body_tracking.skeleton import FloatArray
+
+DISTANCE: Final = 2.0
+"""Metres from the person to the sensors (thesis 5.2.2)."""
+HEIGHT: Final = 1.0
+"""Metres of the sensors above the floor: at 2 m, feet and raised hands are both in view."""
+_WIDTH: Final = 0.249
+"""Metres: of the case of a Kinect v2. No two stand in one place."""
+_GAMMA: Final = {1: 0.0, 2: 15.0, 3: 30.0, 4: 45.0, 5: 60.0, 6: 75.0}
+_DELTA: Final = {7: 30.0, 8: 60.0, 9: 90.0}
+NUMBERS: Final = (*_GAMMA, *_DELTA)
+"""The layouts of Schlagenhauf 2017, table 5.1."""
+
+
+class LayoutError(BodyTrackingError):
+    """Sensors that cannot stand like this."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Sensors round a person, in ``world``: the first sensor at its origin, looking along x.
+
+    Attributes:
+        poses: of the sensors, the reference first.
+        position: (3,) metres, the point on the floor between the person's feet.
+        yaw: radians about z by which the person is turned, 0 facing along x.
+    """
+
+    poses: tuple[SensorPose, ...]
+    position: FloatArray
+    yaw: float
+
+
+def layout(number: int) -> Layout:
+    """One of the nine layouts of Schlagenhauf 2017, table 5.1, with sensors ``kinect1`` and ``kinect2``.
+
+    In 1 to 6 both stand at the angle gamma from the front, the first to the person's left, the second to the right; in
+    7 to 9 the first stands in front and the second at the angle delta to the person's right. In 1 they stand side by
+    side.
+
+    Raises:
+        LayoutError: no such number.
+    """
+    if number in _GAMMA:
+        gamma = max(np.radians(_GAMMA[number]), np.arcsin(0.5 * _WIDTH / DISTANCE))
+        return around((gamma, -gamma))
+    if number in _DELTA:
+        return around((0.0, -np.radians(_DELTA[number])))
+    raise LayoutError(f"layout {number}: expected {NUMBERS[0]} to {NUMBERS[-1]}")
+
+
+def around(
+    azimuths: Sequence[float],
+    distances: float | Sequence[float] = DISTANCE,
+    heights: float | Sequence[float] = HEIGHT,
+    pitches: float | Sequence[float] = 0.0,
+    names: Sequence[str] | None = None,
+) -> Layout:
+    """Sensors anywhere round a person, each turned towards that person.
+
+    Args:
+        azimuths: radians from the person's front to each sensor, positive to the person's left.
+        distances: metres over the floor, one for all or one each, greater than zero.
+        heights: metres above the floor.
+        pitches: radians by which they look down; the first, which tells where ``world`` is, does so in ``world`` too.
+        names: of the sensors; kinect1, kinect2, ... where none are given.
+
+    Raises:
+        LayoutError: no sensor, numbers that do not belong together or are not finite, a distance that is not greater
+            than zero, or a name that comes twice.
+    """
+    count = len(azimuths)
+    names = tuple(f"kinect{k + 1}" for k in range(count)) if names is None else tuple(names)
+    if count == 0 or len(names) != count or len(set(names)) < count:
+        raise LayoutError(f"layout: {count} azimuth(s) for the sensors {', '.join(names) or '(none)'}")
+    try:
+        azimuth, distance, height, pitch = (
+            np.broadcast_to(np.asarray(values, dtype=np.float64), (count,))
+            for values in (azimuths, distances, heights, pitches)
+        )
+    except ValueError as error:
+        raise LayoutError(f"layout: distances, heights or pitches that are not one or {count} ({error})") from error
+    if not np.isfinite([azimuth, distance, height, pitch]).all() or (distance <= 0.0).any():
+        raise LayoutError(f"layout: distances {distance.tolist()}, expected finite numbers greater than zero")
+    # the first sensor looks along x at the person, who stands so that the sensor is at its azimuth
+    yaw = np.pi - azimuth[0]
+    position = np.array([distance[0], 0.0, -height[0]])
+    directions = yaw + azimuth
+    offsets = np.stack([distance * np.cos(directions), distance * np.sin(directions), height], axis=1)
+    level = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    poses = []
+    for name, offset, direction, down in zip(names, offsets, directions, pitch, strict=True):
+        turn = Rotation.from_euler("ZY", [direction + np.pi, down]) * level
+        poses.append(SensorPose(name, position + offset, turn.as_quat()))
+    return Layout(tuple(poses), position, float((yaw + np.pi) % (2.0 * np.pi) - np.pi))
