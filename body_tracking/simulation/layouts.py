@@ -15,7 +15,7 @@ from body_tracking.skeleton import FloatArray
 
 DISTANCE: Final = 2.0
 """Metres from the person to the sensors (thesis 5.2.2)."""
-HEIGHT: Final = 1.1
+HEIGHT: Final = 1.0
 """Metres of the sensors above the floor: at 2 m, feet and raised hands are both in view."""
 _WIDTH: Final = 0.249
 """Metres: of the case of a Kinect v2. No two stand in one place."""
