@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -191,6 +191,106 @@ class Written:
     counters: Mapping[str, int]
 
 
+class FilterAndAngles:
+    """The filter and the joint angles, connected by their messages, as in the live graph: what is published is what
+    was sent, in single precision where messages have no more.
+
+    Args:
+        settings: what to run.
+        publish: gets the topic and the content of every message that the two publish.
+
+    Attributes:
+        frames: joint angle messages so far.
+
+    Raises:
+        FilterError: the filter or its parameters make no sense.
+        GraphError: the filter cannot do what it was asked for.
+    """
+
+    def __init__(self, settings: ReplaySettings, publish: Callable[[str, bytes], None]) -> None:
+        role = settings.role()
+        self.frames = 0
+        self._filter = FilterStage(settings.filter_settings(), self._filtered)
+        self._angles = AngleStream(role.convention)
+        self._of_model = role.angles_input == graph.MODEL_INPUT
+        self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in settings.sensors}
+        self._last_ns: dict[str, int] = {}
+        self._model_state = b""
+        self._publish = publish
+        self._body = settings.body
+
+    @property
+    def published(self) -> dict[str, tuple[str, Qos]]:
+        """Topics with their types and QoS."""
+        topics = {
+            graph.FILTERED: (POINT_CLOUD, SENSOR_DATA),
+            graph.joint_states_topic(self._body): (JOINT_STATE, RELIABLE),
+            graph.joint_states_stddev_topic(self._body): (JOINT_STATE, RELIABLE),
+        }
+        if self._filter.models:
+            topics |= {
+                graph.MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
+                graph.MODEL_STATE_STDDEV: (JOINT_STATE, SENSOR_DATA),
+                graph.MODEL_COVARIANCE: (IMAGE, SENSOR_DATA),
+                graph.segments_topic(self._body): (SEGMENTS, RELIABLE),
+                graph.urdf_topic(self._body): (STRING, graph.URDF_QOS),
+            }
+        return topics
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Of the filter."""
+        return self._filter.counters
+
+    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One message of what comes before; others than those it needs are ignored."""
+        if not self._filter.by_sensor:
+            if topic == graph.FUSED:
+                self._filter.on_fused(_decoded(cdr)[0], log_time_ns)
+        elif topic in self._sensors:
+            self._seen(self._sensors[topic], _decoded(cdr), log_time_ns)
+        elif topic == graph.CALIBRATION_CLOCK:
+            self._filter.set_clock(*time_reference_to_clock(deserialize(TIME_REFERENCE, cdr)))
+        elif topic == graph.CALIBRATION:
+            self._filter.set_pose(transform_to_pose(deserialize(TRANSFORM, cdr)))
+
+    def finish(self) -> None:
+        """What still waits for a frame that does not come."""
+        while (deadline_ns := self._filter.deadline_ns) is not None:
+            self._filter.poll(deadline_ns)
+
+    def _seen(self, sensor: str, skeletons: tuple[Skeleton, ...], log_time_ns: int) -> None:
+        stamp = skeletons[0].stamp_ns
+        if stamp < self._last_ns.get(sensor, stamp) - JUMP_BACK_NS:
+            self._filter.sensor_jumped_back(sensor)
+        self._last_ns[sensor] = stamp
+        self._filter.on_sensor(sensor, skeletons, log_time_ns)
+
+    def _filtered(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
+        """What the filter publishes."""
+        self._publish(topic, cdr)
+        if topic == graph.FILTERED and not self._of_model:
+            (arrived,) = _decoded(cdr)
+            self._tell(self._angles.of_skeleton(arrived), arrived.frame_id)
+        elif topic == graph.MODEL_STATE:
+            self._model_state = cdr
+        elif topic == graph.MODEL_COVARIANCE and self._of_model:
+            model = self._angles.model
+            state, covariance = decode_model_state(self._model_state, model), decode_covariance(cdr, model)
+            assert state is not None
+            assert covariance is not None
+            _, frame_id, q, velocity = state
+            estimate = state_estimate(model, stamp_ns, frame_id, q, velocity, covariance[1])
+            self._tell(self._angles.of_estimate(estimate), frame_id)
+
+    def _tell(self, angles: JointAngles | None, frame_id: str) -> None:
+        if angles is not None:
+            states, stddevs = encode_angles(angles, self._body, frame_id)
+            self._publish(graph.joint_states_topic(self._body), states)
+            self._publish(graph.joint_states_stddev_topic(self._body), stddevs)
+            self.frames += 1
+
+
 class Downstream:
     """Writes every message, filters what the filter takes, and turns that to angles.
 
@@ -209,93 +309,35 @@ class Downstream:
     def __init__(
         self, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], *, overwrite: bool
     ) -> None:
-        role = settings.role()
-        self._filter = FilterStage(settings.filter_settings(), self._filtered)
-        self._angles = AngleStream(role.convention)
-        self._of_model = role.angles_input == graph.MODEL_INPUT
-        self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in settings.sensors}
-        self._last_ns: dict[str, int] = {}
-        self._model_state = b""
+        self._rest = FilterAndAngles(settings, self._write)
         self._now_ns = 0
-        self._body = settings.body
-        self._states = graph.joint_states_topic(settings.body)
-        self._stddevs = graph.joint_states_stddev_topic(settings.body)
-        self._frames = 0
         self._writer = BagWriter(out, overwrite=overwrite)
         published = {
             graph.CALIBRATION: (TRANSFORM, LATCHED),
             graph.CALIBRATION_CLOCK: (TIME_REFERENCE, LATCHED),
             graph.FUSED: (POINT_CLOUD, SENSOR_DATA),
-            graph.FILTERED: (POINT_CLOUD, SENSOR_DATA),
-            self._states: (JOINT_STATE, RELIABLE),
-            self._stddevs: (JOINT_STATE, RELIABLE),
+            **self._rest.published,
         }
-        if self._filter.models:
-            published |= {
-                graph.MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
-                graph.MODEL_STATE_STDDEV: (JOINT_STATE, SENSOR_DATA),
-                graph.MODEL_COVARIANCE: (IMAGE, SENSOR_DATA),
-                graph.segments_topic(settings.body): (SEGMENTS, RELIABLE),
-                graph.urdf_topic(settings.body): (STRING, graph.URDF_QOS),
-            }
         for topic, (type_name, qos) in {**topics, **published}.items():
             self._writer.add_topic(topic, type_name, qos)
 
     def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
         """One serialised message."""
         self._writer.write(topic, cdr, log_time_ns)
-        # Through messages, as in the live graph: skeletons travel in single precision.
         self._now_ns = log_time_ns
-        if not self._filter.by_sensor:
-            if topic == graph.FUSED:
-                self._filter.on_fused(_decoded(cdr)[0], log_time_ns)
-        elif topic in self._sensors:
-            self._seen(self._sensors[topic], _decoded(cdr), log_time_ns)
-        elif topic == graph.CALIBRATION_CLOCK:
-            self._filter.set_clock(*time_reference_to_clock(deserialize(TIME_REFERENCE, cdr)))
-        elif topic == graph.CALIBRATION:
-            self._filter.set_pose(transform_to_pose(deserialize(TRANSFORM, cdr)))
+        self._rest.take(topic, cdr, log_time_ns)
 
-    def _seen(self, sensor: str, skeletons: tuple[Skeleton, ...], log_time_ns: int) -> None:
-        stamp = skeletons[0].stamp_ns
-        if stamp < self._last_ns.get(sensor, stamp) - JUMP_BACK_NS:
-            self._filter.sensor_jumped_back(sensor)
-        self._last_ns[sensor] = stamp
-        self._filter.on_sensor(sensor, skeletons, log_time_ns)
-
-    def _filtered(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
-        """What the filter publishes."""
+    def _write(self, topic: str, cdr: bytes) -> None:
         self._writer.write(topic, cdr, self._now_ns)
-        if topic == graph.FILTERED and not self._of_model:
-            (arrived,) = _decoded(cdr)
-            self._publish(self._angles.of_skeleton(arrived), arrived.frame_id)
-        elif topic == graph.MODEL_STATE:
-            self._model_state = cdr
-        elif topic == graph.MODEL_COVARIANCE and self._of_model:
-            model = self._angles.model
-            state, covariance = decode_model_state(self._model_state, model), decode_covariance(cdr, model)
-            assert state is not None
-            assert covariance is not None
-            _, frame_id, q, velocity = state
-            estimate = state_estimate(model, stamp_ns, frame_id, q, velocity, covariance[1])
-            self._publish(self._angles.of_estimate(estimate), frame_id)
-
-    def _publish(self, angles: JointAngles | None, frame_id: str) -> None:
-        if angles is not None:
-            states, stddevs = encode_angles(angles, self._body, frame_id)
-            self._writer.write(self._states, states, self._now_ns)
-            self._writer.write(self._stddevs, stddevs, self._now_ns)
-            self._frames += 1
 
     def finish(self) -> Written:
         """Close the bag; one without angles is removed again."""
-        while (deadline_ns := self._filter.deadline_ns) is not None:
-            self._filter.poll(deadline_ns)
-        if self._frames:
+        self._rest.finish()
+        if self._rest.frames:
             self._writer.close()
         else:
             self._writer.discard()
-        return Written(self._frames, dict(self._filter.counters))
+        return Written(self._rest.frames, dict(self._rest.counters))
 
     def abandon(self) -> None:
         """Remove the unfinished bag."""
