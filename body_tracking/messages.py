@@ -29,6 +29,8 @@ TRANSFORM = "geometry_msgs/msg/TransformStamped"
 TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
 IMAGE = "sensor_msgs/msg/Image"
 SEGMENTS = "sensor_msgs/msg/MultiDOFJointState"
+IMU = "sensor_msgs/msg/Imu"
+MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 STRING = "std_msgs/msg/String"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 CLOCK = "rosgraph_msgs/msg/Clock"
@@ -464,6 +466,60 @@ def segments_to_joint_state(
         ],
         twist=[],
         wrench=[],
+    )
+
+
+# --- inertial sensors
+
+
+def _vector(values: FloatArray, types: MessageTypes) -> Any:
+    x, y, z = (float(value) for value in values)
+    return types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def imu_to_message(
+    stamp_ns: int,
+    frame_id: str,
+    angular_velocity: FloatArray,
+    linear_acceleration: FloatArray,
+    quat_xyzw: FloatArray | None,
+    covariances: tuple[FloatArray, FloatArray, FloatArray],
+    types: MessageTypes,
+) -> Any:
+    """``sensor_msgs/Imu`` as REP-145 has it.
+
+    Args:
+        stamp_ns: capture time in the sensor's clock, nanoseconds.
+        frame_id: of the sensor.
+        angular_velocity: (3,) rad/s.
+        linear_acceleration: (3,) m/s2, specific force.
+        quat_xyzw: (4,) of the sensor in a world that is east, north, up; None for raw data.
+        covariances: (3, 3) each, of orientation, angular velocity and acceleration; -1 in [0, 0] where unknown.
+        types: the family of message classes to build.
+    """
+    x, y, z, w = (0.0, 0.0, 0.0, 1.0) if quat_xyzw is None else (float(value) for value in quat_xyzw)
+    orientation, angular, linear = (types.floats(covariance.reshape(-1)) for covariance in covariances)
+    return types.make(
+        IMU,
+        header=to_header(stamp_ns, frame_id, types),
+        orientation=types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        orientation_covariance=orientation,
+        angular_velocity=_vector(angular_velocity, types),
+        angular_velocity_covariance=angular,
+        linear_acceleration=_vector(linear_acceleration, types),
+        linear_acceleration_covariance=linear,
+    )
+
+
+def magnetic_field_to_message(
+    stamp_ns: int, frame_id: str, field: FloatArray, covariance: FloatArray, types: MessageTypes
+) -> Any:
+    """``sensor_msgs/MagneticField`` of (3,) tesla with a covariance (3, 3); the rest as :func:`imu_to_message`."""
+    return types.make(
+        MAGNETIC_FIELD,
+        header=to_header(stamp_ns, frame_id, types),
+        magnetic_field=_vector(field, types),
+        magnetic_field_covariance=types.floats(covariance.reshape(-1)),
     )
 
 

@@ -1,191 +1,285 @@
-"""``body_tracking make-bags``: the recordings in ``bags/``, two sensors and the truth.
+"""Simulated recordings as bags: ``body_tracking simulate``, and ``make-bags`` for those that are shipped.
 
-The sensors stand as in the thesis's configuration 4 (figure 5.3): each 45 degrees off the person's front, 2 m away. The
-first is the reference: level, 0.9 m above the floor, the origin of ``world`` and of its time.
+Topics of a simulated bag: ``/<sensor>/skeleton`` of each camera; of each inertial sensor ``/<imu>/imu/data`` (oriented)
+or ``/<imu>/imu/data_raw``, and ``/<imu>/imu/mag`` (names of REP-145); ``/ground_truth/skeleton`` with everybody's joints,
+and of the first person ``/ground_truth/model_state`` (as ``/filtered/model_state``) and ``/ground_truth/joint_states`` (the
+angles of ``kinematics.positional``), stamped in the reference clock; ``/ground_truth/calibration``, a pose per camera,
+and ``/ground_truth/calibration/clock``, the other cameras' clocks once a second.
 """
 
 from __future__ import annotations
 
 import argparse
-import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
-from body_tracking.errors import BodyTrackingError
+from body_tracking import graph
+from body_tracking.cdr import encode_angles, encode_model_state, encode_skeletons
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages import (
+    IMU,
     JOINT_STATE,
+    MAGNETIC_FIELD,
     POINT_CLOUD,
     TIME_REFERENCE,
     TRANSFORM,
-    angles_to_joint_states,
     clock_to_time_reference,
+    imu_to_message,
+    magnetic_field_to_message,
     pose_to_transform,
-    skeletons_to_cloud,
 )
-from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
-from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.figure import Figure
-from body_tracking.simulation.motions import MOTIONS, Motion
-from body_tracking.simulation.sensors import SimulatedSensor
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.recording.replay import Progress
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
+from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.simulation.kinect import KinectErrors, read_errors
+from body_tracking.simulation.layouts import NUMBERS, Layout, around, layout
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.repertoire import MOTIONS
+from body_tracking.simulation.scene import (
+    RECEIVED_FROM_NS,
+    START_NS,
+    WORLD,
+    SceneError,
+    Setup,
+    SimulatedRecording,
+    draw_clock,
+    simulate,
+)
+from body_tracking.skeleton import NANOSECONDS
 
-REFERENCE = "kinect1"
-WORLD = "world"
-BODY = "body1"
+SHIPPED: dict[str, str] = {
+    "tpose_wave": "two_handed_wave",
+    "tpose_slow_down": "slow_down",
+    "tpose_torso_twist": "torso_twist",
+}
+"""The recordings in ``bags/`` and their motions: those of the thesis."""
 SEED = 20170512
-START_NS = 40 * NANOSECONDS
-"""What the reference sensor's clock shows at the start."""
-RECEIVED_FROM_NS = 1_750_000_000 * NANOSECONDS
-"""What the receiver's clock shows at the start."""
-SENSOR_HEIGHT, DISTANCE = 0.9, 2.0
 
-_PERSON = np.array([DISTANCE, 0.0, -SENSOR_HEIGHT])
-_HEADING = np.radians(180.0 + 45.0)
-
-
-class SimulationError(BodyTrackingError):
-    """A motion of this name is not known."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedRecording:
-    """What the sensors said and what was true.
-
-    Attributes:
-        motion: its name.
-        sensors: the true poses and clocks.
-        frames: of all sensors, in the order of receipt.
-        truth: in ``world``, at the reference sensor's captures and in its clock, with velocities.
-    """
-
-    motion: str
-    sensors: tuple[SimulatedSensor, ...]
-    frames: tuple[RecordedFrame, ...]
-    truth: tuple[Skeleton, ...]
-
-
-def layout() -> tuple[SimulatedSensor, SimulatedSensor]:
-    """The two sensors of configuration 4; the second a little higher, not level, 2.7 s behind and 38 ppm fast."""
-    reference = SimulatedSensor(level_pose(REFERENCE), ClockModel(anchor_ns=START_NS))
-    yaw = np.radians(90.0)
-    tilted = Rotation.from_euler("z", yaw) * Rotation.from_quat(
-        level_pose("kinect2", pitch=np.radians(2.5), roll=np.radians(-1.0)).quat_xyzw
-    )
-    place = np.array([DISTANCE, -DISTANCE, 0.06])
-    second = SimulatedSensor(
-        SensorPose("kinect2", place, tilted.as_quat()),
-        ClockModel(offset_ns=-2_718_281_828, drift_ppm=38.0, anchor_ns=START_NS),
-        phase=0.0137,
-    )
-    return reference, second
-
-
-def true_positions(motion: Motion, times: FloatArray) -> FloatArray:
-    """(n, 25, 3) metres in ``world`` at (n,) seconds after the start."""
-    turn = Rotation.from_euler("z", _HEADING).as_matrix()
-    positions: FloatArray = Figure().positions(motion.pose(times)) @ turn.T + _PERSON
-    return positions
-
-
-def simulate(motion: Motion, seed: int = SEED) -> SimulatedRecording:
-    """One recording; the same seed gives the same numbers."""
-    sensors = layout()
-    frames: list[RecordedFrame] = []
-    truth: list[Skeleton] = []
-    for number, sensor in enumerate(sensors):
-        rng = np.random.default_rng([seed, zlib.crc32(motion.name.encode()), number])
-        times = sensor.capture_times(motion.duration, rng)
-        positions = true_positions(motion, times)
-        frames += sensor.observe(times, positions, START_NS, RECEIVED_FROM_NS, rng)
-        if sensor.pose.sensor == REFERENCE:
-            truth = list(_truth(motion, times, positions))
-    frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
-    return SimulatedRecording(motion.name, sensors, tuple(frames), tuple(truth))
-
-
-def _truth(motion: Motion, times: FloatArray, positions: FloatArray) -> Iterator[Skeleton]:
-    step = 1e-4
-    velocities = (true_positions(motion, times + step) - true_positions(motion, times - step)) / (2.0 * step)
-    tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-    for time, position, velocity in zip(times, positions, velocities, strict=True):
-        stamp_ns = START_NS + round(time * NANOSECONDS)
-        yield Skeleton(stamp_ns, WORLD, position, tracked, velocities=velocity)
+_Message = tuple[int, str, bytes]
+"""Log time, topic, serialised message."""
 
 
 def write_bag(recording: SimulatedRecording, folder: Path, *, overwrite: bool = False) -> None:
-    """Write a recording as a bag.
-
-    Topics: ``/<sensor>/skeleton``; ``/ground_truth/skeleton`` (positions only) and ``/ground_truth/joint_states`` (the
-    angles of ``kinematics.positional``), stamped in the reference clock; the true ``/ground_truth/calibration`` (one
-    pose per sensor) and ``/ground_truth/calibration/clock`` (the second sensor's clock once a second).
+    """Write a recording as a bag, showing how far it is.
 
     Raises:
         BagError: the folder exists and is not to be overwritten, or cannot be written.
     """
-    with BagWriter(folder, overwrite=overwrite, flush_interval_s=float("inf")) as bag:
-        for sensor in recording.sensors:
-            bag.add_topic(f"/{sensor.pose.sensor}/skeleton", POINT_CLOUD, SENSOR_DATA)
-        bag.add_topic("/ground_truth/skeleton", POINT_CLOUD, SENSOR_DATA)
-        bag.add_topic("/ground_truth/joint_states", JOINT_STATE, RELIABLE)
-        bag.add_topic("/ground_truth/calibration", TRANSFORM, LATCHED)
-        bag.add_topic("/ground_truth/calibration/clock", TIME_REFERENCE, LATCHED)
-        for log_ns, topic, message in sorted(_messages(recording), key=lambda item: item[:2]):
-            bag.write_message(topic, message, log_ns)
-
-
-def _messages(recording: SimulatedRecording) -> Iterator[tuple[int, str, object]]:
-    """(log time, topic, message) of everything, in no order."""
+    topics: dict[str, tuple[str, Qos]] = {}
     for sensor in recording.sensors:
-        yield RECEIVED_FROM_NS, "/ground_truth/calibration", pose_to_transform(sensor.pose, WORLD, BAG_MESSAGES)
+        topics[graph.skeleton_topic(sensor.pose.sensor)] = POINT_CLOUD, SENSOR_DATA
+    for imu, _ in recording.imus:
+        topics[_imu_topic(imu)] = IMU, SENSOR_DATA
+        if imu.magnetometer:
+            topics[_mag_topic(imu)] = MAGNETIC_FIELD, SENSOR_DATA
+    topics[graph.TRUE_SKELETON] = POINT_CLOUD, SENSOR_DATA
+    topics[graph.TRUE_MODEL_STATE] = JOINT_STATE, SENSOR_DATA
+    topics[graph.TRUE_ANGLES] = JOINT_STATE, RELIABLE
+    topics[graph.TRUE_CALIBRATION] = TRANSFORM, LATCHED
+    topics[graph.TRUE_CLOCK] = TIME_REFERENCE, LATCHED
+    with BagWriter(folder, overwrite=overwrite, flush_interval_s=float("inf")) as bag:
+        for topic, (type_name, qos) in topics.items():
+            bag.add_topic(topic, type_name, qos)
+        progress = Progress(RECEIVED_FROM_NS, RECEIVED_FROM_NS + round(recording.duration * NANOSECONDS))
+        for log_ns, topic, cdr in sorted(_messages(recording), key=lambda item: item[:2]):
+            bag.write(topic, cdr, log_ns)
+            progress.at(log_ns)
+        progress.end()
+
+
+def _imu_topic(imu: SimulatedImu) -> str:
+    return f"/{imu.name}/imu/{'data' if imu.oriented else 'data_raw'}"
+
+
+def _mag_topic(imu: SimulatedImu) -> str:
+    return f"/{imu.name}/imu/mag"
+
+
+def _messages(recording: SimulatedRecording) -> Iterator[_Message]:
+    """Everything, in no order."""
+    for sensor in recording.sensors:
+        transform = pose_to_transform(sensor.pose, WORLD, BAG_MESSAGES)
+        yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(transform)
     for frame in recording.frames:
-        cloud = skeletons_to_cloud(frame.skeletons, BAG_MESSAGES)
-        yield frame.received_ns, f"/{frame.sensor}/skeleton", cloud
-    second = -1
-    for truth in recording.truth:
-        log_ns = RECEIVED_FROM_NS + truth.stamp_ns - START_NS
-        bare = Skeleton(truth.stamp_ns, truth.frame_id, truth.positions, truth.states)
-        yield log_ns, "/ground_truth/skeleton", skeletons_to_cloud((bare,), BAG_MESSAGES)
-        angles, _ = angles_to_joint_states(positional_angles(truth), BODY, WORLD, BAG_MESSAGES)
-        yield log_ns, "/ground_truth/joint_states", angles
-        if truth.stamp_ns // NANOSECONDS > second:
-            second = truth.stamp_ns // NANOSECONDS
-            for sensor in recording.sensors:
-                if sensor.pose.sensor != REFERENCE:
-                    clock = clock_to_time_reference(sensor.pose.sensor, sensor.clock, truth.stamp_ns, BAG_MESSAGES)
-                    yield log_ns, "/ground_truth/calibration/clock", clock
+        yield frame.received_ns, graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons)
+    for imu, samples in recording.imus:
+        yield from _felt(imu, samples)
+    yield from _truth(recording)
+
+
+def _felt(imu: SimulatedImu, samples: ImuSamples) -> Iterator[_Message]:
+    """What an inertial sensor said."""
+    for k, (stamp_ns, received_ns) in enumerate(
+        zip(samples.stamps_ns.tolist(), samples.received_ns.tolist(), strict=True)
+    ):
+        message = imu_to_message(
+            stamp_ns,
+            f"{imu.name}_link",
+            samples.angular_velocity[k],
+            samples.linear_acceleration[k],
+            None if samples.orientation is None else samples.orientation[k],
+            (
+                samples.orientation_covariance[k],
+                samples.angular_velocity_covariance,
+                samples.linear_acceleration_covariance,
+            ),
+            BAG_MESSAGES,
+        )
+        yield received_ns, _imu_topic(imu), serialize(message)
+        if samples.magnetic_field is not None:
+            field = magnetic_field_to_message(
+                stamp_ns, f"{imu.name}_link", samples.magnetic_field[k], samples.magnetic_field_covariance, BAG_MESSAGES
+            )
+            yield received_ns, _mag_topic(imu), serialize(field)
+
+
+def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
+    first, second = recording.truths[0], -1
+    for k, stamp_ns in enumerate(first.stamps_ns.tolist()):
+        log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS
+        skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
+        # positions only, as a sensor's
+        yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
+        yield log_ns, graph.TRUE_MODEL_STATE, encode_model_state(first.estimate(k), MODEL)[0]
+        yield log_ns, graph.TRUE_ANGLES, encode_angles(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD)[0]
+        if stamp_ns // NANOSECONDS > second:
+            second = stamp_ns // NANOSECONDS
+            for sensor in recording.sensors[1:]:
+                clock = clock_to_time_reference(sensor.pose.sensor, sensor.clock, stamp_ns, BAG_MESSAGES)
+                yield log_ns, graph.TRUE_CLOCK, serialize(clock)
+
+
+# --- the commands
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """``body_tracking make-bags``."""
-    parser = subparsers.add_parser(
+    """``body_tracking simulate`` and ``body_tracking make-bags``."""
+    command = subparsers.add_parser(
+        "simulate",
+        help="people who move before simulated sensors, as a bag with the truth",
+        description="Simulates people in front of Kinect v2 sensors that err like real ones, with inertial sensors on "
+        "them if asked, and writes what the sensors say and what is true into a bag. The same arguments give the same "
+        "numbers.",
+        epilog=f"motions: {', '.join(MOTIONS)}. segments: {', '.join(MODEL.segment_names)}.",
+    )
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="BAG", help="the bag to be made")
+    command.add_argument(
+        "--motion",
+        choices=sorted(MOTIONS),
+        default="torso_twist",
+        metavar="NAME",
+        help="what they do (default: %(default)s)",
+    )
+    where = command.add_mutually_exclusive_group()
+    where.add_argument(
+        "--layout",
+        type=int,
+        choices=NUMBERS,
+        default=4,
+        metavar="N",
+        help="two sensors as in table 5.1 of Schlagenhauf 2017, 1 to 9 (default: 4, each 45 degrees from the front)",
+    )
+    where.add_argument(
+        "--around",
+        metavar="A,B,...",
+        help="sensors at these angles from the person's front instead, degrees, positive to the person's left: "
+        "--around=45,-45,135,-135",
+    )
+    command.add_argument("--people", type=int, default=1, metavar="N", help="side by side (default: 1)")
+    command.add_argument(
+        "--imus", default="", metavar="SEGMENT,...", help="segments of the first person with an inertial sensor"
+    )
+    command.add_argument("--raw", action="store_true", help="inertial sensors do not tell their orientation")
+    command.add_argument("--imu-rate", type=float, default=100.0, metavar="HZ", help="of each (default: 100)")
+    command.add_argument("--no-magnetometer", action="store_true", help="inertial sensors have none")
+    command.add_argument(
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="of the recording, by more repetitions (default: what the motion takes)",
+    )
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all chance (default: 0)")
+    command.add_argument("--dark", action="store_true", help="without light a sensor takes 15 frames a second")
+    command.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="errors of the sensors, as in config/simulator.yaml (default: these)",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace BAG if it is there")
+    command.set_defaults(run=run)
+
+    shipped = subparsers.add_parser(
         "make-bags",
         help="make the simulated recordings that are shipped in bags/",
         description="Simulate two Kinect v2 sensors and a person in three motions, and write a bag of each.",
     )
-    parser.add_argument(
+    shipped.add_argument(
         "-o", "--output", type=Path, default=Path("bags"), metavar="FOLDER", help="where the bags go (default: bags)"
     )
-    parser.add_argument("--seed", type=int, default=SEED, help=f"of all chance (default: {SEED})")
-    parser.add_argument("--motion", choices=[motion.name for motion in MOTIONS], help="only this one")
-    parser.set_defaults(run=run)
+    shipped.add_argument("--seed", type=int, default=SEED, help=f"of all chance (default: {SEED})")
+    shipped.add_argument("--motion", choices=sorted(SHIPPED), help="only this one")
+    shipped.set_defaults(run=make_bags)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the bags, replacing those that are there."""
-    if args.seed < 0:
-        raise SimulationError(f"--seed {args.seed}: must not be negative")
-    for motion in MOTIONS:
-        if args.motion in (None, motion.name):
-            folder = args.output / motion.name
-            recording = simulate(motion, args.seed)
-            write_bag(recording, folder, overwrite=True)
-            size = sum(path.stat().st_size for path in folder.iterdir())
-            print(f"{folder}: {motion.duration:.1f} s, {len(recording.frames)} frames, {size / 1e6:.2f} MB")
+    """``body_tracking simulate``."""
+    setup = Setup(
+        args.motion,
+        _layout_of(args),
+        number=args.people,
+        imus=tuple(_imus(args)),
+        seconds=args.seconds,
+        seed=args.seed,
+        errors=KinectErrors() if args.config is None else read_errors(args.config),
+        dark=args.dark,
+    )
+    recording = simulate(setup)
+    write_bag(recording, args.output, overwrite=args.overwrite)
+    _tell(recording, args.output)
     return 0
+
+
+def _imus(args: argparse.Namespace) -> Iterator[SimulatedImu]:
+    """Those that are asked for, each with a clock of its own."""
+    for number, segment in enumerate(filter(None, args.imus.split(","))):
+        yield SimulatedImu(
+            f"imu_{segment}",
+            segment,
+            usual_mounting(segment),
+            args.imu_rate,
+            oriented=not args.raw,
+            magnetometer=not args.no_magnetometer,
+            clock=draw_clock(np.random.default_rng([args.seed, 7, number])),
+        )
+
+
+def _layout_of(args: argparse.Namespace) -> Layout:
+    if args.around is None:
+        return layout(args.layout)
+    try:
+        angles = [float(angle) for angle in args.around.split(",")]
+    except ValueError:
+        raise SceneError(f"--around {args.around}: expected degrees, separated by commas") from None
+    return around(np.radians(angles).tolist())
+
+
+def make_bags(args: argparse.Namespace) -> int:
+    """``body_tracking make-bags``: write the bags, replacing those that are there."""
+    for name, motion in SHIPPED.items():
+        if args.motion in (None, name):
+            recording = simulate(Setup(motion, seed=args.seed, standard=True))
+            write_bag(recording, args.output / name, overwrite=True)
+            _tell(recording, args.output / name)
+    return 0
+
+
+def _tell(recording: SimulatedRecording, folder: Path) -> None:
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    samples = sum(len(said.stamps_ns) for _, said in recording.imus)
+    inertial = f", {samples} inertial samples" if samples else ""
+    print(f"{folder}: {recording.duration:.1f} s, {len(recording.frames)} frames{inertial}, {size / 1e6:.2f} MB")

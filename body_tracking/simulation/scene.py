@@ -1,0 +1,277 @@
+"""People who move in front of sensors: everything that is true, and everything that the sensors said of it."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from body_tracking.calibration.result import ClockModel
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import Posture
+from body_tracking.kinematics.upper_body import PARENTS
+from body_tracking.sensors import RecordedFrame
+from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu
+from body_tracking.simulation.kinect import KinectErrors, Misreading, SimulatedKinect
+from body_tracking.simulation.layouts import Layout, layout
+from body_tracking.simulation.people import MODEL, Course, Person, joints
+from body_tracking.simulation.repertoire import Movement, make_movement
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, IntArray, Skeleton, TrackingState
+
+WORLD: Final = "world"
+START_NS: Final = 40 * NANOSECONDS
+"""What the reference sensor's clock shows at the start."""
+RECEIVED_FROM_NS: Final = 1_750_000_000 * NANOSECONDS
+"""What the receiver's clock shows at the start."""
+MAX_PEOPLE: Final = 6
+"""As many bodies as a Kinect v2 tracks."""
+APART: Final = 0.9
+"""Metres from one person to the next, side by side."""
+_CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM = 2.0, 50.0
+"""Greatest offset and drift of a sensor's clock against the reference sensor's."""
+_STEP = 1e-4
+"""Seconds to either side, of the central differences that velocities are; good to 1e-6 m/s."""
+
+
+class SceneError(BodyTrackingError):
+    """A scene that cannot be."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What is to be simulated.
+
+    Attributes:
+        motion: one of ``repertoire.MOTIONS``; everybody does the same, each in their own way.
+        layout: where the sensors stand.
+        people: who is there; drawn where there is None.
+        number: of people that are drawn.
+        imus: worn by the first person.
+        seconds: of the recording; the motion's own length where None.
+        seed: of all chance.
+        standard: the motion as the thesis shows it, without a person's own way.
+        errors: of the cameras.
+        dark: no light: a Kinect takes 15 frames a second.
+    """
+
+    motion: str
+    layout: Layout = field(default_factory=lambda: layout(4))
+    people: tuple[Person, ...] | None = None
+    number: int = 1
+    imus: tuple[SimulatedImu, ...] = ()
+    seconds: float | None = None
+    seed: int = 0
+    standard: bool = False
+    errors: KinectErrors = field(default_factory=KinectErrors)
+    dark: bool = False
+
+    def __post_init__(self) -> None:
+        count = self.number if self.people is None else len(self.people)
+        if not 1 <= count <= MAX_PEOPLE:
+            raise SceneError(f"{count} people: expected 1 to {MAX_PEOPLE}")
+        if self.seed < 0:
+            raise SceneError(f"seed {self.seed}: must not be negative")
+        if self.seconds is not None and not 1.0 <= self.seconds <= 36_000.0:
+            raise SceneError(f"{self.seconds} seconds: expected 1 to 36000")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """One person, in ``world``, at the captures of the reference sensor and in its clock.
+
+    Attributes:
+        person: who it is.
+        stamps_ns: (n,) nanoseconds.
+        positions: (n, 25, 3) metres.
+        velocities: (n, 25, 3) m/s.
+        q: (n, 35) configurations of ``UpperBody``.
+        rates: (n, 32) tangent velocities, per second.
+    """
+
+    person: Person
+    stamps_ns: IntArray
+    positions: FloatArray
+    velocities: FloatArray
+    q: FloatArray
+    rates: FloatArray
+
+    def skeleton(self, instant: int, body: int = 0) -> Skeleton:
+        """The joints at one of the instants, all Tracked."""
+        tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+        return Skeleton(
+            int(self.stamps_ns[instant]),
+            WORLD,
+            self.positions[instant],
+            tracked,
+            body,
+            velocities=self.velocities[instant],
+        )
+
+    def estimate(self, instant: int, body: int = 0) -> ModelEstimate:
+        """The state of the body model at one of the instants; nothing about it is uncertain."""
+        zero = np.zeros((2 * MODEL.nv, 2 * MODEL.nv))
+        return ModelEstimate(
+            int(self.stamps_ns[instant]),
+            WORLD,
+            body,
+            self.q[instant],
+            self.rates[instant],
+            zero,
+            self.person.lengths,
+            np.zeros(len(self.person.lengths)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedRecording:
+    """What was true and what the sensors said.
+
+    Attributes:
+        setup: what was asked for.
+        duration: seconds.
+        sensors: the cameras, the reference first.
+        frames: of all cameras, in the order of receipt.
+        truths: of each person.
+        imus: what each inertial sensor said.
+    """
+
+    setup: Setup
+    duration: float
+    sensors: tuple[SimulatedKinect, ...]
+    frames: tuple[RecordedFrame, ...]
+    truths: tuple[Truth, ...]
+    imus: tuple[tuple[SimulatedImu, ImuSamples], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Actor:
+    """Somebody who does something somewhere, and whom all sensors misread alike."""
+
+    person: Person
+    misreading: Misreading
+    movement: Movement
+    position: FloatArray
+    yaw: float
+
+    def course(self, times: FloatArray) -> Course:
+        """In ``world``."""
+        return self.movement.course(np.clip(times, 0.0, self.movement.duration)).placed(self.position, self.yaw)
+
+    def positions(self, times: FloatArray) -> FloatArray:
+        """(n, 25, 3) metres in ``world``."""
+        return joints(self.person, self.course(times))
+
+    def truth(self, times: FloatArray) -> Truth:
+        """Everything about the person at (n,) seconds."""
+        before, after = self.course(times - _STEP), self.course(times + _STEP)
+        velocities = (joints(self.person, after) - joints(self.person, before)) / (2.0 * _STEP)
+        stamps = START_NS + np.round(times * NANOSECONDS).astype(np.int64)
+        course = self.course(times)
+        return Truth(
+            self.person,
+            stamps,
+            joints(self.person, course),
+            velocities,
+            course.q,
+            MODEL.difference(before.q, after.q) / (2.0 * _STEP),
+        )
+
+
+def simulate(setup: Setup) -> SimulatedRecording:
+    """One recording; the same setup gives the same numbers.
+
+    Chance is told apart: of the people, of their movements, of each sensor's clock and of each sensor's errors. Another
+    sensor, or another error, changes nothing of the rest.
+
+    Raises:
+        RepertoireError: an unknown motion, or too few seconds for it.
+    """
+    name = zlib.crc32(setup.motion.encode())
+    actors = _actors(setup, name)
+    duration = actors[0].movement.duration
+    sensors = _sensors(setup)
+    frames: list[RecordedFrame] = []
+    truths: tuple[Truth, ...] = ()
+    for number, sensor in enumerate(sensors):
+        rng = np.random.default_rng([setup.seed, name, 3, number])
+        times = sensor.capture_times(duration, rng)
+        if number == 0:
+            truths = tuple(actor.truth(times) for actor in actors)
+        seen = {
+            body: sensor.see(times, actor.positions(times), actor.person.capsules(), rng, actor.misreading)
+            for body, actor in enumerate(actors)
+        }
+        frames += sensor.deliver(times, seen, START_NS, RECEIVED_FROM_NS, rng)
+    frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
+    imus = tuple(
+        (imu, _felt(imu, actors[0], duration, np.random.default_rng([setup.seed, name, 4, number])))
+        for number, imu in enumerate(setup.imus)
+    )
+    return SimulatedRecording(setup, duration, sensors, tuple(frames), truths, imus)
+
+
+def draw_clock(rng: np.random.Generator) -> ClockModel:
+    """The clock of a sensor that nobody set."""
+    offset, drift = rng.uniform(-1.0, 1.0, 2) * [_CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM]
+    return ClockModel(round(offset * NANOSECONDS), float(drift), START_NS)
+
+
+def _actors(setup: Setup, name: int) -> tuple[_Actor, ...]:
+    """Side by side, the first one where the layout says."""
+    rng = np.random.default_rng([setup.seed, 1])
+    people: Sequence[Person] = setup.people or [Person.draw(rng) for _ in range(setup.number)]
+    yaw = setup.layout.yaw
+    left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    actors = []
+    for number, person in enumerate(people):
+        own = None if setup.standard else np.random.default_rng([setup.seed, name, 2, number])
+        movement = make_movement(setup.motion, person, own, setup.seconds)
+        # 0, 1, -1, 2, -2, ... places to the left of the first
+        place = (number + 1) // 2 * (1 if number % 2 else -1)
+        misreading = Misreading.draw(np.random.default_rng([setup.seed, 6, number]))
+        actors.append(_Actor(person, misreading, movement, setup.layout.position + place * APART * left, yaw))
+    return tuple(actors)
+
+
+def _sensors(setup: Setup) -> tuple[SimulatedKinect, ...]:
+    """The cameras with their clocks; the first one's is the reference."""
+    sensors = []
+    for number, pose in enumerate(setup.layout.poses):
+        rng = np.random.default_rng([setup.seed, 5, number])
+        clock = draw_clock(rng) if number else ClockModel(anchor_ns=START_NS)
+        phase = float(rng.uniform(0.0, 1.0 / 30.0)) if number else 0.0
+        sensors.append(SimulatedKinect(pose, clock, phase, setup.errors, setup.dark))
+    return tuple(sensors)
+
+
+def _felt(imu: SimulatedImu, actor: _Actor, duration: float, rng: np.random.Generator) -> ImuSamples:
+    """What an inertial sensor on somebody says."""
+    segment = MODEL.segment_names.index(imu.segment)
+    latest: list[tuple[FloatArray, Posture]] = []
+
+    def posture(times: FloatArray) -> Posture:
+        # a segment and its parent are asked for at the same times, one after the other
+        if not latest or not np.array_equal(latest[0][0], times):
+            latest[:] = [(times, MODEL.forward(actor.course(times).q, actor.person.lengths))]
+        return latest[0][1]
+
+    def motion_of(number: int) -> Motion:
+        def motion(times: FloatArray) -> tuple[FloatArray, FloatArray]:
+            found = posture(times)
+            return found.rotations[:, number], found.origins[:, number]
+
+        return motion
+
+    parent = PARENTS[segment]
+    return imu.samples(
+        motion_of(segment),
+        duration,
+        START_NS,
+        rng,
+        parent=None if parent < 0 else motion_of(parent),
+        received_from_ns=RECEIVED_FROM_NS,
+    )
