@@ -142,7 +142,7 @@ class KinectErrors:
         1.0, "share of the times a person turns the back in which the sensor takes it for the front", "1", 0.0, 1.0
     )
     mirror_hysteresis: float = _parameter(
-        0.85, "angle beyond the side view by which a body has to turn for left and right to change", "rad", 0.0, 1.5
+        1.1, "angle beyond the side view by which a body has to turn for left and right to change", "rad", 0.0, 1.5
     )
     mirror_rate: float = _parameter(
         0.04, "how often left and right change by themselves in a side view", "1/s", 0.0, 10.0
