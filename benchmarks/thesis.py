@@ -32,14 +32,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from body_tracking import graph
 from body_tracking.calibration.rigid import rigid_registration
 from body_tracking.cdr import decode_skeletons
+from body_tracking.evaluation.comparison import skeleton_angles
+from body_tracking.evaluation.metrics import Curve, joint_errors, wrapped
 from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.filters.schlagenhauf import SchlagenhaufKalmanFilter
-from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
 from body_tracking.recording.replay import replay
@@ -47,7 +48,7 @@ from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.bags import SEED, simulate, write_bag
 from body_tracking.simulation.motions import MOTIONS
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 BAGS = Path(__file__).parent.parent / "bags"
 TWIST = "tpose_torso_twist"
@@ -128,19 +129,11 @@ class Truth:
         self._zero_ns = skeletons[0].stamp_ns
         self.end_ns = skeletons[-1].stamp_ns
         times = [(each.stamp_ns - self._zero_ns) / NANOSECONDS for each in skeletons]
-        self._curve = CubicSpline(times, np.stack([each.positions for each in skeletons]))
+        self._curve = Curve(np.array(times), np.stack([each.positions for each in skeletons]))
 
     def at(self, stamps_ns: Sequence[int]) -> FloatArray:
         """(n, 25, 3) metres."""
-        positions: FloatArray = self._curve([(stamp - self._zero_ns) / NANOSECONDS for stamp in stamps_ns])
-        return positions
-
-
-def _angles(positions: FloatArray) -> FloatArray:
-    """(n, 9) radians, of skeletons (n, 25, 3)."""
-    tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-    found = [positional_angles(Skeleton(0, "world", each, tracked)).position[ANGLES] for each in positions]
-    return np.array(found)
+        return self._curve.at(np.array([(stamp - self._zero_ns) / NANOSECONDS for stamp in stamps_ns]))
 
 
 def errors_of(skeletons: Sequence[Skeleton], truth: Truth, begin_ns: int) -> Errors:
@@ -153,13 +146,14 @@ def errors_of(skeletons: Sequence[Skeleton], truth: Truth, begin_ns: int) -> Err
     points, targets = found[:, TEN][here], right[:, TEN][here]
     rotation, translation = rigid_registration(targets, points)
     fitted = 1e3 * np.linalg.norm(points @ rotation.T + translation - targets, axis=-1)
-    off = _angles(found) - _angles(right)
-    off = np.degrees((off + np.pi) % (2.0 * np.pi) - np.pi)
+    mine, true = (skeleton_angles(each)[0][:, ANGLES] for each in (found, right))
+    off = np.degrees(wrapped(mine - true))
     columns = np.cumsum([0, *(len(names) for names in GROUPS.values())])
     groups = {
         name: _rms(off[:, first:last]) for name, first, last in zip(GROUPS, columns[:-1], columns[1:], strict=True)
     }
-    joints = {Joint(joint).name.lower(): _rms(apart[:, number]) for number, joint in enumerate(TEN)}
+    of_joints = 1e3 * joint_errors(found, right).rms
+    joints = {Joint(joint).name.lower(): float(of_joints[joint]) for joint in TEN}
     known = apart[here]
     return Errors(
         _rms(known), float(known.mean()), _rms(fitted), float(fitted.mean()), _rms(off), groups, joints, len(counted)

@@ -18,6 +18,7 @@ SUBCOMMANDS = (
     "calibration.offline",
     "up",
     "evaluation.show",
+    "evaluation.evaluate",
     "simulation.bags",
 )
 """Modules of the package with ``add_parser(subparsers)``, which sets ``run`` on its parser; in the help's order."""

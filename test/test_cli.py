@@ -13,7 +13,7 @@ import pytest
 from body_tracking import cli
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "show", "make-bags")
+COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "show", "evaluate", "make-bags")
 
 
 def test_the_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -47,6 +47,7 @@ def test_the_version_is_the_manifests(capsys: pytest.CaptureFixture[str]) -> Non
         ["replay", "nowhere", "-o", "out"],
         ["calibrate", "nowhere"],
         ["show", "nowhere"],
+        ["evaluate", "nowhere"],
     ],
 )
 def test_what_is_not_there_is_said_in_one_line(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking import graph
+from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import JOINT_STATE, POINT_CLOUD, MessageError, cloud_to_skeletons, to_nanoseconds
 from body_tracking.recording.rosbag2 import BagReader, deserialize
@@ -108,33 +109,56 @@ def read(path: Path, body: str | None = None) -> Tracked:
         EvaluationError: it holds no joint angles, or none of this person.
     """
     with BagReader(path) as bag:
-        found = sorted(
+        if not bodies(bag):
+            raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
+        body, angles = read_angles(bag, body)
+        return Tracked(
+            bag=Path(path),
+            body=body,
+            angles=angles,
+            skeletons=read_skeletons(bag, graph.FILTERED),
+            true_angles=read_joint_states(bag, TRUE_ANGLES, body),
+            true_skeletons=read_skeletons(bag, TRUE_SKELETON),
+        )
+
+
+def bodies(bag: BagReader) -> tuple[str, ...]:
+    """The ids of the people whose joint angles a bag holds, sorted."""
+    return tuple(
+        sorted(
             topic.removeprefix(_PREFIX).removesuffix(_SUFFIX)
             for topic, info in bag.topics.items()
             if topic.startswith(_PREFIX) and topic.endswith(_SUFFIX) and info.type_name == JOINT_STATE and info.count
         )
-        if not found:
-            raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
-        if body is not None and body not in found:
-            raise EvaluationError(f"{path}: holds no joint angles of {body!r} (there: {', '.join(found)})")
-        body = body or found[0]
-        values = _joint_states(bag, graph.joint_states_topic(body), body)
-        deviations = _joint_states(bag, graph.joint_states_stddev_topic(body), body)
-        if values is None:
-            raise EvaluationError(f"{path}: every message of {graph.joint_states_topic(body)} is malformed")
-        true_angles = _joint_states(bag, TRUE_ANGLES, body)
-        return Tracked(
-            bag=Path(path),
-            body=body,
-            angles=_with_stddev(values, deviations),
-            skeletons=_skeletons(bag, graph.FILTERED),
-            true_angles=true_angles,
-            true_skeletons=_skeletons(bag, TRUE_SKELETON),
-        )
+    )
 
 
-def _joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | None:
-    """A topic's positions as a series in time order; frames with other names than the first are left out."""
+def read_angles(bag: BagReader, body: str | None = None) -> tuple[str, AngleSeries]:
+    """A person's id and measured angles.
+
+    Args:
+        bag: with the joint angles of at least one of :func:`bodies`.
+        body: the person's id; the first one in the bag where None.
+
+    Raises:
+        EvaluationError: the bag holds no joint angles of this person, or none that can be read.
+    """
+    found = bodies(bag)
+    if body is not None and body not in found:
+        raise EvaluationError(f"{bag.path}: holds no joint angles of {body!r} (there: {', '.join(found) or 'none'})")
+    body = body or found[0]
+    values = read_joint_states(bag, graph.joint_states_topic(body), body)
+    if values is None:
+        raise EvaluationError(f"{bag.path}: every message of {graph.joint_states_topic(body)} is malformed")
+    return body, _with_stddev(values, read_joint_states(bag, graph.joint_states_stddev_topic(body), body))
+
+
+def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | None:
+    """A topic's positions as a series in time order; frames with other names than the first are left out.
+
+    Returns:
+        With standard deviations of zero and names without the body's id; None where there is no such message.
+    """
     if topic not in bag.topics or bag.topics[topic].type_name != JOINT_STATE:
         return None
     names: tuple[str, ...] = ()
@@ -162,13 +186,14 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
     return AngleSeries(values.stamps_ns, values.names, values.position, stddev)
 
 
-def _skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
+def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
+    """The first body of each of a topic's messages in time order; none where the topic is missing or holds others."""
     if topic not in bag.topics or bag.topics[topic].type_name != POINT_CLOUD:
         return ()
     skeletons: dict[int, Skeleton] = {}
     for raw in bag.messages([topic]):
         try:
-            skeleton = cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0]
+            skeleton = (decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr)))[0]
         except MessageError:
             continue  # a damaged frame is not shown
         skeletons[skeleton.stamp_ns] = skeleton

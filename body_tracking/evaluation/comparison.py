@@ -1,0 +1,697 @@
+"""What a recording says of a person beside the truth: read both, compare them in all ways that ``metrics`` knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from body_tracking import graph
+from body_tracking.calibration.clock import correlate_clocks
+from body_tracking.evaluation.metrics import (
+    Alignment,
+    AngleErrors,
+    Curve,
+    JointErrors,
+    LengthErrors,
+    MetricsError,
+    PoseErrors,
+    Trajectory,
+    align,
+    angle_errors,
+    find_delay,
+    grid,
+    jitter,
+    joint_errors,
+    known,
+    length_errors,
+    off_track,
+    pose_errors,
+)
+from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
+from body_tracking.evaluation.summary import (
+    TRUE_ANGLES,
+    TRUE_SKELETON,
+    AngleSeries,
+    EvaluationError,
+    bodies,
+    read_angles,
+    read_joint_states,
+    read_skeletons,
+)
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.messages import (
+    POINT_CLOUD,
+    TIME_REFERENCE,
+    TRANSFORM,
+    coordinates_to_configuration,
+    time_reference_to_clock,
+    transform_to_pose,
+)
+from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
+from body_tracking.skeleton import (
+    JOINT_NAMES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
+
+TRUE_CALIBRATION = "/ground_truth/calibration"
+TRUE_CLOCK = "/ground_truth/calibration/clock"
+TRUE_COORDINATES = "/ground_truth/model_state"
+AS_IT_IS, ALIGNED = "as it is", "aligned"
+
+_TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+_SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
+"""A true angle that would not stand out of 10 mm of doubt in every joint, as the plane of a hanging arm, counts not."""
+_EXACT, _AMPLIFIED = 1e-6, 10.0
+"""Radians: so well known is the body model's true pose; an angle that makes more than ten times of it counts not."""
+_COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationParameters:
+    """How to compare.
+
+    Attributes:
+        beyond: a joint farther from the truth is off track, metres.
+        max_gap: samples farther apart have a gap between them, s.
+        window: delays up to this are looked for, s.
+        own_clock: the truth's clock has nothing to do with the estimate's, nor its frame: only aligned.
+    """
+
+    beyond: float = 0.15
+    max_gap: float = 0.15
+    window: float = 0.5
+    own_clock: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorClaims:
+    """What is said of one sensor's pose and clock over time; stamps in nanoseconds of the reference clock.
+
+    Attributes:
+        pose_stamps_ns: (n,) from when each pose is used.
+        rotations: (n, 3, 3) sensor to world.
+        translations: (n, 3) metres.
+        clock_stamps_ns: (c,).
+        clock_offsets: (c,) s, sensor clock minus reference clock.
+    """
+
+    pose_stamps_ns: IntArray
+    rotations: FloatArray
+    translations: FloatArray
+    clock_stamps_ns: IntArray
+    clock_offsets: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Skeletons of one person over time with what belongs to them: an estimate, or the truth.
+
+    Attributes:
+        source: the bag or file.
+        topic: of the skeletons; empty where the file has none.
+        frame_id: of the positions.
+        stamps_ns: (n,) capture times, increasing, nanoseconds.
+        positions: (n, 25, 3) metres, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
+        angles: by name; None where there are none.
+        sensors: calibration by sensor.
+        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
+        warnings: what the file itself lacks, a line each.
+    """
+
+    source: Path
+    topic: str
+    frame_id: str
+    stamps_ns: IntArray
+    positions: FloatArray
+    covariances: FloatArray | None = None
+    angles: AngleSeries | None = None
+    sensors: Mapping[str, SensorClaims] = field(default_factory=dict)
+    coordinates: AngleSeries | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> BoolArray:
+        """(25,) joints that are ever known."""
+        return np.asarray(known(self.positions).any(axis=0))
+
+    def seconds(self, zero_ns: int) -> FloatArray:
+        """(n,) s since ``zero_ns``."""
+        return (self.stamps_ns - zero_ns) / NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AngleComparison:
+    """Angles at the same instants.
+
+    Attributes:
+        names: m names.
+        times: (n,) s in the truth's time.
+        found: (n, m) radians.
+        true: (n, m) radians; NaN where the true pose does not determine the angle.
+        stddev: (n, m) radians, infinity where none is stated.
+        errors: between them.
+    """
+
+    names: tuple[str, ...]
+    times: FloatArray
+    found: FloatArray
+    true: FloatArray
+    stddev: FloatArray
+    errors: AngleErrors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Estimate and truth under one alignment.
+
+    Attributes:
+        name: :data:`AS_IT_IS` or :data:`ALIGNED`.
+        alignment: what was done to the estimate.
+        times: (n,) s in the truth's time.
+        found: (n, 25, 3) metres.
+        true: (n, 25, 3) metres.
+        joints: errors between them.
+        off_track: (25,) share of the truth's frames from the first estimate on; NaN for joints that have no estimate.
+        positional: the angles of ``kinematics.positional`` of both skeletons.
+        named: the estimate's own angles where the truth has the same names; None where there are none.
+    """
+
+    name: str
+    alignment: Alignment
+    times: FloatArray
+    found: FloatArray
+    true: FloatArray
+    joints: JointErrors
+    off_track: FloatArray
+    positional: AngleComparison
+    named: AngleComparison | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorErrors:
+    """A sensor's calibration against the truth over time.
+
+    Attributes:
+        sensor: its name.
+        times: (n,) s at which a pose was published, and the errors of each.
+        poses: errors of these.
+        clock_times: (c,) s.
+        clock: (c,) s, estimated minus true offset.
+    """
+
+    sensor: str
+    times: FloatArray
+    poses: PoseErrors
+    clock_times: FloatArray
+    clock: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """All that was found.
+
+    Attributes:
+        estimate: what was judged.
+        truth: what it was judged by.
+        parameters: how.
+        span: (first, last) s in the truth's time, of what both cover.
+        delay: s by which the estimate follows the truth; NaN where that cannot be told.
+        comparisons: as it is (where clock and frame are shared), and aligned.
+        jitter: (25,) metres.
+        lengths: of the bones.
+        calibration: of each sensor but the one that defines world.
+        notes: what was left out, a line each.
+    """
+
+    estimate: Recorded
+    truth: Recorded
+    parameters: EvaluationParameters
+    span: tuple[float, float]
+    delay: float
+    comparisons: tuple[Comparison, ...]
+    jitter: FloatArray
+    lengths: LengthErrors
+    calibration: tuple[SensorErrors, ...]
+    notes: tuple[str, ...]
+
+
+# --- reading
+
+
+def read_estimate(path: Path, topic: str | None = None, body: str | None = None) -> Recorded:
+    """The skeletons, angles and calibration that a bag holds.
+
+    Args:
+        path: a bag folder or an mcap file.
+        topic: of the skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
+        body: whose angles; the first in the bag where None.
+
+    Raises:
+        BagError: no such bag, or nothing of it can be read.
+        EvaluationError: it holds no such topic, of no such type, nothing in it, or no angles of this person.
+    """
+    with BagReader(path) as bag:
+        if topic is None:
+            full = [each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics and bag.topics[each].count]
+            topic = full[0] if full else graph.FILTERED
+        skeletons = _skeletons(bag, topic, "; make some with replay, or choose one with --topic")
+        angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
+        sensors = _sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK)
+        return replace(_recorded(path, topic, skeletons, angles, sensors), warnings=tuple(bag.warnings))
+
+
+def read_truth(path: Path, body: str | None = None) -> Recorded:
+    """The true skeletons, angles and calibration that a bag holds.
+
+    Args:
+        path: a bag folder or an mcap file.
+        body: the id that ends the names of its angles; any where None.
+
+    Raises:
+        BagError: no such bag, or nothing of it can be read.
+        EvaluationError: it holds no true skeletons.
+    """
+    with BagReader(path) as bag:
+        skeletons = _skeletons(bag, TRUE_SKELETON, "; the truth is a bag from a simulation or what replay made of it")
+        ids = (body,) if body is not None else bodies(bag)
+        angles = read_joint_states(bag, TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
+        made = _recorded(path, TRUE_SKELETON, skeletons, angles, _sensors(bag, TRUE_CALIBRATION, TRUE_CLOCK))
+        coordinates = read_joint_states(bag, TRUE_COORDINATES, "")
+        return replace(made, coordinates=coordinates, warnings=tuple(bag.warnings))
+
+
+def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
+    """Joint centres from markers as the truth; its clock and frame are its own.
+
+    Args:
+        path: a C3D file with the markers of Plug-in Gait.
+        subject: whose; needed where the file holds several.
+        measurements: of the subject, a file of Vicon's; those in the C3D file where None.
+
+    Raises:
+        MarkerError: the files cannot be read, or too few markers are there.
+    """
+    measured = None if measurements is None else read_measurements(measurements)
+    markers = read_plug_in_gait(path, subject=subject, measurements=measured)
+    said = [f"{path}: not seen: {gap}" for gap in markers.gaps]
+    for names, what in ((markers.missing, "has no marker"), (markers.estimated, "estimates the subject's")):
+        if names:
+            said.append(f"{path}: {what} {', '.join(names)}")
+    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(said))
+
+
+def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
+    """Joint centres from markers as the truth; its clock and frame are its own.
+
+    Args:
+        source: the file.
+        stamps: (n,) s, increasing.
+        positions: (n, 25, 3) metres, NaN where unknown.
+    """
+    stamps_ns = np.rint(stamps * NANOSECONDS).astype(np.int64)
+    return Recorded(source, "", "markers", stamps_ns, positions)
+
+
+def _skeletons(bag: BagReader, topic: str, advice: str) -> tuple[Skeleton, ...]:
+    info = bag.topics.get(topic)
+    there = ", ".join(sorted(name for name, each in bag.topics.items() if each.type_name == POINT_CLOUD))
+    if info is None:
+        raise EvaluationError(f"{bag.path}: no topic {topic} (skeletons there: {there or 'none'}){advice}")
+    if info.type_name != POINT_CLOUD:
+        raise EvaluationError(f"{bag.path}: {topic} holds {info.type_name}, expected {POINT_CLOUD}")
+    if not info.count:
+        raise EvaluationError(f"{bag.path}: {topic} is empty")
+    skeletons = read_skeletons(bag, topic)
+    if len(skeletons) < 2:
+        raise EvaluationError(
+            f"{bag.path}: {len(skeletons)} skeleton(s) with a stamp of their own in the {info.count} messages of "
+            f"{topic}, at least 2 are needed"
+        )
+    return skeletons
+
+
+def _recorded(
+    path: Path,
+    topic: str,
+    skeletons: Sequence[Skeleton],
+    angles: AngleSeries | None,
+    sensors: Mapping[str, SensorClaims],
+) -> Recorded:
+    # infinite ones state as little as none, and would spread when they are turned
+    stated = [
+        np.where(np.isfinite(each.covariances), each.covariances, np.nan)
+        for each in skeletons
+        if each.covariances is not None
+    ]
+    return Recorded(
+        Path(path),
+        topic,
+        skeletons[0].frame_id,
+        np.array([each.stamp_ns for each in skeletons], dtype=np.int64),
+        np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in skeletons]),
+        np.stack(stated) if len(stated) == len(skeletons) else None,
+        angles,
+        sensors,
+    )
+
+
+def _sensors(bag: BagReader, pose_topic: str, clock_topic: str) -> dict[str, SensorClaims]:
+    poses = [transform_to_pose(deserialize(TRANSFORM, raw.cdr)) for raw in _messages(bag, pose_topic, TRANSFORM)]
+    clocks = [
+        time_reference_to_clock(deserialize(TIME_REFERENCE, raw.cdr))
+        for raw in _messages(bag, clock_topic, TIME_REFERENCE)
+    ]
+    claims = {}
+    for sensor in dict.fromkeys(pose.sensor for pose in poses):
+        own = [pose for pose in poses if pose.sensor == sensor]
+        times = sorted((at_ns, clock.offset) for name, at_ns, clock in clocks if name == sensor)
+        claims[sensor] = SensorClaims(
+            np.array([pose.valid_from_ns for pose in own], dtype=np.int64),
+            np.stack([pose.rotation for pose in own]),
+            np.stack([pose.translation for pose in own]),
+            np.array([at_ns for at_ns, _ in times], dtype=np.int64),
+            np.array([offset for _, offset in times]),
+        )
+    return claims
+
+
+def _messages(bag: BagReader, topic: str, kind: str) -> Iterator[RawMessage]:
+    there = topic in bag.topics and bag.topics[topic].type_name == kind
+    return bag.messages([topic]) if there else iter(())
+
+
+# --- comparing
+
+
+def evaluate(
+    estimate: Recorded,
+    truth: Recorded,
+    parameters: EvaluationParameters | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Evaluation:
+    """Compare an estimate with the truth.
+
+    Args:
+        estimate: of one person.
+        truth: of the same.
+        parameters: the defaults where None.
+        progress: called now and then with the share that is done, from 0 to 1.
+
+    Raises:
+        EvaluationError: no joint is known in both, nothing overlaps in time, or too little to compare.
+    """
+    p = parameters or EvaluationParameters()
+    done = progress or (lambda share: None)
+    notes = _notes(estimate, truth)
+    if estimate.frame_id != truth.frame_id and not p.own_clock:
+        notes.append(f"{AS_IT_IS!r} compares {estimate.frame_id!r} with {truth.frame_id!r}, which may be other frames")
+    zero_ns = int(truth.stamps_ns[0])
+    whole = Trajectory(
+        estimate.seconds(int(estimate.stamps_ns[0]) if p.own_clock else zero_ns),
+        estimate.positions,
+        estimate.covariances,
+    )
+    curve = Curve(truth.seconds(zero_ns), truth.positions, p.max_gap)
+    if np.isnan(curve.span).any():
+        raise EvaluationError(f"{truth.source}: no joint is known twice within {p.max_gap:g} s")
+    around = _own_clock_offset(whole, curve, estimate, truth) if p.own_clock else 0.0
+    span = _span(whole.times - around, curve.span, estimate, truth)
+    done(0.1)
+    delay = find_delay(whole, curve, p.window, around)
+    if np.isnan(delay) and p.own_clock:
+        raise EvaluationError(
+            f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
+            "of their frames belong together"
+        )
+    if np.isnan(delay):
+        notes.append(f"no delay within {p.window:g} s could be found (still, or another clock?): aligned in space only")
+    done(0.3)
+    alignments = {} if p.own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
+    try:
+        alignments[ALIGNED] = align(whole, curve, 0.0 if np.isnan(delay) else delay)
+    except MetricsError as error:
+        if p.own_clock:
+            raise EvaluationError(f"{estimate.source} and {truth.source}: {error}") from error
+        notes.append(f"not aligned: {error}")
+    true_angles = _true_angles(estimate.angles, truth)
+    mine = estimate.angles
+    if mine is not None and true_angles is not None and mine.names != true_angles.names:
+        notes.append("estimate and truth have different sets of angles: one name may mean two things")
+    comparisons = []
+    for number, (name, alignment) in enumerate(alignments.items()):
+        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, true_angles, p))
+        done(0.3 + 0.7 * (number + 1) / len(alignments))
+    last = comparisons[-1]
+    moved = last.alignment.apply(whole)
+    true = curve.at(moved.times)
+    return Evaluation(
+        estimate,
+        truth,
+        p,
+        span,
+        float("nan") if p.own_clock else delay,
+        tuple(comparisons),
+        jitter(moved.times, moved.positions, true),
+        length_errors(moved.positions, true),
+        () if p.own_clock else _calibration(estimate, truth, zero_ns),
+        tuple(notes),
+    )
+
+
+def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
+    """What will not be compared.
+
+    Raises:
+        EvaluationError: nothing will.
+    """
+    mine, theirs = estimate.joints, truth.joints
+    if not (mine & theirs).any():
+        raise EvaluationError(
+            f"no joint is known in both: {estimate.source} knows {_joints(mine)}, {truth.source} {_joints(theirs)}"
+        )
+    notes = list(dict.fromkeys((*estimate.warnings, *truth.warnings)))
+    for only, where in ((mine & ~theirs, estimate), (theirs & ~mine, truth)):
+        if only.any():
+            notes.append(f"not compared, since only {where.source} knows them: {_joints(only)}")
+    for each in (estimate, truth):
+        missing = ~known(each.positions[:, mine & theirs])
+        if missing.any():
+            frames = f"{missing.any(axis=1).sum()} of {len(missing)} frames"
+            notes.append(f"{each.source}: {missing.mean():.1%} of the joints' positions are unknown, in {frames}")
+    return notes
+
+
+def _joints(which: BoolArray) -> str:
+    return ", ".join(JOINT_NAMES[joint] for joint in np.flatnonzero(which)) or "none"
+
+
+def _span(times: FloatArray, truth: tuple[float, float], estimate: Recorded, true: Recorded) -> tuple[float, float]:
+    """What both cover, s in the truth's time."""
+    first, last = max(float(times[0]), truth[0]), min(float(times[-1]), truth[1])
+    if not last > first:
+        spans = (
+            f"{each.source} from {each.stamps_ns[0] / NANOSECONDS:.3f} to {each.stamps_ns[-1] / NANOSECONDS:.3f} s"
+            for each in (estimate, true)
+        )
+        raise EvaluationError(
+            f"estimate and truth do not overlap in time: {', '.join(spans)}; is it another recording, or another "
+            "clock (--own-clock)?"
+        )
+    return first, last
+
+
+def _own_clock_offset(whole: Trajectory, curve: Curve, estimate: Recorded, truth: Recorded) -> float:
+    """The estimate's time less the truth's, each from its first frame, by the speeds of the joints.
+
+    These need no common frame. At least half of the shorter recording must overlap.
+    """
+    first, last = curve.span
+    times = grid(first, last, _COARSE_RATE)
+    length = float(whole.times[-1] - whole.times[0])
+    least = 0.5 * min(length, last - first)
+    guesses = np.arange(first - last + least, length - least + _COARSE_WINDOW, _COARSE_WINDOW)
+    true = (times, curve.at(times))
+    found = [
+        each
+        for guess in guesses
+        if (each := correlate_clocks(true, (whole.times, whole.positions), float(guess), _COARSE_WINDOW)) is not None
+    ]
+    best = max(found, key=lambda each: each.correlation, default=None)
+    if best is None or best.correlation < 0.5:
+        said = "none" if best is None else f"{best.correlation:.2f}"
+        raise EvaluationError(
+            f"{estimate.source} and {truth.source} do not show the same movement: best correlation of their joints' "
+            f"speeds at any shift in time {said}, expected at least 0.5 over at least 2 s"
+        )
+    return best.offset
+
+
+def _compare(
+    name: str,
+    alignment: Alignment,
+    whole: Trajectory,
+    curve: Curve,
+    estimate: Recorded,
+    truth: Recorded,
+    true_angles: AngleSeries | None,
+    p: EvaluationParameters,
+) -> Comparison:
+    moved = alignment.apply(whole)
+    first, last = max(moved.times[0], curve.span[0]), min(moved.times[-1], curve.span[1])
+    inside = (moved.times >= first) & (moved.times <= last)
+    if inside.sum() < 2:
+        raise EvaluationError(
+            f"{estimate.source} has {inside.sum()} frames from {first:.3f} to {last:.3f} s after the truth of "
+            f"{truth.source} begins, which is what both cover; at least 2 are needed"
+        )
+    own = Trajectory(
+        moved.times[inside],
+        moved.positions[inside],
+        None if moved.covariances is None else moved.covariances[inside],
+    )
+    compared = own if name == AS_IT_IS else moved.at(grid(first, last), p.max_gap)
+    true = curve.at(compared.times)
+    errors = joint_errors(compared.positions, true, compared.covariances)
+    if not errors.frames.any():
+        raise EvaluationError(
+            f"no joint is known in both at any time from {first:.3f} to {last:.3f} s after the truth begins: "
+            f"{estimate.source} knows {known(own.positions).mean():.0%} of the positions there, "
+            f"{truth.source} {known(curve.at(own.times)).mean():.0%}"
+        )
+    # From the first estimate on every frame of the truth counts, also those that the estimate has left out; but to its
+    # end only where the truth was recorded apart from it.
+    all_times = truth.seconds(int(truth.stamps_ns[0]))
+    lost = (all_times > last + p.max_gap) & (not p.own_clock)
+    counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
+    off = off_track(moved.at(counted, p.max_gap).positions, curve.at(counted), p.beyond)
+    return Comparison(
+        name,
+        alignment,
+        compared.times,
+        compared.positions,
+        true,
+        errors,
+        np.where(estimate.joints, off, np.nan),
+        _positional(own, curve),
+        _named(estimate, true_angles, whole, moved, int(truth.stamps_ns[0]), p),
+    )
+
+
+def _positional(found: Trajectory, curve: Curve) -> AngleComparison:
+    """The angles of both skeletons at the estimate's own instants."""
+    mine, stddev = skeleton_angles(found.positions, found.covariances)
+    positions = curve.at(found.times)
+    true, shown = skeleton_angles(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
+    true = np.where(np.isfinite(shown), true, np.nan)
+    return AngleComparison(ANGLE_NAMES, found.times, mine, true, stddev, angle_errors(mine, true, stddev))
+
+
+def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """The angles of ``kinematics.positional`` over time.
+
+    Args:
+        positions: (n, 25, 3) metres, z up, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres; None where none are stated.
+
+    Returns:
+        (n, 13) radians, NaN where unknown, and their standard deviations, infinite where unknown.
+    """
+    angles = [
+        positional_angles(
+            Skeleton(0, "", each, _TRACKED, covariances=None if covariances is None else covariances[number])
+        )
+        for number, each in enumerate(positions)
+    ]
+    return np.stack([each.position for each in angles]), np.stack([each.position_stddev for each in angles])
+
+
+def _true_angles(mine: AngleSeries | None, truth: Recorded) -> AngleSeries | None:
+    """The true angles in the convention of the estimate's where the truth has the model's coordinates, or its own."""
+    if mine is None or truth.coordinates is None:
+        return truth.angles
+    model = UpperBody()
+    of_names = {convention(name, model).names: name for name in CONVENTIONS}
+    if mine.names not in of_names or truth.coordinates.names != model.coordinate_names:
+        return truth.angles
+    exact = _EXACT**2 * np.eye(2 * model.nv)
+    lengths = model.default_lengths()  # no angle depends on them
+    rates = np.zeros(model.nv)
+    series: list[JointAngles] = []
+    for stamp_ns, tangent in zip(truth.coordinates.stamps_ns, truth.coordinates.position, strict=True):
+        q, _ = coordinates_to_configuration(tangent, rates, model)
+        estimate = ModelEstimate(int(stamp_ns), truth.frame_id, 0, q, rates, exact, lengths, np.zeros_like(lengths))
+        series.append(angles_of(estimate, model, of_names[mine.names], series[-1] if series else None))
+    stddev = np.stack([each.position_stddev for each in series])
+    return AngleSeries(
+        truth.coordinates.stamps_ns,
+        mine.names,
+        np.stack([each.position for each in series]),
+        np.where(stddev > _AMPLIFIED * _EXACT, np.inf, stddev),
+    )
+
+
+def _named(
+    estimate: Recorded,
+    theirs: AngleSeries | None,
+    whole: Trajectory,
+    moved: Trajectory,
+    zero_ns: int,
+    p: EvaluationParameters,
+) -> AngleComparison | None:
+    """The angles that have the same name in both; those that change with the frame are not turned with it."""
+    mine = estimate.angles
+    if mine is None or theirs is None:
+        return None
+    names = tuple(name for name in mine.names if name in theirs.names)
+    if not names:
+        return None
+    shift = moved.times[0] - whole.times[0]
+    times = (mine.stamps_ns - estimate.stamps_ns[0]) / NANOSECONDS + whole.times[0] + shift
+    found, stddev = (values[:, [mine.names.index(name) for name in names]] for values in (mine.known, mine.stddev))
+    position = theirs.known[:, [theirs.names.index(name) for name in names]]
+    true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), p.max_gap).at(times)
+    return AngleComparison(names, times, found, true, stddev, angle_errors(found, true, stddev))
+
+
+def _unwrapped(angles: FloatArray) -> FloatArray:
+    """(n, m) angles without jumps by whole turns; what is unknown stays so."""
+    unwrapped = np.full_like(angles, np.nan)
+    for column in range(angles.shape[1]):
+        there = np.isfinite(angles[:, column])
+        unwrapped[there, column] = np.unwrap(angles[there, column])
+    return unwrapped
+
+
+def _calibration(estimate: Recorded, truth: Recorded, zero_ns: int) -> tuple[SensorErrors, ...]:
+    """Of the sensors that both know, but for one that is right by definition: it is world."""
+    base = truth.positions[:, Joint.SPINE_BASE if truth.joints[Joint.SPINE_BASE] else int(truth.joints.argmax())]
+    place = base[known(base)].mean(axis=0)
+    found = []
+    for sensor in estimate.sensors.keys() & truth.sensors.keys():
+        mine, true = estimate.sensors[sensor], truth.sensors[sensor]
+        errors = pose_errors(mine.rotations, mine.translations, true.rotations[-1], true.translations[-1], place)
+        if not errors.displacement.max() > 1e-6:
+            continue
+        clock_times = (mine.clock_stamps_ns - zero_ns) / NANOSECONDS
+        true_times = (true.clock_stamps_ns - zero_ns) / NANOSECONDS
+        clock = np.full(len(clock_times), np.nan)
+        if len(true_times):
+            clock = mine.clock_offsets - np.interp(clock_times, true_times, true.clock_offsets)
+        times = np.maximum((mine.pose_stamps_ns - zero_ns) / NANOSECONDS, 0.0)
+        found.append(SensorErrors(sensor, times, errors, clock_times, clock))
+    return tuple(sorted(found, key=lambda each: each.sensor))

@@ -1,0 +1,105 @@
+"""``body_tracking evaluate``: how far an estimate is from the truth, as tables, CSV, JSON and a page with pictures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from body_tracking.evaluation.comparison import (
+    EvaluationParameters,
+    Recorded,
+    evaluate,
+    read_estimate,
+    read_markers,
+    read_truth,
+)
+from body_tracking.evaluation.plots import pictures
+from body_tracking.evaluation.report import as_json, check_writable, page, text, write, write_csv
+from body_tracking.evaluation.summary import EvaluationError
+from body_tracking.recording.replay import Progress
+
+_DEFAULTS = EvaluationParameters()
+
+
+def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
+    """The truth by the kind of its file, and whether its clock and frame are its own.
+
+    Raises:
+        BagError: neither a C3D file nor a bag that can be read.
+        EvaluationError: the bag holds no truth.
+        MarkerError: nothing can be made of the C3D file.
+    """
+    path: Path = args.truth or args.estimate
+    if path.suffix.lower() == ".c3d":
+        return read_markers(path, args.subject, args.measurements), True
+    return read_truth(path, args.body), args.own_clock
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """``body_tracking evaluate``."""
+    parser = subparsers.add_parser(
+        "evaluate",
+        help="compare what was estimated with the truth",
+        description="Compare skeletons and joint angles in a recording with the truth: errors of position and angle "
+        "as they are, and aligned in time and space as the thesis does (100 Hz, one shift, one rigid transform); "
+        "delay, jitter, segment lengths, calibration, and whether the stated standard deviations hold.",
+    )
+    parser.add_argument("estimate", type=Path, metavar="EST", help="a bag as replay or bag_recorder writes it")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="TRUTH",
+        help="a bag with /ground_truth/skeleton (default: EST itself), or a C3D file with Plug-in Gait's markers",
+    )
+    parser.add_argument("--topic", help="skeletons to judge (default: /filtered/skeleton, else /fused/skeleton)")
+    parser.add_argument("--body", metavar="ID", help="whose angles (default: the first in the recording)")
+    parser.add_argument(
+        "--own-clock",
+        action="store_true",
+        help="clock and frame of TRUTH are its own, as those of a C3D file always are: find the shift by the movement, "
+        "and compare aligned only",
+    )
+    parser.add_argument("--subject", metavar="NAME", help="whose markers, where a C3D file holds several people's")
+    parser.add_argument(
+        "--measurements", type=Path, metavar="FILE", help="the subject's, from Vicon (default: those in the C3D file)"
+    )
+    parser.add_argument(
+        "--off-track",
+        type=float,
+        default=1e3 * _DEFAULTS.beyond,
+        metavar="MM",
+        help="a joint farther from the truth is off track (default: %(default).0f)",
+    )
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every number into this file")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with tables and pictures")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare, print and write."""
+    if not args.off_track > 0.0:
+        raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm")
+    progress = Progress(0, 1000)
+    try:
+        estimate = read_estimate(args.estimate, args.topic, args.body)
+        progress.at(100)
+        truth, own_clock = truth_from(args)
+        progress.at(200)
+        parameters = EvaluationParameters(beyond=1e-3 * args.off_track, own_clock=own_clock)
+        for path in (args.html, args.csv):
+            if path is not None:
+                check_writable(path)
+        result = evaluate(estimate, truth, parameters, lambda share: progress.at(int(200 + 400 * share)))
+        if args.html is not None:
+            write(args.html, page(result, pictures(result, lambda share: progress.at(int(600 + 400 * share)))))
+        if args.csv is not None:
+            write_csv(result, args.csv)
+    finally:
+        progress.end()
+    print(as_json(result) if args.json else text(result))
+    if not args.json:
+        for name, path in (("numbers", args.csv), ("report", args.html)):
+            if path is not None:
+                print(f"\n{name}: {path}")
+    return 0

@@ -1,0 +1,504 @@
+"""How an estimate of a movement differs from the truth: pure functions on arrays.
+
+The comparison is made twice. *As it is*: each estimate against the truth at the instant and in the frame that it
+claims for itself, so that delay, calibration and offset count; this is what a robot gets. *Aligned*: as chapter 5.7 of
+Schlagenhauf 2017 compares with a marker system, after one constant shift in time and one rigid transform over the whole
+recording, the estimates interpolated linearly to 100 Hz; this is what the thesis's tables 5.3 and E.1 say.
+
+Besides, each joint's own constant offset can be taken off. It is constant in the frames of the body's segments
+(``segments``), as a sensor's and an anatomist's joint centres differ by a vector that turns with the person; an offset
+along the axes of the room would be none for somebody who turns.
+
+NaN is what is not known, in every array; statistics are over what is known in both, and NaN where that is nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.errors import BodyTrackingError
+from body_tracking.evaluation.alignment import sample
+from body_tracking.evaluation.segments import segment_frames
+from body_tracking.skeleton import BONES, BoolArray, FloatArray, IntArray
+
+RATE = 100.0
+"""Hz, the marker system's rate, to which the thesis interpolates (section 5.7.1)."""
+MIN_SPEED = 0.02
+"""m/s, RMS over joints: a slower movement does not show its time."""
+
+_LEVEL = 0.95
+_NORMAL = float(np.sqrt(chi2.ppf(_LEVEL, 1)))
+_ELLIPSOID = float(chi2.ppf(_LEVEL, 3))
+_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
+_PARENTS, _CHILDREN = (np.array([bone[end] for bone in BONES], dtype=np.intp) for end in (0, 1))
+
+
+class MetricsError(BodyTrackingError):
+    """An estimate and a truth cannot be compared."""
+
+
+# --- time and space
+
+
+class Curve:
+    """Values at any time: cubic splines through samples, a separate one on each side of a gap."""
+
+    def __init__(self, times: FloatArray, values: FloatArray, max_gap: float = np.inf) -> None:
+        """Fit.
+
+        Args:
+            times: (n,) s, increasing.
+            values: (n, ...), NaN where unknown.
+            max_gap: s; known samples farther apart have nothing in between.
+
+        Raises:
+            MetricsError: times that do not increase, or of another number than the values.
+        """
+        if times.shape != values.shape[:1] or not len(times) or not (np.diff(times) > 0.0).all():
+            raise MetricsError(
+                f"curve: {values.shape[0]} values at {len(times)} times, expected as many times, increasing"
+            )
+        self._shape = values.shape[1:]
+        columns = values.reshape(len(times), -1)
+        known = np.isfinite(columns)
+        self._pieces: list[tuple[float, float, IntArray, CubicSpline]] = []
+        patterns, members = np.unique(known, axis=1, return_inverse=True)
+        for number, pattern in enumerate(patterns.T):
+            own = np.flatnonzero(members.ravel() == number)
+            knots = np.flatnonzero(pattern)
+            for run in np.split(knots, np.flatnonzero(np.diff(times[knots]) > max_gap) + 1):
+                if len(run) > 1:
+                    spline = CubicSpline(times[run], columns[np.ix_(run, own)])
+                    self._pieces.append((float(times[run[0]]), float(times[run[-1]]), own, spline))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time of which anything is known, s; NaN if there is none."""
+        if not self._pieces:
+            return float("nan"), float("nan")
+        return min(piece[0] for piece in self._pieces), max(piece[1] for piece in self._pieces)
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """(m, ...) values at (m,) s; NaN in gaps and beyond the ends."""
+        values = np.full((len(times), int(np.prod(self._shape))), np.nan)
+        for first, last, columns, spline in self._pieces:
+            inside = np.flatnonzero((times >= first) & (times <= last))
+            if len(inside):
+                values[np.ix_(inside, columns)] = spline(times[inside])
+        return values.reshape(len(times), *self._shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Joints over time.
+
+    Attributes:
+        times: (n,) s, increasing.
+        positions: (n, 25, 3) metres, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres, NaN or infinite where none is stated; None where none is at all.
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    covariances: FloatArray | None = None
+
+    def at(self, times: FloatArray, max_gap: float) -> Trajectory:
+        """Linearly interpolated to (m,) s; unknown between samples more than ``max_gap`` s apart."""
+        if len(self.times) < 2:
+            raise MetricsError(f"trajectory: {len(self.times)} sample(s), expected at least 2 to interpolate")
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        unsure = (self.times[after] - self.times[after - 1] > max_gap) & ~np.isin(times, self.times)
+        at = np.where(unsure, np.nan, times)
+        covariances = self.covariances
+        return Trajectory(
+            times,
+            sample(at, self.times, self.positions),
+            None if covariances is None else sample(at, self.times, covariances),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """What takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation``.
+
+    Attributes:
+        delay: s by which the estimate follows the truth.
+        rotation: (3, 3).
+        translation: (3,) metres.
+    """
+
+    delay: float
+    rotation: FloatArray
+    translation: FloatArray
+
+    def apply(self, estimate: Trajectory) -> Trajectory:
+        """The estimate in the truth's time and frame."""
+        r = self.rotation
+        covariances = None if estimate.covariances is None else r @ estimate.covariances @ r.T
+        return Trajectory(estimate.times - self.delay, estimate.positions @ r.T + self.translation, covariances)
+
+
+def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: float = 0.0) -> float:
+    """The constant time by which an estimate follows the truth, by least squares.
+
+    The delay with which ``R e_j(t) + b_j - truth_j(t - delay)`` has the least mean square over times and joints, where
+    the rotation R and an offset b_j of each joint are free: for a delay both have a closed form (Umeyama 1991, each
+    joint about its own mean), so that neither frames nor joint centres need agree. A grid finds the valley, Brent's
+    method its bottom.
+
+    Args:
+        estimate: at any times.
+        truth: (..., 25, 3) metres.
+        window: half the width of the search, s.
+        around: its middle, s.
+
+    Returns:
+        Seconds; NaN where the movement does not show it: less than 20 mm/s of RMS speed, less than two windows in
+        common, or the best value at the edge of the search.
+    """
+    first, last = truth.span
+    shown = estimate.times - around
+    inside = (shown - window >= first) & (shown + window <= last)
+    times, positions = estimate.times[inside], estimate.positions[inside]
+    if len(times) < 4 or times[-1] - times[0] < 2.0 * window:
+        return float("nan")
+
+    def cost(delay: float) -> float:
+        true = truth.at(times - delay)
+        both = (known(positions) & known(true))[..., None]
+        count = both.sum(axis=0)
+        centred = []
+        for each in (positions, true):
+            there = np.where(both, each, 0.0)
+            centred.append(np.where(both, each - there.sum(axis=0) / np.maximum(count, 1), 0.0).reshape(-1, 3))
+        e, t = centred
+        u, spread, vt = np.linalg.svd(t.T @ e)
+        spread[2] *= np.sign(np.linalg.det(u @ vt))
+        return float(((e**2).sum() + (t**2).sum() - 2.0 * spread.sum()) / max(int(count.sum()), 1))
+
+    def speed(step: float = 0.02) -> float:
+        return _rms((truth.at(times - around + step) - truth.at(times - around - step)).ravel()) * 3**0.5 / (2.0 * step)
+
+    if not speed() > MIN_SPEED:
+        return float("nan")
+    grid = around + np.linspace(-window, window, 2 * int(np.ceil(window * 30.0)) + 1)
+    costs = [cost(float(delay)) for delay in grid]
+    best = int(np.argmin(costs))
+    if not 0 < best < len(grid) - 1:
+        return float("nan")
+    found = minimize_scalar(
+        cost, bounds=(grid[best - 1], grid[best + 1]), method="bounded", options={"xatol": 1e-5, "maxiter": 40}
+    )
+    return float(found.x)
+
+
+def align(estimate: Trajectory, truth: Curve, delay: float) -> Alignment:
+    """The rigid transform over the whole recording with the least squares over all joints (thesis eq. 5.1-5.7).
+
+    Args:
+        estimate: at its own times.
+        truth: (..., 25, 3) metres.
+        delay: s, as :func:`find_delay` gives it.
+
+    Raises:
+        MetricsError: fewer than three points in common, or all on one line.
+    """
+    true = truth.at(estimate.times - delay)
+    both = known(estimate.positions) & known(true)
+    try:
+        rotation, translation = rigid_registration(true[both], estimate.positions[both])
+    except CalibrationError as error:
+        raise MetricsError(f"alignment in space: {error}") from error
+    return Alignment(delay, rotation, translation)
+
+
+def grid(first: float, last: float, rate: float = RATE) -> FloatArray:
+    """(n,) s from the first to the last at a rate in Hz."""
+    return first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate
+
+
+# --- joints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointErrors:
+    """Differences of k joints over time; metres.
+
+    Attributes:
+        frames: (k,) instants at which both are known.
+        mae: (k, 3) mean absolute error along each axis (the thesis's MAE).
+        largest: (k, 3) the largest (the thesis's MAD).
+        mean: (k,) mean distance.
+        rms: (k,) root mean square distance.
+        farthest: (k,) largest distance.
+        offset: (k, 3) mean error in the frame of the joint's segment.
+        fixed_mean: (k,) mean distance without that offset.
+        fixed_rms: (k,) root mean square distance without it.
+        covered: (k,) share of the frames with a stated covariance in which the truth lies in its 95 % ellipsoid.
+    """
+
+    frames: IntArray
+    mae: FloatArray
+    largest: FloatArray
+    mean: FloatArray
+    rms: FloatArray
+    farthest: FloatArray
+    offset: FloatArray
+    fixed_mean: FloatArray
+    fixed_rms: FloatArray
+    covered: FloatArray
+
+
+def joint_errors(found: FloatArray, true: FloatArray, covariances: FloatArray | None = None) -> JointErrors:
+    """Compare joints at the same instants.
+
+    Args:
+        found: (n, 25, 3) metres.
+        true: (n, 25, 3) metres.
+        covariances: (n, 25, 3, 3) square metres, of what was found; None where none are stated.
+    """
+    error = np.where((known(found) & known(true))[..., None], found - true, np.nan)
+    distance = np.linalg.norm(error, axis=-1)
+    own = np.einsum("njba,njb->nja", segment_frames(true), error)
+    offset = _mean(own)
+    fixed = np.linalg.norm(own - offset, axis=-1)
+    return JointErrors(
+        frames=known(error).sum(axis=0),
+        mae=_mean(np.abs(error)),
+        largest=_max(np.abs(error)),
+        mean=_mean(distance),
+        rms=np.sqrt(_mean(distance**2)),
+        farthest=_max(distance),
+        offset=offset,
+        fixed_mean=_mean(fixed),
+        fixed_rms=np.sqrt(_mean(fixed**2)),
+        covered=np.full(error.shape[1], np.nan) if covariances is None else position_coverage(error, covariances),
+    )
+
+
+def position_coverage(error: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Share of the frames in which an error lies in the 95 % ellipsoid of its covariance (chi-square, 3 degrees).
+
+    Args:
+        error: (n, k, 3) metres.
+        covariances: (n, k, 3, 3) square metres; those that are not finite or not positive definite state nothing.
+
+    Returns:
+        (k,) from 0 to 1.
+    """
+    stated = known(error) & np.isfinite(covariances).all(axis=(-2, -1))
+    safe = np.where(stated[..., None, None], covariances, np.eye(3))
+    variances = np.linalg.eigvalsh(safe)
+    stated &= variances[..., 0] > 1e-9 * variances[..., 2]
+    safe[~stated] = np.eye(3)
+    squared = (error * np.linalg.solve(safe, np.where(stated[..., None], error, 0.0)[..., None])[..., 0]).sum(axis=-1)
+    return _mean(np.where(stated, squared <= _ELLIPSOID, np.nan))
+
+
+def off_track(found: FloatArray, true: FloatArray, beyond: float) -> FloatArray:
+    """Share of the frames in which a joint is missing or farther off than ``beyond``, of those in which it is known.
+
+    Args:
+        found: (n, k, 3) metres.
+        true: (n, k, 3) metres.
+        beyond: metres.
+
+    Returns:
+        (k,) from 0 to 1.
+    """
+    tracked = np.linalg.norm(found - true, axis=-1) <= beyond
+    return _mean(np.where(known(true), ~tracked, np.nan))
+
+
+def jitter(times: FloatArray, found: FloatArray, true: FloatArray) -> FloatArray:
+    """The shaking of each joint beyond the true movement, as the white noise that would shake it as much.
+
+    The root of what the mean squared third difference of the estimate exceeds that of the truth at the same instants,
+    over the square root of 20: the third difference of white noise of standard deviation s has s sqrt(1 + 9 + 9 + 1).
+    It is blind to offset, to delay and to errors that change slowly.
+
+    Args:
+        times: (n,) s; four frames in a row count whose steps are within a quarter of the median step.
+        found: (n, k, 3) metres.
+        true: (n, k, 3) metres at the same times.
+
+    Returns:
+        (k,) metres along one axis; 0 where the estimate is smoother than the truth.
+    """
+    if len(times) < len(_THIRD):
+        return np.full(found.shape[1], np.nan)
+    step = np.diff(times)
+    even = np.lib.stride_tricks.sliding_window_view(np.abs(step / np.median(step) - 1.0) < 0.25, 3).all(axis=-1)
+    both = (known(found) & known(true))[..., None]
+    squares = []
+    for positions in (found, true):
+        windows = np.lib.stride_tricks.sliding_window_view(np.where(both, positions, np.nan), len(_THIRD), axis=0)
+        squares.append(_mean((windows[even] @ _THIRD) ** 2))
+    excess: FloatArray = np.sqrt(np.maximum(squares[0] - squares[1], 0.0).mean(axis=-1) / (_THIRD**2).sum())
+    return excess
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LengthErrors:
+    """Of the 24 bones of ``skeleton.BONES``; metres.
+
+    Attributes:
+        spread: (24,) standard deviation of the estimated length over time.
+        true_spread: (24,) that of the true one.
+        error: (24,) mean estimated length minus mean true length, over the same frames.
+    """
+
+    spread: FloatArray
+    true_spread: FloatArray
+    error: FloatArray
+
+
+def length_errors(found: FloatArray, true: FloatArray) -> LengthErrors:
+    """Compare segment lengths (thesis figure 5.14).
+
+    Args:
+        found: (n, 25, 3) metres.
+        true: (n, 25, 3) metres.
+    """
+    lengths, right = (np.linalg.norm(each[:, _CHILDREN] - each[:, _PARENTS], axis=-1) for each in (found, true))
+    both = np.isfinite(lengths) & np.isfinite(right)
+    lengths, right = np.where(both, lengths, np.nan), np.where(both, right, np.nan)
+    mean, true_mean = _mean(lengths), _mean(right)
+    return LengthErrors(
+        np.sqrt(_mean((lengths - mean) ** 2)), np.sqrt(_mean((right - true_mean) ** 2)), mean - true_mean
+    )
+
+
+# --- angles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AngleErrors:
+    """Differences of m angles over time; radians.
+
+    Attributes:
+        frames: (m,) instants at which both are known.
+        rmse: (m,) root mean square.
+        offset: (m,) mean.
+        fixed_rmse: (m,) root mean square without the mean.
+        mae: (m,) mean absolute.
+        largest: (m,) largest absolute.
+        covered: (m,) share of the frames with a stated standard deviation in which the truth lies within 1.96 of them.
+    """
+
+    frames: IntArray
+    rmse: FloatArray
+    offset: FloatArray
+    fixed_rmse: FloatArray
+    mae: FloatArray
+    largest: FloatArray
+    covered: FloatArray
+
+
+def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None = None) -> AngleErrors:
+    """Compare angles at the same instants; 359 deg and 1 deg are 2 deg apart.
+
+    Args:
+        found: (n, m) radians.
+        true: (n, m) radians.
+        stddev: (n, m) radians; what is not finite or not positive states nothing. None where none are stated.
+    """
+    error = wrapped(found - true)
+    offset = _mean(error)
+    covered = np.full(error.shape[1], np.nan)
+    if stddev is not None:
+        stated = np.isfinite(error) & np.isfinite(stddev) & (stddev > 0.0)
+        covered = _mean(np.where(stated, np.abs(error) <= _NORMAL * stddev, np.nan))
+    return AngleErrors(
+        frames=np.isfinite(error).sum(axis=0),
+        rmse=np.sqrt(_mean(error**2)),
+        offset=offset,
+        fixed_rmse=np.sqrt(_mean((error - offset) ** 2)),
+        mae=_mean(np.abs(error)),
+        largest=_max(np.abs(error)),
+        covered=covered,
+    )
+
+
+def wrapped(angles: FloatArray) -> FloatArray:
+    """Angles brought to -pi .. pi, radians."""
+    around: FloatArray = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    return around
+
+
+# --- calibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """Of n poses of one sensor.
+
+    Attributes:
+        rotation: (n,) radians.
+        translation: (n,) metres, of the sensor.
+        displacement: (n,) metres by which a point where the person is comes out elsewhere.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    displacement: FloatArray
+
+
+def pose_errors(
+    rotations: FloatArray,
+    translations: FloatArray,
+    true_rotation: FloatArray,
+    true_translation: FloatArray,
+    place: FloatArray,
+) -> PoseErrors:
+    """Compare calibrated poses (sensor to world) with the true one.
+
+    Args:
+        rotations: (n, 3, 3).
+        translations: (n, 3) metres.
+        true_rotation: (3, 3).
+        true_translation: (3,) metres.
+        place: (3,) metres, where the person is in world.
+    """
+    turned = rotations @ true_rotation.T
+    sine = np.linalg.norm(turned - np.swapaxes(turned, -1, -2), axis=(-2, -1)) / np.sqrt(8.0)
+    cosine = 0.5 * (np.trace(turned, axis1=-2, axis2=-1) - 1.0)
+    seen = true_rotation.T @ (place - true_translation)
+    return PoseErrors(
+        np.arctan2(sine, cosine),
+        np.linalg.norm(translations - true_translation, axis=-1),
+        np.linalg.norm(rotations @ seen + translations - place, axis=-1),
+    )
+
+
+# --- statistics over time of what is known
+
+
+def known(positions: FloatArray) -> BoolArray:
+    """(..., ) which of (..., 3) points have all coordinates."""
+    return np.asarray(np.isfinite(positions).all(axis=-1))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Over the first axis."""
+    there = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        mean: FloatArray = np.where(there, values, 0.0).sum(axis=0) / there.sum(axis=0)
+    return mean
+
+
+def _max(values: FloatArray) -> FloatArray:
+    """Over the first axis, of values that are not negative."""
+    there = np.isfinite(values)
+    largest = np.where(there, values, -1.0).max(axis=0, initial=-1.0)
+    return np.where(largest < 0.0, np.nan, largest)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(_mean(values**2)))

@@ -1,0 +1,210 @@
+"""``body_tracking evaluate``: what it prints and writes is what is in the bags."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from body_tracking.cli import main
+from body_tracking.evaluation.comparison import Evaluation, evaluate, read_estimate, read_markers, read_truth
+from body_tracking.evaluation.metrics import Curve
+from body_tracking.evaluation.report import tables
+from body_tracking.messages import JOINT_STATE, POINT_CLOUD, skeletons_to_cloud
+from body_tracking.recording.replay import replay
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
+from body_tracking.recording.stages import ReplaySettings
+from body_tracking.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the graph makes of the wave; the truth is beside it."""
+    folder = tmp_path_factory.mktemp("evaluate") / "wave"
+    replay(BAGS / "tpose_wave", folder, ReplaySettings(()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(replayed: Path) -> Evaluation:
+    return evaluate(read_estimate(replayed), read_truth(BAGS / "tpose_wave"))
+
+
+def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind: str = POINT_CLOUD) -> Path:
+    """A bag with one topic and nothing else."""
+    states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+    with BagWriter(folder) as bag:
+        bag.add_topic(topic, kind)
+        for number in range(skeletons):
+            skeleton = Skeleton(10**9 + number, "world", np.ones((N_JOINTS, 3)), states)
+            bag.write_message(topic, skeletons_to_cloud((skeleton,), BAG_MESSAGES), number)
+    return folder
+
+
+class Page(HTMLParser):
+    """Counts what stands in a page, and keeps every address."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.counts: dict[str, int] = {}
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.counts[tag] = self.counts.get(tag, 0) + 1
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_table_says_what_was_found(replayed: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(replayed), "--truth", str(BAGS / "tpose_wave")]) == 0
+    shown = capsys.readouterr().out
+    wrist = JOINT_NAMES.index("WristLeft")
+    line = next(line for line in shown.splitlines() if line.startswith("WristLeft "))
+    errors = result.comparisons[0].joints
+    expected = [*errors.mae[wrist], *errors.largest[wrist], errors.mean[wrist], errors.rms[wrist]]
+    assert [float(each) for each in line.split()[1:9]] == pytest.approx(1e3 * np.array(expected), abs=0.06)
+    ten = next(line for line in shown.splitlines() if line.startswith("of the thesis's ten (10) "))
+    assert 5.0 < float(ten.split()[5]) < 100.0
+    assert "kinect2" in shown and "elbow_flexion_left" in shown and "ElbowLeft-WristLeft" in shown
+    assert f"delay     {1e3 * result.delay:.1f} ms" in shown
+
+
+def test_csv_json_and_tables_agree(
+    replayed: Path, result: Evaluation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    numbers = tmp_path / "new" / "numbers.csv"
+    assert main(["evaluate", str(replayed), "--csv", str(numbers), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    with numbers.open(encoding="utf-8") as file:
+        rows = {(row["table"], row["row"], row["column"]): row for row in csv.DictReader(file)}
+    assert float(rows["recording", "all", "delay"]["value"]) == pytest.approx(said["delay_ms"], rel=1e-4)
+    count = 0
+    for key, table in said["tables"].items():
+        for name, columns in table["rows"].items():
+            for column, value in columns.items():
+                written = rows[key, name, column]
+                assert written["unit"] == table["units"][column]
+                if value is None:
+                    assert written["value"] == ""
+                else:
+                    assert float(written["value"]) == pytest.approx(value, rel=1e-4, abs=1e-5)
+                count += 1
+    assert count == len(rows) - 1 > 500
+    assert set(said["tables"]) == {table.key for table in tables(result)}
+
+
+def test_the_report_is_one_whole_page_that_needs_no_other_file(replayed: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.html"
+    assert main(["evaluate", str(replayed), "--html", str(report)]) == 0
+    text = report.read_text(encoding="utf-8")
+    page = Page(text)
+    assert not page.open
+    assert page.counts["img"] == 6 and page.counts["table"] == 6
+    assert all(re.match(r"data:image/(png|svg\+xml);base64,[A-Za-z0-9+/=]{5000}", each) for each in page.addresses)
+    assert "http://" not in text and "https://" not in text
+    assert all(name in text for name in JOINT_NAMES)
+
+
+def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(replayed: Path, tmp_path: Path) -> None:
+    fused = read_estimate(replayed, "/fused/skeleton")
+    assert fused.topic == "/fused/skeleton" and fused.frame_id == "world"
+    alone = read_estimate(bag_of(tmp_path / "fused", 3, "/fused/skeleton"))
+    assert alone.topic == "/fused/skeleton" and alone.angles is None and len(alone.stamps_ns) == 3
+
+
+def test_a_joint_is_off_track_by_the_distance_that_is_given(
+    replayed: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(replayed), "--off-track", "30", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["tables"]["joints_as_it_is"]["rows"]
+    assert (100.0 * result.comparisons[0].off_track.mean()) < rows["all (25)"]["off_track"] < 95.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{empty}"], r"empty: /filtered/skeleton is empty"),
+        (["{one}"], r"one: 1 skeleton\(s\) .* at least 2"),
+        (["{wave}", "--truth", "{two}"], r"two: no topic /ground_truth/skeleton \(skeletons there: /filtered"),
+        (["{wave}", "--truth", "{twist}", "--own-clock"], r"do not show the same movement: best correlation"),
+        (["{two}", "--truth", "{twist}"], r"do not overlap in time: .*two from 1\.000 to 1\.000 s, .*from 40\.000"),
+        (["{twist}"], r"no topic /filtered/skeleton \(skeletons there: /ground_truth/skeleton, /kinect1"),
+        (["{wave}", "--topic", "/calibration"], r"/calibration holds geometry_msgs/msg/TransformStamped, expected"),
+        (["{wave}", "--body", "bob"], r"no joint angles of 'bob' \(there: body1\)"),
+        (["{text}"], r"notes\.txt: not an mcap file"),
+        (["{wave}", "--truth", "{text}"], r"notes\.txt: not an mcap file"),
+        (["{wave}", "--truth", "{nowhere}.c3d"], r"nowhere\.c3d"),
+        (["{wave}", "--truth", "{nowhere}"], r"nowhere: no such recording"),
+        (["{wave}", "--html", "{text}/page.html"], r"notes\.txt"),
+        (["{wave}", "--off-track", "-1"], r"--off-track -1: must be more than 0"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(
+    arguments: list[str], message: str, replayed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("no recording")
+    places = {
+        "wave": replayed,
+        "twist": BAGS / "tpose_torso_twist",
+        "text": text,
+        "nowhere": tmp_path / "nowhere",
+        "empty": bag_of(tmp_path / "empty", 0),
+        "one": bag_of(tmp_path / "one", 1),
+        "two": bag_of(tmp_path / "two", 2),
+    }
+    assert main(["evaluate", *(argument.format(**places) for argument in arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("body_tracking: ") and captured.err.count("\n") == 1
+    assert re.search(message, captured.err), captured.err
+    assert not captured.out
+
+
+def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = bag_of(tmp_path / "typed", 0, "/filtered/skeleton", JOINT_STATE)
+    assert main(["evaluate", str(folder)]) == 2
+    assert f"/filtered/skeleton holds {JOINT_STATE}, expected {POINT_CLOUD}" in capsys.readouterr().err
+
+
+def test_markers_are_a_truth_whose_clock_and_frame_are_their_own(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An estimate that is the markers' own joint centres, elsewhere, at another time, 30 times a second, with noise."""
+    file = shared_data / "plug_in_gait" / "cgm__Test_Files__Movement_trial.c3d"
+    if not file.is_file():
+        pytest.skip(f"{file} is absent")
+    markers = read_markers(file)
+    times = markers.seconds(int(markers.stamps_ns[0]))
+    shown = Curve(times, markers.positions, 0.15).at(np.arange(0.2, times[-1] - 0.1, 1.0 / 30.0))
+    turn = Rotation.from_euler("zyx", [1.0, 0.2, -0.1]).as_matrix()
+    shown = shown @ turn.T + np.random.default_rng(1).normal(0.0, 0.01, shown.shape)
+    with BagWriter(tmp_path / "estimate") as bag:
+        bag.add_topic("/filtered/skeleton", POINT_CLOUD)
+        for number, positions in enumerate(shown):
+            states = np.where(np.isfinite(positions).all(axis=1), 2, 0).astype(np.uint8)
+            skeleton = Skeleton(10**12 + number * 33_333_333, "world", positions, states)
+            bag.write_message("/filtered/skeleton", skeletons_to_cloud((skeleton,), BAG_MESSAGES), number)
+    assert main(["evaluate", str(tmp_path / "estimate"), "--truth", str(file), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said["tables"]) == {"joints_aligned", "angles_aligned", "lengths"} and said["delay_ms"] is None
+    rows = said["tables"]["joints_aligned"]["rows"]
+    # 10 mm of noise along each axis, less by the lines between the frames; every joint within its own scatter
+    assert 10.0 < next(row for name, row in rows.items() if name.startswith("all"))["rms"] < 20.0
+    assert rows["WristLeft"]["jitter"] == pytest.approx(10.0, rel=0.3)
+    assert rows["WristLeft"]["off_track"] == 0.0
+    assert main(["evaluate", str(BAGS / "tpose_wave"), "--topic", "/kinect1/skeleton", "--truth", str(file)]) == 2
+    assert "do not show the same movement" in capsys.readouterr().err
