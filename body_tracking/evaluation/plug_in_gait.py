@@ -628,9 +628,9 @@ def _of_subject(path: Path, labels: list[str], subject: str | None) -> dict[str,
     split = [tuple(label.rpartition(":")[::2]) for label in labels]
     named = {prefix for prefix, name in split if name in MARKERS}
     if subject is not None and subject not in named:
-        raise MarkerError(f"{path}: no subject {subject!r}; found {_listed(named)}")
+        raise MarkerError(f"{path}: no subject {subject!r}; found {_listed(sorted(named))}")
     if subject is None and len(named) > 1:
-        raise MarkerError(f"{path}: {len(named)} subjects, choose one of {_listed(named)}")
+        raise MarkerError(f"{path}: {len(named)} subjects, choose one of {_listed(sorted(named))}")
     if not named:
         return {name: index for index, (_, name) in enumerate(split)}
     chosen = subject if subject is not None else next(iter(named))
@@ -638,7 +638,7 @@ def _of_subject(path: Path, labels: list[str], subject: str | None) -> dict[str,
     counts = Counter(name for prefix, name in split if prefix == chosen)
     twice = [name for name in MARKERS if counts[name] > 1]
     if twice:
-        raise MarkerError(f"{path}: more than one point is called {_listed(twice)}")
+        raise MarkerError(f"{path}: more than one point is called {_listed(sorted(twice))}")
     return places
 
 
