@@ -1,9 +1,9 @@
 """Four sensors of 30 Hz live through the graph: what is lost, what each node costs, and how late its output is.
 
-A person is simulated as for the shipped bags, in their three motions, seen by four Kinects that run on clocks of their
-own and deliver after different times, so that many frames come after later ones of other sensors. ``body_tracking up``
-plays them at their times through four sensor nodes, the filter ``ekf`` takes each frame by itself, best effort as by
-default.
+A person is simulated who twists as in a shipped bag, for as long as it takes, seen by four Kinects that run on clocks
+of their own and deliver after different times, so that many frames come after later ones of other sensors.
+``body_tracking up`` plays them at their times through four sensor nodes, the filter ``ekf`` takes each frame by itself,
+best effort as by default.
 
 All is measured from outside: frames by the recording and by what the nodes say in ``/diagnostics``, processor time by
 the system's account of each process over the steady part, delays by the capture stamps of what this process receives.
@@ -42,29 +42,21 @@ import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality, level_pose
+from body_tracking.calibration.result import CalibrationResult, SensorQuality
 from body_tracking.calibration.storage import save
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.parameters import SECTION
 from body_tracking.recording.qos import RELIABLE
 from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.bags import (
-    DISTANCE,
-    RECEIVED_FROM_NS,
-    START_NS,
-    SimulatedRecording,
-    layout,
-    true_positions,
-    write_bag,
-)
-from body_tracking.simulation.figure import Pose
-from body_tracking.simulation.motions import MOTIONS, Motion, minimum_jerk
-from body_tracking.simulation.sensors import Errors, SimulatedSensor
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.simulation import scene
+from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.kinect import KinectErrors
+from body_tracking.simulation.layouts import around
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording
+from body_tracking.skeleton import NANOSECONDS
 
 FILTER = "ekf"
 LIMIT = 0.30
@@ -77,9 +69,8 @@ START_AFTER = 12.0
 """Seconds until the sensors deliver: every node is there by then."""
 
 SEED = 4
-_BLEND = 0.5
-"""Seconds before and after the end of a motion in which it turns into the next; both are in a T-pose."""
-
+_LAYOUT = around(np.radians([45.0, -45.0, 0.0, -80.0]).tolist(), (2.0, 2.0, 2.4, 2.2), (1.0, 1.0, 1.25, 0.9))
+"""The two sensors of the shipped bags, one in front of the person and one far to the right."""
 _DELAYS = ((0.022, 0.003), (0.034, 0.004), (0.028, 0.003), (0.045, 0.006))
 """Seconds that each sensor takes to deliver: at least, and more on average."""
 
@@ -91,58 +82,17 @@ _STAMP = struct.Struct("<iI")
 # --- the recording
 
 
-def sensors() -> tuple[SimulatedSensor, ...]:
-    """The two sensors of the shipped bags, one in front of the person and one far to the side of the first."""
-    known = layout()
-    others = (
-        _facing("kinect3", 225.0, 2.4, 0.25, ClockModel(1_414_213_562, -21.0, START_NS), 0.0071),
-        _facing("kinect4", 145.0, 2.2, -0.1, ClockModel(-577_215_664, 55.0, START_NS), 0.0263),
-    )
-    return tuple(
-        replace(sensor, errors=Errors(delay=least, delay_jitter=more))
-        for sensor, (least, more) in zip((*known, *others), _DELAYS, strict=True)
-    )
-
-
-def _facing(
-    name: str, bearing: float, distance: float, height: float, clock: ClockModel, phase: float
-) -> SimulatedSensor:
-    """A sensor that the person has in this direction (degrees in ``world``), looking at the person."""
-    angle = np.radians(bearing)
-    place = np.array([DISTANCE + distance * np.cos(angle), distance * np.sin(angle), height])
-    turned = Rotation.from_euler("z", angle + np.pi) * Rotation.from_quat(level_pose(name, pitch=0.05).quat_xyzw)
-    return SimulatedSensor(SensorPose(name, place, turned.as_quat()), clock, phase)
-
-
-def all_motions(duration: float) -> Motion:
-    """The three motions one after the other, again and again."""
-
-    def pose(times: FloatArray) -> Pose:
-        start, number, result = 0.0, 0, MOTIONS[0].pose(times)
-        while start < duration:
-            start, number = start + MOTIONS[number % len(MOTIONS)].duration, number + 1
-            share = minimum_jerk((times - start + _BLEND) / (2.0 * _BLEND))[:, None]
-            coming = MOTIONS[number % len(MOTIONS)].pose(times - start)
-            result = Pose(
-                *(
-                    (1.0 - share) * getattr(result, name) + share * getattr(coming, name)
-                    for name in Pose.__dataclass_fields__
-                )
-            )
-        return result
-
-    return Motion("four_sensors", duration, pose)
-
-
 def simulate(duration: float) -> SimulatedRecording:
     """The recording; the same numbers each time."""
-    motion, frames = all_motions(duration), []
-    for number, sensor in enumerate(sensors()):
-        rng = np.random.default_rng([SEED, number])
-        times = sensor.capture_times(duration, rng)
-        frames += sensor.observe(times, true_positions(motion, times), START_NS, RECEIVED_FROM_NS, rng)
+    setup = Setup("torso_twist", _LAYOUT, seconds=duration, seed=SEED, standard=True)
+    frames: list[RecordedFrame] = []
+    for pose, (least, more) in zip(_LAYOUT.poses, _DELAYS, strict=True):
+        # errors of one sensor change nothing of the others: of each recording the sensor that it is about
+        errors = KinectErrors(delay=least, delay_jitter=more)
+        recording = scene.simulate(replace(setup, errors=errors))
+        frames += [frame for frame in recording.frames if frame.sensor == pose.sensor]
     frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
-    return SimulatedRecording(motion.name, sensors(), tuple(frames), ())
+    return replace(recording, frames=tuple(frames))
 
 
 def captures(recording: SimulatedRecording) -> list[int]:

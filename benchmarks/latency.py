@@ -59,7 +59,6 @@ from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "tpose_wave"
-TRUE_POSES, TRUE_CLOCKS = "/ground_truth/calibration", "/ground_truth/calibration/clock"
 ROS = RosMessages()
 SENSORS = ("kinect1", "kinect2")
 CHAIN = ("fusion", "skeleton_filter", "joint_angles")
@@ -192,10 +191,10 @@ def _recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
         for message in reader.messages([graph.skeleton_topic(name) for name in SENSORS]):
             skeleton = cloud_to_skeletons(deserialize(reader.topics[message.topic].type_name, message.cdr))[0]
             frames[message.topic.split("/")[1]].append(skeleton)
-        for message in reader.messages([TRUE_POSES]):
+        for message in reader.messages([graph.TRUE_CALIBRATION]):
             pose = transform_to_pose(deserialize(TRANSFORM, message.cdr))
             poses[pose.sensor] = pose
-        for message in reader.messages([TRUE_CLOCKS]):
+        for message in reader.messages([graph.TRUE_CLOCK]):
             sensor, _, clocks[sensor] = time_reference_to_clock(deserialize(TIME_REFERENCE, message.cdr))
     return {name: Stream(skeletons, clocks[name]) for name, skeletons in frames.items()}, poses
 

@@ -13,8 +13,8 @@ angles    RMSE in degrees of the angles of ``kinematics.positional`` against tho
           it is given those of its own fixed base, so that its trunk angles are its model's.
 
 The bar: in the torso twist, errors of ``ekf`` at most 60 % of those of ``schlagenhauf_ekf``, positions (RMS, in world)
-and angles alike. ``--more N`` draws N recordings of each motion with other noise besides: one recording is one draw of
-slow errors of some seconds' length, and the ratio differs from draw to draw.
+and angles alike. ``--more N`` draws N recordings of each motion besides, of other people with other errors: one
+recording is one draw of what sensors make of a person, and the ratio differs from draw to draw.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
 from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.recording.stages import ReplaySettings
-from body_tracking.simulation.bags import SEED, simulate, write_bag
-from body_tracking.simulation.motions import MOTIONS
+from body_tracking.simulation.bags import SEED, SHIPPED, shipped, write_bag
+from body_tracking.simulation.scene import simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 BAGS = Path(__file__).parent.parent / "bags"
@@ -105,9 +105,7 @@ def methods_of(bag: Path) -> tuple[list[Skeleton], dict[str, list[Skeleton]]]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
         replay(bag, out, ReplaySettings((), filter_name=EKF))
-        truth, fused, filtered = (
-            _read(out, topic) for topic in ("/ground_truth/skeleton", graph.FUSED, graph.FILTERED)
-        )
+        truth, fused, filtered = (_read(out, topic) for topic in (graph.TRUE_SKELETON, graph.FUSED, graph.FILTERED))
     methods = {"fused": fused}
     methods |= {name: run_filter(fused, make_filter(name)) for name in FUSED_FILTERS}
     methods[BY_SENSOR] = filtered
@@ -204,24 +202,24 @@ def main() -> int:
     parser.add_argument("--only", metavar="TEXT", help="recordings whose name contains this")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, also those of each joint")
     arguments = parser.parse_args()
-    motions = [each for each in MOTIONS if arguments.only is None or arguments.only in each.name]
-    if not motions or arguments.more < 0:
-        parser.error("no such recording" if not motions else "--more: not less than 0")
+    names = [name for name in SHIPPED if arguments.only is None or arguments.only in name]
+    if not names or arguments.more < 0:
+        parser.error("no such recording" if not names else "--more: not less than 0")
 
     results: dict[str, dict[str, Errors]] = {}
     drawn: dict[str, list[tuple[float, float]]] = {}
-    for motion in motions:
-        print(f"bags/{motion.name}", file=sys.stderr, flush=True)
-        results[motion.name] = compare(BAGS / motion.name)
-        show(motion.name, results[motion.name])
+    for name in names:
+        print(f"bags/{name}", file=sys.stderr, flush=True)
+        results[name] = compare(BAGS / name)
+        show(name, results[name])
         for number in range(1, arguments.more + 1):
             with tempfile.TemporaryDirectory() as folder:
-                bag = Path(folder) / motion.name
-                write_bag(simulate(motion, SEED + number), bag)
+                bag = Path(folder) / name
+                write_bag(simulate(shipped(name, SEED + number)), bag)
                 found = compare(bag)
-            results[f"{motion.name} seed {SEED + number}"] = found
-            drawn.setdefault(motion.name, []).append(ratios(found, BY_SENSOR))
-            p, a = drawn[motion.name][-1]
+            results[f"{name} seed {SEED + number}"] = found
+            drawn.setdefault(name, []).append(ratios(found, BY_SENSOR))
+            p, a = drawn[name][-1]
             print(f"  seed {SEED + number}: positions {p:.2f}, angles {a:.2f}", file=sys.stderr, flush=True)
     for name, pairs in drawn.items():
         p, a = np.median(pairs, axis=0)

@@ -1,4 +1,4 @@
-"""Write what the code defines: the tables of README.md, and config/body_tracking.yaml with every parameter.
+"""Write what the code defines: the tables of README.md, and the files in config/ with every parameter.
 
 With ``--check`` it only says whether they are up to date.
 """
@@ -17,10 +17,16 @@ from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import Qos
+from body_tracking.simulation import kinect
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 CONFIG = ROOT / "config" / "body_tracking.yaml"
+SIMULATOR = ROOT / "config" / "simulator.yaml"
+SIMULATOR_HEADER = """\
+# How much a simulated Kinect v2 errs. Written by `make docs` from the code; copy it, keep what you change:
+#   body_tracking simulate --config my_errors.yaml -o bag
+"""
 SECTION = re.compile(r"(<!-- (\w+): written by make docs -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
 
 
@@ -134,13 +140,19 @@ def readme() -> str:
     return SECTION.sub(lambda match: f"{match[1]}{WRITERS[match[2]]()}{match[3]}", text)
 
 
+def files() -> dict[Path, str]:
+    """The text of each file as the code defines it now."""
+    simulator = f"{SIMULATOR_HEADER}\n{kinect.errors_as_yaml()}"
+    return {README: readme(), CONFIG: graph.config_text(), SIMULATOR: simulator}
+
+
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if not up to date")
     check = parser.parse_args().check
     code = 0
-    for path, text in ((README, readme()), (CONFIG, graph.config_text())):
+    for path, text in files().items():
         if path.exists() and path.read_text(encoding="utf-8") == text:
             continue
         if check:

@@ -1,4 +1,4 @@
-"""A person who walks about, seen by sensors without noise or with some: for tests of calibration and fusion.
+"""What people do, and one who walks about, seen by sensors without noise or with some: for tests of all that follows.
 
 The errors that make calibration hard are put in one at a time by the tests themselves.
 """
@@ -8,14 +8,36 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.simulation.bags import true_positions
-from body_tracking.simulation.motions import MOTIONS
+from body_tracking.simulation.people import Person, joints
+from body_tracking.simulation.repertoire import END_S, TPOSE_S, make_movement
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Level axes (x forward, y left, z up) into optical ones (x right, y down, z forward)."""
+
+
+PERSON = Person.average("male")
+ABOUT_FACE = np.array([-1.0, -1.0, 1.0])
+"""Level axes of somebody who faces a sensor into the sensor's."""
+
+
+_WAVE_S = make_movement("two_handed_wave", PERSON).duration - TPOSE_S - END_S
+
+
+def performed(motion: str, times: FloatArray | None = None) -> FloatArray:
+    """The standard performance of a motion by an average man, in his own frame: x forward, the origin on the floor.
+
+    Args:
+        motion: one of ``repertoire.MOTIONS``.
+        times: (n,) seconds; all of it, 30 times a second, where none are given.
+
+    Returns:
+        (n, 25, 3) metres.
+    """
+    movement = make_movement(motion, PERSON)
+    return joints(PERSON, movement.course(np.arange(0.0, movement.duration, 1.0 / 30.0) if times is None else times))
 
 
 def walk(times: FloatArray, still: float = 3.0) -> FloatArray:
@@ -29,9 +51,9 @@ def walk(times: FloatArray, still: float = 3.0) -> FloatArray:
         (n, 25, 3) metres.
     """
     moving = np.clip(times - still, 0.0, None)
-    figure = true_positions(MOTIONS[0], 3.0 + moving % 10.0)
-    # The simulated figure faces between its two sensors; this one faces its only one.
-    figure = (figure - figure[:, :1]) @ Rotation.from_euler("z", -45, degrees=True).as_matrix().T
+    # from one T-pose to the other, again and again
+    wave = performed("two_handed_wave", TPOSE_S + moving % _WAVE_S)
+    figure = (wave - wave[:, :1]) * ABOUT_FACE
     ramp = np.clip(moving, 0.0, 1.0)
     heading = 0.7 * ramp * np.sin(0.9 * moving)
     place = np.stack(

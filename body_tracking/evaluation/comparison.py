@@ -32,8 +32,6 @@ from body_tracking.evaluation.metrics import (
 )
 from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
 from body_tracking.evaluation.summary import (
-    TRUE_ANGLES,
-    TRUE_SKELETON,
     AngleSeries,
     EvaluationError,
     bodies,
@@ -67,9 +65,6 @@ from body_tracking.skeleton import (
     TrackingState,
 )
 
-TRUE_CALIBRATION = "/ground_truth/calibration"
-TRUE_CLOCK = "/ground_truth/calibration/clock"
-TRUE_COORDINATES = "/ground_truth/model_state"
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
@@ -287,11 +282,13 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         EvaluationError: it holds no true skeletons.
     """
     with BagReader(path) as bag:
-        skeletons = _skeletons(bag, TRUE_SKELETON, "; the truth is a bag from a simulation or what replay made of it")
+        wanted = "; the truth is a bag from a simulation or what replay made of it"
+        skeletons = _skeletons(bag, graph.TRUE_SKELETON, wanted)
         ids = (body,) if body is not None else bodies(bag)
-        angles = read_joint_states(bag, TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
-        made = _recorded(path, TRUE_SKELETON, skeletons, angles, _sensors(bag, TRUE_CALIBRATION, TRUE_CLOCK))
-        coordinates = read_joint_states(bag, TRUE_COORDINATES, "")
+        angles = read_joint_states(bag, graph.TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
+        sensors = _sensors(bag, graph.TRUE_CALIBRATION, graph.TRUE_CLOCK)
+        made = _recorded(path, graph.TRUE_SKELETON, skeletons, angles, sensors)
+        coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
         return replace(made, coordinates=coordinates, warnings=tuple(bag.warnings))
 
 

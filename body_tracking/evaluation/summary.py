@@ -14,8 +14,6 @@ from body_tracking.messages import JOINT_STATE, POINT_CLOUD, MessageError, cloud
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
-TRUE_SKELETON = "/ground_truth/skeleton"
-TRUE_ANGLES = "/ground_truth/joint_states"
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
 
@@ -117,8 +115,8 @@ def read(path: Path, body: str | None = None) -> Tracked:
             body=body,
             angles=angles,
             skeletons=read_skeletons(bag, graph.FILTERED),
-            true_angles=read_joint_states(bag, TRUE_ANGLES, body),
-            true_skeletons=read_skeletons(bag, TRUE_SKELETON),
+            true_angles=read_joint_states(bag, graph.TRUE_ANGLES, body),
+            true_skeletons=read_skeletons(bag, graph.TRUE_SKELETON),
         )
 
 

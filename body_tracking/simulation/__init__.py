@@ -1,6 +1,8 @@
-"""A small articulated person, a few motions, and two skeleton cameras that err like real ones.
+"""People who move before Kinects and inertial sensors that err like real ones, and everything that is true of it.
 
-``figure`` turns joint angles into the 25 joints, ``motions`` turns time into joint angles, ``sensors`` turns true
-joints into what a sensor would have said of them and when, ``bags`` writes all of it into recordings. Knows the core
-types, ``sensors`` and ``recording``; nothing imports it but the command line and tests. A full simulator grows here.
+``people`` are bodies of ``kinematics.upper_body`` on two legs, ``repertoire`` is what they do, made of
+``trajectories``; ``layouts`` says where sensors stand, ``occlusion`` what they cannot see, ``kinect`` and ``imus`` what
+they would have said and when. ``scene`` puts all of it together, ``bags`` writes it into recordings. ``random_people``
+stand apart: bodies that obey the filter's own model, with white noise only. Knows the core types, ``kinematics``,
+``calibration.result``, ``sensors`` and ``recording``; nothing imports it but the command line, benchmarks and tests.
 """

@@ -31,7 +31,7 @@ from body_tracking.calibration.result import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS
-from body_tracking.simulation.motions import minimum_jerk
+from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
 StampArray = NDArray[np.int64]

@@ -8,12 +8,20 @@ from numpy.testing import assert_allclose
 
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
-from body_tracking.simulation.bags import true_positions
-from body_tracking.simulation.motions import MOTIONS
-from walkers import OPTICAL_FROM_LEVEL, about_y, walk
+from body_tracking.simulation.repertoire import make_movement
+from body_tracking.skeleton import FloatArray
+from walkers import ABOUT_FACE, OPTICAL_FROM_LEVEL, PERSON, about_y, performed, walk
 
 TIMES = np.arange(FRAMES) / 30.0
-POSE = true_positions(MOTIONS[0], np.array([1.0]))[0] @ OPTICAL_FROM_LEVEL.T
+
+
+def seen(motion: str, time: float) -> FloatArray:
+    """(25, 3) metres of somebody 2 m in front of a sensor at a height of 0.9 m."""
+    pose = performed(motion, np.array([time]))[0] * ABOUT_FACE + [2.0, 0.0, -0.9]
+    return np.asarray(pose @ OPTICAL_FROM_LEVEL.T)
+
+
+POSE = seen("two_handed_wave", 1.0)
 
 
 def repeated(noise: float = 0.008) -> np.ndarray:
@@ -37,8 +45,8 @@ def test_a_body_that_is_not_seen_is_not_still() -> None:
 
 def test_the_t_pose_is_recognised() -> None:
     assert is_t_pose(POSE)
-    hanging = true_positions(MOTIONS[1], np.array([MOTIONS[1].duration]))[0]
-    assert is_t_pose(hanging) == (abs(hanging[6, 2] - hanging[4, 2]) < 0.2)
+    assert is_t_pose(seen("slow_down", make_movement("slow_down", PERSON).duration))
+    assert not is_t_pose(seen("standing_still", 1.0))
     arms_down = POSE.copy()
     arms_down[[6, 10]] = POSE[[4, 8]] + [0.0, 0.5, 0.0]
     assert not is_t_pose(arms_down)

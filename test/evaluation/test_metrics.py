@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from body_tracking import graph
 from body_tracking.evaluation.metrics import (
     Curve,
     MetricsError,
@@ -30,7 +31,7 @@ from body_tracking.evaluation.metrics import (
     wrapped,
 )
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.evaluation.summary import TRUE_SKELETON, read_skeletons
+from body_tracking.evaluation.summary import read_skeletons
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
 
@@ -42,7 +43,7 @@ WRIST = Joint.WRIST_LEFT
 def samples() -> tuple[FloatArray, FloatArray]:
     """(n,) s from 0 and (n, 25, 3) m of a person who twists the trunk."""
     with BagReader(TWIST) as bag:
-        skeletons = read_skeletons(bag, TRUE_SKELETON)
+        skeletons = read_skeletons(bag, graph.TRUE_SKELETON)
     first = skeletons[0].stamp_ns
     times = np.array([(each.stamp_ns - first) / NANOSECONDS for each in skeletons])
     return times, np.stack([each.positions for each in skeletons])

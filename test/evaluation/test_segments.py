@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from body_tracking import graph
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.evaluation.summary import TRUE_SKELETON, read_skeletons
+from body_tracking.evaluation.summary import read_skeletons
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint
@@ -26,7 +27,7 @@ TRUNK = ("SPINE", "NECK", "HEAD", "SHOULDER", "HIP")
 def twist() -> tuple[FloatArray, FloatArray]:
     """(n,) s and (n, 25, 3) of a person who twists the trunk, arms spread."""
     with BagReader(TWIST) as bag:
-        skeletons = read_skeletons(bag, TRUE_SKELETON)
+        skeletons = read_skeletons(bag, graph.TRUE_SKELETON)
     return np.array([each.stamp for each in skeletons]), np.stack([each.positions for each in skeletons])
 
 

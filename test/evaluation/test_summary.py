@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from body_tracking import graph
 from body_tracking.cli import main
 from body_tracking.evaluation.show import summarise
 from body_tracking.evaluation.summary import AngleSeries, EvaluationError, nearest, read, summaries, table
@@ -15,7 +17,8 @@ from body_tracking.filters import make_filter
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.messages import JOINT_STATE, POINT_CLOUD, angles_to_joint_states, skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter
-from body_tracking.simulation.bags import MOTIONS, simulate
+from body_tracking.simulation.kinect import KinectErrors
+from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import N_JOINTS, Skeleton, TrackingState
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -24,21 +27,23 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wave as one sensor at its true place would track it, with the truth beside."""
-    recording = simulate(MOTIONS[0])
+    """The wave as one sensor at its true place would track it, which has white noise only, with the truth beside."""
+    noisy = replace(KinectErrors.none(), white=0.001)
+    recording = simulate(Setup("two_handed_wave", standard=True, errors=noisy))
     sensor = recording.sensors[0]
     tracker = make_filter("lkf_constant_velocity")
     folder = tmp_path_factory.mktemp("evaluation") / "wave"
-    topics = ("/humans/bodies/ann/joint_states", "/humans/bodies/ann/joint_states_stddev", "/ground_truth/joint_states")
+    topics = ("/humans/bodies/ann/joint_states", "/humans/bodies/ann/joint_states_stddev", graph.TRUE_ANGLES)
     with BagWriter(folder) as bag:
-        for topic in ("/filtered/skeleton", "/ground_truth/skeleton"):
+        for topic in (graph.FILTERED, graph.TRUE_SKELETON):
             bag.add_topic(topic, POINT_CLOUD)
         for topic in topics:
             bag.add_topic(topic, JOINT_STATE)
-        for truth in recording.truth:
+        for k in range(len(recording.truths[0].stamps_ns)):
+            truth = recording.truths[0].skeleton(k)
             states, _ = angles_to_joint_states(positional_angles(truth), "ann", "world", BAG_MESSAGES)
             bag.write_message(topics[2], states, truth.stamp_ns)
-            bag.write_message("/ground_truth/skeleton", skeletons_to_cloud((truth,), BAG_MESSAGES), truth.stamp_ns)
+            bag.write_message(graph.TRUE_SKELETON, skeletons_to_cloud((truth,), BAG_MESSAGES), truth.stamp_ns)
         for frame in recording.frames:
             seen = frame.skeletons[0]
             if frame.sensor != sensor.pose.sensor:
@@ -46,7 +51,7 @@ def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
             world = Skeleton(seen.stamp_ns, "world", sensor.pose.apply(seen.positions), seen.states)
             result = tracker.update(world)
             assert result is not None
-            bag.write_message("/filtered/skeleton", skeletons_to_cloud((result,), BAG_MESSAGES), seen.stamp_ns)
+            bag.write_message(graph.FILTERED, skeletons_to_cloud((result,), BAG_MESSAGES), seen.stamp_ns)
             states, deviations = angles_to_joint_states(positional_angles(result), "ann", "world", BAG_MESSAGES)
             bag.write_message(topics[0], states, seen.stamp_ns)
             bag.write_message(topics[1], deviations, seen.stamp_ns)

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from body_tracking.filters.linear import FilterError
 from body_tracking.filters.schlagenhauf import SchlagenhaufKalmanFilter, SchlagenhaufParameters
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.simulation.bags import true_positions
-from body_tracking.simulation.motions import MOTIONS
+from body_tracking.simulation.bags import SHIPPED
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from walkers import performed
 
 FRAME_NS = NANOSECONDS // 30
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
@@ -174,11 +174,11 @@ def test_nothing_starts_before_place_and_heading_are_seen(hidden: list[Joint]) -
     assert tracker.calibrated
 
 
-@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.name)
-def test_it_follows_the_thesis_motions(motion: object) -> None:
+@pytest.mark.parametrize("motion", SHIPPED.values())
+def test_it_follows_the_thesis_motions(motion: str) -> None:
     """20 mm of white noise: nearer to the truth than what it is given, on the whole, with constant lengths."""
     rng = np.random.default_rng(3)
-    truth = true_positions(motion, np.arange(0.0, motion.duration, 1.0 / 30.0))  # type: ignore[attr-defined]
+    truth = performed(motion)
     seen = truth + rng.normal(size=truth.shape) * 0.02
     tracker = SchlagenhaufKalmanFilter()
     results = [tracker.update(skeleton(1 + k * FRAME_NS, frame)) for k, frame in enumerate(seen)]

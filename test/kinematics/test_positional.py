@@ -127,6 +127,35 @@ def test_rotation_of_the_humerus_with_the_elbow_at_90_degrees(
     assert both(angles, "humeral_rotation") == pytest.approx((rotation, rotation), abs=1e-9)
 
 
+@given(
+    plane=st.floats(-60.0, 100.0),
+    elevation=st.floats(15.0, 145.0),
+    rotation=st.floats(-85.0, 85.0),
+    flexion=st.floats(10.0, 140.0),
+)
+def test_an_arm_has_the_angles_that_it_is_made_of(
+    plane: float, elevation: float, rotation: float, flexion: float
+) -> None:
+    """The upper arm raised in a plane, turned about itself from where the elbow bends forward, and bent."""
+    positions = t_pose()
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        outward, (p, e, r, f) = sign * LEFT, np.radians([plane, elevation, rotation, flexion])
+        upper = -np.cos(e) * UP + np.sin(e) * (np.cos(p) * outward + np.sin(p) * FORWARD)
+        # to the front of the plane, and up in it: both across the upper arm
+        front = np.cos(p) * FORWARD - np.sin(p) * outward
+        rise = np.sin(e) * UP + np.cos(e) * (np.cos(p) * outward + np.sin(p) * FORWARD)
+        across = np.cos(r) * front - np.sin(r) * rise
+        arm(positions, side, upper, np.cos(f) * upper + np.sin(f) * across)
+    angles = positional_angles(skeleton(positions, 0.01))
+    for name, value in (
+        ("shoulder_plane", plane),
+        ("shoulder_elevation", elevation),
+        ("humeral_rotation", rotation),
+        ("elbow_flexion", flexion),
+    ):
+        assert both(angles, name) == pytest.approx((value, value), abs=1e-6), name
+
+
 @pytest.mark.parametrize(
     ("flexion", "lateral", "axial"), [(30, 0, 0), (0, 20, 0), (0, 0, -40), (50, -25, 30), (-15, 10, 80)]
 )

@@ -53,8 +53,8 @@ class Tracking(Running):
                 for each in reader.messages([graph.skeleton_topic(sensor) for sensor in SENSORS])
             ]
             calibration = {
-                "/ground_truth/calibration": TransformStamped,
-                "/ground_truth/calibration/clock": TimeReference,
+                graph.TRUE_CALIBRATION: TransformStamped,
+                graph.TRUE_CLOCK: TimeReference,
             }
             self.calibration = [
                 (each.topic, deserialize_message(each.cdr, calibration[each.topic]))

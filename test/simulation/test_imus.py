@@ -31,8 +31,8 @@ from body_tracking.simulation.imus import (
     swapped,
     usual_mounting,
 )
-from body_tracking.simulation.motions import minimum_jerk
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
+from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.simulation.people import MODEL, Course, Person, joints
+from body_tracking.simulation.people import MODEL, SEXES, Course, Person, joints
 from body_tracking.simulation.repertoire import (
     END_S,
     MOTIONS,
@@ -160,6 +160,17 @@ def test_exercises_begin_and_end_in_a_t_pose(name: str, seed: int) -> None:
     assert movement.tpose_s == TPOSE_S
     for begin, end in ((0.0, TPOSE_S), (movement.duration - END_S, movement.duration)):
         is_a_t_pose(joints(person, movement.course(np.linspace(begin, end, 20))))
+
+
+@pytest.mark.parametrize("sex", SEXES)
+def test_arms_spread_as_wide_as_the_person_is_tall(sex: str) -> None:
+    """Leonardo's man, to 8 %; the middle of the head is below the crown, and the feet are on the floor."""
+    person = Person.average(sex)
+    positions = joints(person, make_movement("two_handed_wave", person).course(np.array([1.0])))[0]
+    span = np.linalg.norm(positions[Joint.HAND_TIP_LEFT] - positions[Joint.HAND_TIP_RIGHT])
+    assert span == pytest.approx(person.stature, rel=0.08)
+    assert 0.91 * person.stature < positions[Joint.HEAD, 2] < person.stature
+    assert 0.0 < positions[Joint.FOOT_LEFT, 2] < 0.1
 
 
 def is_a_t_pose(positions: FloatArray) -> None:
