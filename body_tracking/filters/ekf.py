@@ -1193,7 +1193,7 @@ class ExtendedKalmanFilter:
             fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
         except ModelError:
             return state
-        present = self.inverse.cost(state.q, points, stddev, state.lengths)
+        present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
         if other and whole and fresh.cost < share * min(fit.cost, present):
             self.counters["restarts"] += 1
