@@ -118,6 +118,8 @@ _LOOK_NS = NANOSECONDS // 2
 these do not give way to a wrong hand, and its strain remains."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_AWAY_NS = NANOSECONDS // 4
+"""Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
 _LINEARISATIONS = 4
 _FAR, _CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
@@ -641,11 +643,15 @@ class ExtendedKalmanFilter:
         Raises:
             LinAlgError: its covariance is none.
         """
+        back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
         state = self._corrected(state, measurement)
         # another pose takes ten times as long to look for as a frame to filter
         if state.stamp_ns - state.attempted_ns > _REST_NS:
             if state.rejected_for.max() > self.parameters.reacquire_after:
                 state = self._reacquired(state, measurement).but(attempted_ns=state.stamp_ns)
+            elif back.any() and self._astray(state, measurement, back):
+                points, stddev = self._as_fitted(measurement, state)
+                state = self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
             elif state.strain > _STRAINED or (
                 state.strain > _SUSPICIOUS and (not state.settled or state.stamp_ns - state.attempted_ns > _LOOK_NS)
             ):
@@ -1182,8 +1188,7 @@ class ExtendedKalmanFilter:
 
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
         """Start the pose anew where another one fits the rejected points much better."""
-        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
-        stddev = self._point_stddev(measurement, state.sensors)
+        points, stddev = self._as_fitted(measurement, state)
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
@@ -1191,6 +1196,17 @@ class ExtendedKalmanFilter:
         covariance = state.covariance.copy()
         covariance[self._lengths, self._lengths] += self._lengths_covariance
         return state.but(covariance=covariance)
+
+    def _astray(self, state: _State, measurement: _Measurement, back: BoolArray) -> bool:
+        """Whether an update by points (19,) that were away for long ended where they are not."""
+        off = measurement.positions - self.model.forward(state.q, state.lengths).positions
+        variance = self._point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
+        return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
+
+    def _as_fitted(self, measurement: _Measurement, state: _State) -> tuple[FloatArray, FloatArray]:
+        """(19, 3) points, NaN where not measured, and their deviations (19,)."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        return points, self._point_stddev(measurement, state.sensors)
 
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""

@@ -609,6 +609,16 @@ def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
         assert np.degrees(hand_errors(hands, truth, side)[late].max()) < 75.0, (seed, side)
 
 
+def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
+    """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
+    for seed in range(320, 326):
+        truth = somebody(seed, 2.4, tempo=1.6)
+        for arm in ARMS.values():
+            estimator = ExtendedKalmanFilter()
+            outputs = run(estimator, measured(truth, 0.008, dropouts=(Dropout(1.0, 2.0, arm),)).skeletons)
+            assert errors_of(outputs, truth, 2.05)[:, np.isin(POINTS, arm)].max() < 0.15, (seed, arm)
+
+
 def test_outliers_hardly_matter() -> None:
     """5 % of the points are off by up to 1 m."""
     clean: list[float] = []
