@@ -113,8 +113,13 @@ _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
 _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
+_LOOK_NS = NANOSECONDS // 2
+"""The same where only a hand is suspected, which much noise makes it be time and again, and lengths stay as they are:
+these do not give way to a wrong hand, and its strain remains."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_AWAY_NS = NANOSECONDS // 4
+"""Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
 _LINEARISATIONS = 4
 _FAR, _CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
@@ -129,6 +134,11 @@ _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 _STRAINED = 4.0
 """Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
 with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 2 to 5."""
+_SUSPICIOUS = 1.0
+"""The same, from which it is worth a look whether a hand is bent and turned the wrong way about. That is seldom with
+little noise, and most of the time in such a pose: lengths that are still learnt give way to it."""
+_LIKELIER = 3.0
+"""Half the difference of two costs, the logarithm of how much likelier a pose is: 20 to 1."""
 _MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
@@ -633,12 +643,18 @@ class ExtendedKalmanFilter:
         Raises:
             LinAlgError: its covariance is none.
         """
+        back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
         state = self._corrected(state, measurement)
         # another pose takes ten times as long to look for as a frame to filter
         if state.stamp_ns - state.attempted_ns > _REST_NS:
             if state.rejected_for.max() > self.parameters.reacquire_after:
                 state = self._reacquired(state, measurement).but(attempted_ns=state.stamp_ns)
-            elif state.strain > _STRAINED:
+            elif back.any() and self._astray(state, measurement, back):
+                points, stddev = self._as_fitted(measurement, state)
+                state = self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
+            elif state.strain > _STRAINED or (
+                state.strain > _SUSPICIOUS and (not state.settled or state.stamp_ns - state.attempted_ns > _LOOK_NS)
+            ):
                 state = self._straightened(state, measurement).but(attempted_ns=state.stamp_ns)
         return self._within(self._bounded(self._measured(state, measurement)))
 
@@ -1172,8 +1188,7 @@ class ExtendedKalmanFilter:
 
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
         """Start the pose anew where another one fits the rejected points much better."""
-        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
-        stddev = self._point_stddev(measurement, state.sensors)
+        points, stddev = self._as_fitted(measurement, state)
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
@@ -1181,6 +1196,17 @@ class ExtendedKalmanFilter:
         covariance = state.covariance.copy()
         covariance[self._lengths, self._lengths] += self._lengths_covariance
         return state.but(covariance=covariance)
+
+    def _astray(self, state: _State, measurement: _Measurement, back: BoolArray) -> bool:
+        """Whether an update by points (19,) that were away for long ended where they are not."""
+        off = measurement.positions - self.model.forward(state.q, state.lengths).positions
+        variance = self._point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
+        return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
+
+    def _as_fitted(self, measurement: _Measurement, state: _State) -> tuple[FloatArray, FloatArray]:
+        """(19, 3) points, NaN where not measured, and their deviations (19,)."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        return points, self._point_stddev(measurement, state.sensors)
 
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
@@ -1193,7 +1219,7 @@ class ExtendedKalmanFilter:
             fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
         except ModelError:
             return state
-        present = self.inverse.cost(state.q, points, stddev, state.lengths)
+        present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
         if other and whole and fresh.cost < share * min(fit.cost, present):
             self.counters["restarts"] += 1
@@ -1240,8 +1266,31 @@ class ExtendedKalmanFilter:
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
         stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2), np.inf)
+        turned = self._hands_turned(state, points, stddev)
+        if turned is not state or state.strain < _STRAINED:
+            return turned
         state = state.but(lean=np.zeros_like(state.lean), leaning=np.zeros(self._points), strain=0.0)
         return self._restarted(state, points, stddev, _MUCH_BETTER)
+
+    def _hands_turned(self, state: _State, points: FloatArray, stddev: FloatArray) -> _State:
+        """Start anew with a hand turned about itself where that is much likelier; else the present state.
+
+        A hand that is bent and turned the wrong way about soon has lengths to match, a thumb that does not stand out.
+        So the lengths count, too: what is average against what they were learnt to be.
+        """
+        lengths, unlikely = state.lengths, 0.0
+        if not state.settled:
+            lengths = self._lengths_of(points)
+            off = state.lengths - lengths
+            unlikely = 0.5 * float(off @ np.linalg.solve(self._lengths_covariance, off))
+        fit = self.inverse.solve(points, stddev, lengths, state.q, tolerance=_CLOSE, alternatives=True)
+        if not self.inverse.is_turned(state.q, fit.q):
+            return state
+        stays = self.inverse.solve(points, stddev, state.lengths, state.q, tolerance=_CLOSE)
+        if stays.cost + unlikely < fit.cost + _LIKELIER:
+            return state
+        self.counters["restarts"] += 1
+        return self._new_state(state.stamp_ns, fit.q, lengths, stddev, state, keep_lengths=state.settled)
 
     def _point_stddev(self, measurement: _Measurement, sensors: Mapping[str, _SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
