@@ -248,10 +248,10 @@ class _SlowBasis:
         limbs = self.limbs.reshape(-1, _DIMENSIONS, self.limbs.shape[1])
         return np.asarray(limbs @ limbs.swapaxes(1, 2))
 
-    def of(self, errors: FloatArray) -> FloatArray:
-        """(57, n) displacement by errors (61, n)."""
+    def of(self, crosses: FloatArray) -> FloatArray:
+        """(n, 57) covariance with the displacement, of what has (n, 61) with the slow errors: C B^T."""
         count = len(self.points)
-        result: FloatArray = self.points[:, None] * errors[:count] + self.limbs @ errors[count:]
+        result: FloatArray = crosses[:, :count] * self.points + crosses[:, count:] @ self.limbs.T
         return result
 
 
@@ -372,7 +372,7 @@ class _Expected:
         innovation: (57,) metres, for a state without any correction.
         covariance: (57, 57) of the innovation.
         own: (19, 3, 3) its blocks of single points, with what curvature adds.
-        cross: (57, 85) covariance of the innovation with the state.
+        cross: (85, 57) covariance of the state with the innovation.
         basis: of the slow errors; None where these are negligible.
     """
 
@@ -421,10 +421,9 @@ class ExtendedKalmanFilter:
         starts = [row * self._size + column for row, column in ((t, t), (v, v), (t, v), (v, t))]
         along = self._size + 1
         self._diagonals = [slice(start, start + (self._nv - 1) * along + 1, along) for start in starts]
-        # of the points' covariance the blocks of each one alone, flat; and what is corrected, where lengths are settled
+        # of the points' covariance the blocks of each one alone, flat
         first = 3 * np.arange(self._points)[:, None] + np.arange(3)
         self._own: IntArray = (3 * self._points * first[:, :, None] + first[:, None, :]).astype(np.intp)
-        self._estimated = {False: (slice(0, self._size),), True: (self._tangent, self._velocities)}
         self._pose_prior()
         self._lengths_covariance = proportions()
         self.counters: dict[str, int] = dict.fromkeys(
@@ -744,7 +743,7 @@ class ExtendedKalmanFilter:
             s = seen.covariance
             s.reshape(-1)[self._own] = grown[:, None, None] * seen.own
             whitening = _whitening(s[rows][:, rows])
-            gain = whitening @ seen.cross[rows]  # (k, 85): L^-1 (P H^T)^T
+            gain = whitening @ seen.cross[:, rows].T  # (k, 85): L^-1 (P H^T)^T
             white = whitening @ seen.innovation[rows]
             before, correction = correction, white @ gain
             covariance = state.covariance - gain.T @ gain
@@ -781,16 +780,15 @@ class ExtendedKalmanFilter:
             kalman = gain.T @ whitening  # (85, k)
             if state.settled:
                 kalman[self._lengths] = 0.0
-            taken = kalman @ observation[rows]
-            news = [(block, taken[block] @ crosses[: self._observed]) for block in self._estimated[state.settled]]
-            crosses = crosses.copy()
-            for block, change in news:
-                crosses[block] -= change
+            change = kalman @ observation[rows] @ crosses[: self._observed]
             if basis is not None:
                 place = names.index(measurement.sensor) * self._slow_size
+                own_change = change[:, place : place + self._slow_size]
+                own_change[:, rows] += kalman * basis.points[rows]
+                own_change[:, 3 * self._points :] += kalman @ basis.limbs[rows]
+            crosses = np.subtract(crosses, change, out=change)
+            if basis is not None:
                 own_cross = crosses[:, place : place + self._slow_size]
-                own_cross[:, rows] -= kalman * basis.points[rows]
-                own_cross[:, 3 * self._points :] -= kalman @ basis.limbs[rows]
             for ball, turn in turns:
                 crosses[ball] = turn @ crosses[ball]
         moved = state.moved + correction[self._velocities]
@@ -867,21 +865,21 @@ class ExtendedKalmanFilter:
             known = self._nv if state.settled else self._observed
             innovation += observation[:, :known] @ correction[:known]
 
-        # (57, 85) covariance of the points, as they are measured, with the state: H P + B C^T
-        cross_covariance = observation @ state.covariance[: self._observed]
+        # (85, 57) covariance of the state with the points as they are measured: P H^T + C B^T
+        cross_covariance = state.covariance[:, : self._observed] @ observation.T
         basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
         cross = state.cross(measurement.sensor)
         if basis is None:
-            s = cross_covariance[:, : self._observed] @ observation.T
+            s = observation @ cross_covariance[: self._observed]
             s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3)
         else:
             # H P H^T + B C^T H^T + H C B^T + B B^T
             half = 0.5 * cross_covariance
             if cross is not None:
-                by_slow = basis.of(cross.T)
+                by_slow = basis.of(cross)
                 cross_covariance += by_slow
                 half += by_slow
-            half = half[:, : self._observed] @ observation.T
+            half = observation @ half[: self._observed]
             s = half + half.T + basis.limbs @ basis.limbs.T
             s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3) + basis.points**2
         # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
