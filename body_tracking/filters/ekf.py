@@ -53,6 +53,9 @@ from body_tracking.skeleton import (
 _DIMENSIONS = 3
 _TRACKED, _INFERRED = np.uint8(TrackingState.TRACKED), np.uint8(TrackingState.INFERRED)
 _EYE3 = np.eye(_DIMENSIONS)
+_MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
+_MEAN_VARIANCE = _EYE3.reshape(-1) / _DIMENSIONS
+"""(9,) factors of a covariance, row by row."""
 _UNKNOWN = np.zeros((N_JOINTS, _DIMENSIONS, _DIMENSIONS))
 _UNKNOWN[:] = np.diag([np.inf] * _DIMENSIONS)
 _START_FRAMES = 4
@@ -113,8 +116,13 @@ _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
 _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
+_LOOK_NS = NANOSECONDS // 2
+"""The same where only a hand is suspected, which much noise makes it be time and again, and lengths stay as they are:
+these do not give way to a wrong hand, and its strain remains."""
 _WHOLE = 15
 """Points that a frame must show to tell a person's size from."""
+_AWAY_NS = NANOSECONDS // 4
+"""Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
 _LINEARISATIONS = 4
 _FAR, _CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
@@ -129,6 +137,11 @@ _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
 _STRAINED = 4.0
 """Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
 with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 2 to 5."""
+_SUSPICIOUS = 1.0
+"""The same, from which it is worth a look whether a hand is bent and turned the wrong way about. That is seldom with
+little noise, and most of the time in such a pose: lengths that are still learnt give way to it."""
+_LIKELIER = 3.0
+"""Half the difference of two costs, the logarithm of how much likelier a pose is: 20 to 1."""
 _MISFIT = 0.02
 """Metres by which a person's points lie beside any pose of the model for a while."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
@@ -243,15 +256,10 @@ class _SlowBasis:
     points: FloatArray
     limbs: FloatArray
 
-    def own_limbs(self) -> FloatArray:
-        """(19, 3, 3) covariance of each point by the slow errors of the limbs."""
-        limbs = self.limbs.reshape(-1, _DIMENSIONS, self.limbs.shape[1])
-        return np.asarray(limbs @ limbs.swapaxes(1, 2))
-
-    def of(self, errors: FloatArray) -> FloatArray:
-        """(57, n) displacement by errors (61, n)."""
+    def of(self, crosses: FloatArray) -> FloatArray:
+        """(n, 57) covariance with the displacement, of what has (n, 61) with the slow errors: C B^T."""
         count = len(self.points)
-        result: FloatArray = self.points[:, None] * errors[:count] + self.limbs @ errors[count:]
+        result: FloatArray = crosses[:, :count] * self.points + crosses[:, count:] @ self.limbs.T
         return result
 
 
@@ -372,7 +380,8 @@ class _Expected:
         innovation: (57,) metres, for a state without any correction.
         covariance: (57, 57) of the innovation.
         own: (19, 3, 3) its blocks of single points, with what curvature adds.
-        cross: (57, 85) covariance of the innovation with the state.
+        unstretched: (19, 3, 3) the same without limbs that are too long or too short.
+        cross: (85, 57) covariance of the state with the innovation.
         basis: of the slow errors; None where these are negligible.
     """
 
@@ -380,6 +389,7 @@ class _Expected:
     innovation: FloatArray
     covariance: FloatArray
     own: FloatArray
+    unstretched: FloatArray
     cross: FloatArray
     basis: _SlowBasis | None
 
@@ -418,13 +428,11 @@ class ExtendedKalmanFilter:
         self._slow_size = 3 * self._points + len(self._limbs)
         # of the flat covariance the diagonals of its blocks: tangent, velocities, and between these
         t, v = self._tangent.start, self._velocities.start
-        starts = [row * self._size + column for row, column in ((t, t), (v, v), (t, v), (v, t))]
-        along = self._size + 1
-        self._diagonals = [slice(start, start + (self._nv - 1) * along + 1, along) for start in starts]
-        # of the points' covariance the blocks of each one alone, flat; and what is corrected, where lengths are settled
+        starts = np.array([row * self._size + column for row, column in ((t, t), (v, v), (t, v), (v, t))])
+        self._diagonals: IntArray = starts[:, None] + (self._size + 1) * np.arange(self._nv)
+        # of the points' covariance the blocks of each one alone, flat
         first = 3 * np.arange(self._points)[:, None] + np.arange(3)
         self._own: IntArray = (3 * self._points * first[:, :, None] + first[:, None, :]).astype(np.intp)
-        self._estimated = {False: (slice(0, self._size),), True: (self._tangent, self._velocities)}
         self._pose_prior()
         self._lengths_covariance = proportions()
         self.counters: dict[str, int] = dict.fromkeys(
@@ -633,12 +641,18 @@ class ExtendedKalmanFilter:
         Raises:
             LinAlgError: its covariance is none.
         """
+        back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
         state = self._corrected(state, measurement)
         # another pose takes ten times as long to look for as a frame to filter
         if state.stamp_ns - state.attempted_ns > _REST_NS:
             if state.rejected_for.max() > self.parameters.reacquire_after:
                 state = self._reacquired(state, measurement).but(attempted_ns=state.stamp_ns)
-            elif state.strain > _STRAINED:
+            elif back.any() and self._astray(state, measurement, back):
+                points, stddev = self._as_fitted(measurement, state)
+                state = self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
+            elif state.strain > _STRAINED or (
+                state.strain > _SUSPICIOUS and (not state.settled or state.stamp_ns - state.attempted_ns > _LOOK_NS)
+            ):
                 state = self._straightened(state, measurement).but(attempted_ns=state.stamp_ns)
         return self._within(self._bounded(self._measured(state, measurement)))
 
@@ -657,7 +671,8 @@ class ExtendedKalmanFilter:
         turns = so3.quat_to_matrix(so3.exp(-step[self.model.ball_v]))
         t, v = self._tangent, self._velocities
         p = state.covariance.copy()
-        for part in (p, p.T):  # F P, then (F P) F^T, as rows and columns
+        crosses = math.exp(-dt / self.parameters.slow_time) * state.crosses
+        for part in (p, p.T, crosses):  # F P, then (F P) F^T, as rows and columns; and F C
             self._turned_back(part, turns)
             part[t] += reach * part[v]
             part[v] *= fade
@@ -665,13 +680,8 @@ class ExtendedKalmanFilter:
         vv = 0.5 * tau * (1.0 - fade * fade)
         tv = 0.5 * reach * reach
         tt = tau * tau * (dt - 2.0 * reach + vv)
-        for diagonal, added in zip(self._diagonals, (tt, vv, tv, tv), strict=True):
-            p.reshape(-1)[diagonal] += added * density
+        p.reshape(-1)[self._diagonals] += np.array([[tt], [vv], [tv], [tv]]) * density
 
-        crosses = math.exp(-dt / self.parameters.slow_time) * state.crosses
-        self._turned_back(crosses, turns)
-        crosses[t] += reach * crosses[v]
-        crosses[v] *= fade
         fading = math.exp(-dt / _WHITENESS_TIME)
         return state.but(
             stamp_ns=stamp_ns,
@@ -716,19 +726,19 @@ class ExtendedKalmanFilter:
         stubborn = measurement.measured & ~near & (state.rejected_for > self.parameters.reacquire_after)
         grown = np.where(stubborn, np.minimum(distances / _DRAWING, _MOST_GROWN), 1.0)
         used = measurement.measured & (near | stubborn)
-        rejected = measurement.measured & ~used
-        self.counters["measured"] += int(used.sum())
-        self.counters["rejected"] += int(rejected.sum())
+        count = int(np.count_nonzero(used))
+        self.counters["measured"] += count
+        self.counters["rejected"] += int(np.count_nonzero(measurement.measured)) - count
         # a wrong pose must not pass for limbs that stretch
-        unstretched = own if seen.basis is None else own - seen.basis.own_limbs()
+        unstretched = seen.unstretched
         lean, leaning, strain = self._leaning(state, y, unstretched, measurement.measured, distances, sensor.white, dt)
 
         rows: slice | IntArray = slice(0, 3 * self._points)
-        if not used.all():
+        if count < self._points:
             rows = np.flatnonzero(np.repeat(used, 3))
         rejected_for = np.where(used & near, 0.0, state.rejected_for + np.where(measurement.measured, dt, 0.0))
         used_ns = np.where(used, measurement.stamp_ns, state.used_ns)
-        if not used.any():
+        if not count:
             sensors = {**state.sensors, measurement.sensor: self._seen_by(sensor, measurement, used)}
             return state.but(
                 sensors=sensors,
@@ -744,7 +754,7 @@ class ExtendedKalmanFilter:
             s = seen.covariance
             s.reshape(-1)[self._own] = grown[:, None, None] * seen.own
             whitening = _whitening(s[rows][:, rows])
-            gain = whitening @ seen.cross[rows]  # (k, 85): L^-1 (P H^T)^T
+            gain = whitening @ seen.cross[:, rows].T  # (k, 85): L^-1 (P H^T)^T
             white = whitening @ seen.innovation[rows]
             before, correction = correction, white @ gain
             covariance = state.covariance - gain.T @ gain
@@ -781,23 +791,22 @@ class ExtendedKalmanFilter:
             kalman = gain.T @ whitening  # (85, k)
             if state.settled:
                 kalman[self._lengths] = 0.0
-            taken = kalman @ observation[rows]
-            news = [(block, taken[block] @ crosses[: self._observed]) for block in self._estimated[state.settled]]
-            crosses = crosses.copy()
-            for block, change in news:
-                crosses[block] -= change
+            change = kalman @ observation[rows] @ crosses[: self._observed]
             if basis is not None:
                 place = names.index(measurement.sensor) * self._slow_size
+                own_change = change[:, place : place + self._slow_size]
+                own_change[:, rows] += kalman * basis.points[rows]
+                own_change[:, 3 * self._points :] += kalman @ basis.limbs[rows]
+            crosses = np.subtract(crosses, change, out=change)
+            if basis is not None:
                 own_cross = crosses[:, place : place + self._slow_size]
-                own_cross[:, rows] -= kalman * basis.points[rows]
-                own_cross[:, 3 * self._points :] -= kalman @ basis.limbs[rows]
             for ball, turn in turns:
                 crosses[ball] = turn @ crosses[ball]
         moved = state.moved + correction[self._velocities]
         before, after = (m.diagonal()[self._velocities] for m in (state.covariance, covariance))
         moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
 
-        predicted_variance = own.trace(axis1=1, axis2=2) / _DIMENSIONS - sensor.white
+        predicted_variance = own.reshape(-1, _EYE3.size) @ _MEAN_VARIANCE - sensor.white
         foreseeable = float(predicted_variance[used].max()) < _FORESEEABLE**2
         slow_scale, slow_estimate, information = (
             self._slow_learnt(sensor, measurement, whitening, white, rows)
@@ -867,26 +876,29 @@ class ExtendedKalmanFilter:
             known = self._nv if state.settled else self._observed
             innovation += observation[:, :known] @ correction[:known]
 
-        # (57, 85) covariance of the points, as they are measured, with the state: H P + B C^T
-        cross_covariance = observation @ state.covariance[: self._observed]
+        # (85, 57) covariance of the state with the points as they are measured: P H^T + C B^T
+        cross_covariance = state.covariance[:, : self._observed] @ observation.T
         basis = self._slow_basis(sensor.slow, measurement, lines.posture.positions)
         cross = state.cross(measurement.sensor)
+        noise = sensor.white.repeat(3)
         if basis is None:
-            s = cross_covariance[:, : self._observed] @ observation.T
-            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3)
+            s = observation @ cross_covariance[: self._observed]
         else:
             # H P H^T + B C^T H^T + H C B^T + B B^T
             half = 0.5 * cross_covariance
             if cross is not None:
-                by_slow = basis.of(cross.T)
+                by_slow = basis.of(cross)
                 cross_covariance += by_slow
                 half += by_slow
-            half = half[:, : self._observed] @ observation.T
-            s = half + half.T + basis.limbs @ basis.limbs.T
-            s.reshape(-1)[:: len(s) + 1] += np.repeat(sensor.white, 3) + basis.points**2
+            half = observation @ half[: self._observed]
+            by_limbs = basis.limbs @ basis.limbs.T
+            s = half + half.T + by_limbs
+            noise += basis.points * basis.points
+        s.reshape(-1)[:: len(s) + 1] += noise
         # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
         own = s.reshape(-1).take(self._own) + 2.0 * curvature[:, :, None] * curvature[:, None, :]
-        return _Expected(observation, innovation, s, own, cross_covariance, basis)
+        unstretched = own if basis is None else own - by_limbs.reshape(-1).take(self._own)
+        return _Expected(observation, innovation, s, own, unstretched, cross_covariance, basis)
 
     def _last_stamp(self, state: _State, measurement: _Measurement) -> int:
         sensor = state.sensors.get(measurement.sensor)
@@ -917,7 +929,7 @@ class ExtendedKalmanFilter:
         if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
             factors = _third_difference((*stamps, measurement.stamp_ns))
             difference = (factors[:3] @ frames.reshape(3, -1)).reshape(-1, 3) + factors[3] * points
-            squared = np.einsum("pi,pi->p", difference, difference) / _DIMENSIONS
+            squared = (difference * difference) @ _MEAN
             known = squared >= 0.0  # not NaN
             if known.any():
                 sensor = self._white_learnt(sensor, squared, known)
@@ -958,11 +970,12 @@ class ExtendedKalmanFilter:
             (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
         """
         least = self._least_slow(sensor.white, measurement)
-        unchanged = _kept(sensor.slow, np.maximum(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
-        if sensor.weight.max() < 2.0 * _POOL:
-            return unchanged  # what is white is not known yet, and would be taken for slow
-        if sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS:
-            return unchanged  # it changes slowly, and takes a while to compute
+        # It changes slowly, and takes a while to compute.
+        soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
+        # What is white is not known at first, and would be taken for slow.
+        if soon or sensor.weight.max() < 2.0 * _POOL:
+            scales = _kept(sensor.slow, np.maximum(sensor.slow, least))
+            return scales, sensor.slow_estimate, sensor.slow_information
         basis = self._basis_of(measurement, measurement.positions)
         half = np.zeros((len(white), self._slow_size))
         half[:, rows] = whitening * basis.points[rows]
@@ -985,7 +998,7 @@ class ExtendedKalmanFilter:
         estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
         # an error is taken for real when it stands out: else every sensor would have a little of it
         real = estimate * np.sqrt(total) > _SIGNIFICANT
-        scales = np.maximum(np.where(real, np.clip(estimate, 0.0, _MAX_SLOW), 0.0), least)
+        scales = np.maximum(np.where(real, np.minimum(estimate, _MAX_SLOW), 0.0), least)
         return _kept(sensor.slow, scales), estimate, total
 
     def _least_slow(self, white: FloatArray, measurement: _Measurement) -> FloatArray:
@@ -1172,8 +1185,7 @@ class ExtendedKalmanFilter:
 
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
         """Start the pose anew where another one fits the rejected points much better."""
-        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
-        stddev = self._point_stddev(measurement, state.sensors)
+        points, stddev = self._as_fitted(measurement, state)
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
@@ -1181,6 +1193,17 @@ class ExtendedKalmanFilter:
         covariance = state.covariance.copy()
         covariance[self._lengths, self._lengths] += self._lengths_covariance
         return state.but(covariance=covariance)
+
+    def _astray(self, state: _State, measurement: _Measurement, back: BoolArray) -> bool:
+        """Whether an update by points (19,) that were away for long ended where they are not."""
+        off = measurement.positions - self.model.forward(state.q, state.lengths).positions
+        variance = self._point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
+        return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
+
+    def _as_fitted(self, measurement: _Measurement, state: _State) -> tuple[FloatArray, FloatArray]:
+        """(19, 3) points, NaN where not measured, and their deviations (19,)."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        return points, self._point_stddev(measurement, state.sensors)
 
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
@@ -1193,7 +1216,7 @@ class ExtendedKalmanFilter:
             fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
         except ModelError:
             return state
-        present = self.inverse.cost(state.q, points, stddev, state.lengths)
+        present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
         if other and whole and fresh.cost < share * min(fit.cost, present):
             self.counters["restarts"] += 1
@@ -1240,8 +1263,31 @@ class ExtendedKalmanFilter:
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._point_stddev(measurement, state.sensors)
         stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2), np.inf)
+        turned = self._hands_turned(state, points, stddev)
+        if turned is not state or state.strain < _STRAINED:
+            return turned
         state = state.but(lean=np.zeros_like(state.lean), leaning=np.zeros(self._points), strain=0.0)
         return self._restarted(state, points, stddev, _MUCH_BETTER)
+
+    def _hands_turned(self, state: _State, points: FloatArray, stddev: FloatArray) -> _State:
+        """Start anew with a hand turned about itself where that is much likelier; else the present state.
+
+        A hand that is bent and turned the wrong way about soon has lengths to match, a thumb that does not stand out.
+        So the lengths count, too: what is average against what they were learnt to be.
+        """
+        lengths, unlikely = state.lengths, 0.0
+        if not state.settled:
+            lengths = self._lengths_of(points)
+            off = state.lengths - lengths
+            unlikely = 0.5 * float(off @ np.linalg.solve(self._lengths_covariance, off))
+        fit = self.inverse.solve(points, stddev, lengths, state.q, tolerance=_CLOSE, alternatives=True)
+        if not self.inverse.is_turned(state.q, fit.q):
+            return state
+        stays = self.inverse.solve(points, stddev, state.lengths, state.q, tolerance=_CLOSE)
+        if stays.cost + unlikely < fit.cost + _LIKELIER:
+            return state
+        self.counters["restarts"] += 1
+        return self._new_state(state.stamp_ns, fit.q, lengths, stddev, state, keep_lengths=state.settled)
 
     def _point_stddev(self, measurement: _Measurement, sensors: Mapping[str, _SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
@@ -1501,7 +1547,8 @@ def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tu
 
 def _kept(before: FloatArray, after: FloatArray) -> FloatArray:
     """(2,) the new scales of slow errors, or the very same as before where they hardly differ."""
-    return before if (np.abs(after - before) <= _SLOW_STEP * before).all() else after
+    pairs = zip(before.tolist(), after.tolist(), strict=True)
+    return before if all(abs(b - a) <= _SLOW_STEP * a for a, b in pairs) else after
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:

@@ -3,6 +3,12 @@
 A closed form finds the pose from the directions between the points, whatever it is; damped least squares (Levenberg
 1944, Marquardt 1963) then fit the points by their noise, with the ranges of motion as priors. The filter starts from it
 and comes back to it after a loss; offline it is a method of its own, frame by frame.
+
+Least squares find the nearest minimum, and an arm has others. Half a turn of the forearm, or of the upper arm with the
+elbow bent the other way, and flexion and deviation of the wrist reversed put every point where it was but the thumb,
+which then lies as far on the other side of the hand; both half turns together, the wrist as it was, move none at all
+(``Ranges.nearest_branch``). Between these poses the ranges of motion stand: a hand that is bent cannot turn about
+itself without leaving them. So the arm is tried all the way round (:meth:`InverseKinematics.turned_about`).
 """
 
 from __future__ import annotations
@@ -23,6 +29,15 @@ _STRAIGHT = 0.15
 """Sine of the elbow's flexion below which the forearm does not show how the upper arm is turned about itself."""
 _LIMIT_STDDEV = np.radians(4.0)
 """How softly the ranges of motion push back."""
+_TURNED = np.radians(60.0)
+"""A hand turned about itself by more than this against another is in another pose; half a turn lies between the two."""
+_NEARLY_STRAIGHT = 0.5
+"""Sine of the elbow's flexion up to which the upper arm is turned about itself, too: beyond, a turn by an eighth of a
+circle takes the wrist of a forearm of 0.25 m away by 0.09 m, more than any sensor's noise."""
+_TURNS = np.radians(np.arange(0.0, 360.0, 45.0))
+_PRONATIONS = 13
+"""A step of 15 degrees moves a thumb's point by 7 mm, less than it takes to get from one valley to the next."""
+_TWIST_STDDEV = np.radians(TWIST_SHARING_STDDEV)
 _HUBER = 2.5
 """Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
 
@@ -46,6 +61,23 @@ class Fit:
     iterations: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Descent:
+    """Where least squares end.
+
+    Attributes:
+        q: (35,) configuration.
+        normal: (32, 32) of the normal equations.
+        cost: there.
+        iterations: it took.
+    """
+
+    q: FloatArray
+    normal: FloatArray
+    cost: float
+    iterations: int
+
+
 class InverseKinematics:
     """Fits ``upper_body`` to points."""
 
@@ -57,6 +89,10 @@ class InverseKinematics:
         self._column = {name: number for number, name in enumerate(names)}
         scalars = [names[v] for v in model.scalar_v]
         self._scalar = {name: int(model.scalar_q[number]) for number, name in enumerate(scalars)}
+        self._hands = [model.segment_names.index(f"hand_{side}") for side in ("left", "right")]
+        self._low_high = np.full((2, model.nq), np.nan)
+        rows = model.scalar_v - 6
+        self._low_high[:, model.scalar_q] = self.ranges.low[rows], self.ranges.high[rows]
 
     def start(self, positions: FloatArray) -> FloatArray:
         """A configuration in closed form, from the directions between the points; no lengths are needed.
@@ -112,6 +148,7 @@ class InverseKinematics:
         *,
         max_iterations: int = 15,
         tolerance: float = 1e-4,
+        alternatives: bool | None = None,
     ) -> Fit:
         """Damped least squares on the points, with the ranges of motion as priors.
 
@@ -122,15 +159,115 @@ class InverseKinematics:
             q: (35,) where to start; the closed form where None.
             max_iterations: at most so many steps.
             tolerance: of the last step's tangent, radians and metres.
+            alternatives: whether to look at arms turned about themselves, too, and take the best; where no start is
+                given, if None.
 
         Raises:
             ModelError: no trunk is seen, and no start was given.
         """
         measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        alternatives = q is None if alternatives is None else alternatives
         if q is None:
             q = self.start(np.where(measured[:, None], positions, np.nan))
         weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
         target = np.where(measured[:, None], positions, 0.0)
+        found = self._descended(q, target, weights, lengths, max_iterations, tolerance)
+        if alternatives:
+            for other in self.turned_about(found.q, positions, stddev, lengths):
+                another = self._descended(other, target, weights, lengths, max_iterations, tolerance)
+                found = another if another.cost < found.cost else found
+        q, normal = found.q, found.normal
+        branch = self.ranges.nearest_branch(q)
+        if branch is not None:
+            q = branch[0]
+            normal = self._normal_equations(q, target, weights, lengths)[0]
+        fitted = self.model.forward(q, lengths).positions
+        residuals = np.where(measured[:, None], positions - fitted, np.nan)
+        covariance = np.linalg.inv(normal).astype(np.float64)
+        return Fit(q, covariance, residuals, found.cost, found.iterations)
+
+    def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> FloatArray:
+        """(...,) what :attr:`Fit.cost` would be at configurations (..., 35); other arguments as of :meth:`solve`."""
+        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
+        target = np.where(measured[:, None], positions, 0.0)
+        size = _sizes((target - self.model.forward(q, lengths).positions) * weights[:, None])
+        return self._costs(size, self.ranges.soft_coordinates(q).values)
+
+    def turned_about(
+        self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray
+    ) -> list[FloatArray]:
+        """Where to look for other poses of either arm: the best one with the hand turned about itself, each.
+
+        The forearm is turned through its whole range, and the wrist is bent so that the hand points where it did. Where
+        the elbow is nearly straight, the upper arm is turned about itself besides, and the elbow bent to where the
+        forearm points.
+
+        Args:
+            q: (35,) a pose.
+            positions: as of :meth:`solve`.
+            stddev: as of :meth:`solve`.
+            lengths: as of :meth:`solve`.
+
+        Returns:
+            (35,) a configuration for each arm whose elbow and hand are seen: a start, not a fit.
+        """
+        seen = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        found = []
+        for side in ("left", "right"):
+            chain = [self._point[Joint[f"{name}_{side.upper()}"]] for name in ("ELBOW", "WRIST", "HAND", "THUMB")]
+            if not seen[chain].all():
+                continue
+            turned = self._all_round(q, side)
+            turned = turned[self.is_turned(q, turned)]
+            if len(turned):
+                found.append(turned[self.cost(turned, positions, stddev, lengths).argmin()])
+        return found
+
+    def is_turned(self, q: FloatArray, other: FloatArray) -> BoolArray:
+        """(...,) whether configurations ``other`` (..., 35) hold a hand turned about itself against ``q`` (35,)."""
+        lengths = self.model.default_lengths()
+        here, there = (
+            self.model.forward(each, lengths).rotations.take(self._hands, axis=-3)[..., 0] for each in (q, other)
+        )
+        result: BoolArray = ((here * there).sum(axis=-1) < np.cos(_TURNED)).any(axis=-1)
+        return result
+
+    def _all_round(self, q: FloatArray, side: str) -> FloatArray:
+        """(n, 35) a configuration with one arm turned all the way round, its hand pointing where it does."""
+        sign = 1.0 if side == "left" else -1.0
+        elbow, pronation, flexion, deviation = (
+            self._scalar[f"{name}_{side}"]
+            for name in ("elbow_flexion", "forearm_pronation", "wrist_flexion", "wrist_deviation")
+        )
+        forearm, hand = (self.model.segment_names.index(f"{name}_{side}") for name in ("forearm", "hand"))
+        upper_arm = self.model.quaternion_of(f"upper_arm_{side}")
+        low, high = self._low_high
+        turns = _TURNS if np.sin(q[elbow]) < _NEARLY_STRAIGHT else _TURNS[:1]
+        turned = np.tile(q, (len(turns) * _PRONATIONS, 1))
+        turn = turns.repeat(_PRONATIONS)
+        turned[:, upper_arm] = so3.quat_multiply(q[upper_arm], so3.exp(turn[:, None] * [0.0, 0.0, 1.0]))
+        turned[:, elbow] = np.arctan2(np.sin(q[elbow]) * np.cos(turn), np.cos(q[elbow]))
+        turned[:, pronation] = np.tile(np.linspace(low[pronation], high[pronation], _PRONATIONS), len(turns))
+        lengths = self.model.default_lengths()
+        along = -self.model.forward(q, lengths).rotations[hand, :, 2]
+        x, y, z = (self.model.forward(turned, lengths).rotations[:, forearm].swapaxes(1, 2) @ along).T
+        turned[:, deviation] = np.arcsin(np.clip(x, -1.0, 1.0))
+        turned[:, flexion] = np.arctan2(-sign * y, -z)
+        bent = [elbow, flexion, deviation]
+        turned[:, bent] = np.clip(turned[:, bent], low[bent], high[bent])
+        return turned
+
+    def _descended(
+        self,
+        q: FloatArray,
+        target: FloatArray,
+        weights: FloatArray,
+        lengths: FloatArray,
+        max_iterations: int,
+        tolerance: float,
+    ) -> _Descent:
+        """The nearest minimum."""
         damping, iterations = 1e-3, 0
         normal, gradient, cost = self._normal_equations(q, target, weights, lengths)
         while iterations < max_iterations:
@@ -149,20 +286,16 @@ class InverseKinematics:
                 damping *= 10.0
                 if damping > 1e8:
                     break
-        branch = self.ranges.nearest_branch(q)
-        if branch is not None:
-            q = branch[0]
-            normal = self._normal_equations(q, target, weights, lengths)[0]
-        fitted = self.model.forward(q, lengths).positions
-        residuals = np.where(measured[:, None], positions - fitted, np.nan)
-        covariance = np.linalg.inv(normal).astype(np.float64)
-        return Fit(q, covariance, residuals, cost, iterations)
+        return _Descent(q, normal, cost, iterations)
 
-    def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> float:
-        """What :attr:`Fit.cost` would be at a given configuration; arguments as of :meth:`solve`."""
-        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
-        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
-        return self._normal_equations(q, np.where(measured[:, None], positions, 0.0), weights, lengths)[2]
+    def _costs(self, size: FloatArray, soft: FloatArray) -> FloatArray:
+        """(...,) of normalised residuals (..., 19) and of the quantities (..., 26) that ranges are about."""
+        points = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=-1)
+        off = (soft - self.ranges.centre) / self.ranges.stddev
+        over = self.ranges.excess_of(soft) / _LIMIT_STDDEV
+        twist = soft @ self.ranges.twist / _TWIST_STDDEV
+        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + twist**2)
+        return result
 
     def _normal_equations(
         self, q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray
@@ -170,13 +303,12 @@ class InverseKinematics:
         """(nv, nv) and (nv,) of one Gauss-Newton step, and the cost at ``q``."""
         lines = self.model.linearise(q, lengths)
         residual = (target - lines.posture.positions) * weights[:, None]
-        size = np.sqrt((residual * residual).sum(axis=1))
+        size = _sizes(residual)
         bounded = np.minimum(1.0, _HUBER / np.maximum(size, _TINY))
         jacobian = (lines.jacobian * (weights * np.sqrt(bounded))[:, None, None]).reshape(-1, self.model.nv)
         error = (residual * np.sqrt(bounded)[:, None]).reshape(-1)
         normal = jacobian.T @ jacobian
         gradient = jacobian.T @ error
-        cost = float(np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum())
 
         soft = self.ranges.soft_coordinates(q)
         off = soft.values - self.ranges.centre
@@ -187,13 +319,12 @@ class InverseKinematics:
         normal[6:, 6:] += inner
         gradient[6:] -= soft.gradients.T @ (prior * off + limit * over)
         twist = float(self.ranges.twist @ soft.values)
-        sharing = 1.0 / np.radians(TWIST_SHARING_STDDEV) ** 2
+        sharing = 1.0 / _TWIST_STDDEV**2
         normal[6:, 6:] += sharing * np.outer(self.ranges.twist, self.ranges.twist)
         gradient[6:] -= sharing * twist * self.ranges.twist
         # the base is anywhere; with too few points it still must be somewhere
         normal[np.arange(6), np.arange(6)] += 1e-4
-        cost += 0.5 * float((prior * off**2 + limit * over**2).sum() + sharing * twist**2)
-        return normal, gradient, cost
+        return normal, gradient, float(self._costs(size, soft.values))
 
     def _set_trunk(self, q: FloatArray, part: str, rotation: FloatArray) -> None:
         """Flexion, lateral and axial angle of an intrinsic y-x-z rotation."""
@@ -253,6 +384,12 @@ class InverseKinematics:
         posture = self.model.forward(q, self.model.default_lengths())
         rotation: FloatArray = posture.rotations[self.model.segment_names.index(segment)]
         return rotation
+
+
+def _sizes(residuals: FloatArray) -> FloatArray:
+    """(...) of vectors (..., 3)."""
+    result: FloatArray = np.sqrt((residuals * residuals).sum(axis=-1))
+    return result
 
 
 def _unit(v: FloatArray) -> FloatArray:

@@ -535,6 +535,90 @@ def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) ->
     assert rms(errors_of(outputs, truth, 1.0)) < np.sqrt(3.0) * NOISE + 0.01
 
 
+def hand_columns(side: str) -> list[int]:
+    """Of the tangent: pronation, flexion and deviation."""
+    names = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
+    return [MODEL.coordinate_names.index(f"{name}_{side}") for name in names]
+
+
+def turned_over(q: FloatArray, side: str) -> FloatArray:
+    """The forearm turned by half a turn and the wrist bent the other way, which moves the thumb alone."""
+    columns = hand_columns(side)
+    pronation, *wrist = MODEL.difference(MODEL.neutral(), q)[columns]
+    tangent = np.zeros(MODEL.nv)
+    tangent[columns] = -np.copysign(np.pi, pronation), *(-2.0 * np.array(wrist))
+    return MODEL.integrate(q, tangent)
+
+
+def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[int, Truth, str]]:
+    """(seed, what is true, side) of people who have bent a wrist by more than 40 degrees at some time."""
+    found: list[tuple[int, Truth, str]] = []
+    seed = 0
+    while len(found) < count:
+        truth = somebody(seed, seconds)
+        then = int(np.searchsorted(truth.times, bent_at))
+        angles = MODEL.difference(MODEL.neutral(), truth.q[then])
+        found += [
+            (seed, truth, side) for side in ("left", "right") if abs(angles[hand_columns(side)[1]]) > np.radians(40.0)
+        ]
+        seed += 1
+    return found[:count]
+
+
+def hand_errors(rotations: Sequence[FloatArray], truth: Truth, side: str) -> FloatArray:
+    """(n,) radians by which a hand is turned against the truth, from rotations (12, 3, 3) of the last n instants."""
+    hand = MODEL.segment_names.index(f"hand_{side}")
+    true = MODEL.forward(truth.q[-len(rotations) :], truth.lengths).rotations[:, hand]
+    cosine = 0.5 * (np.einsum("kij,kij->k", np.stack(rotations)[:, hand], true) - 1.0)
+    result: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return result
+
+
+def pose(estimator: ExtendedKalmanFilter) -> FloatArray:
+    """(12, 3, 3) the rotations of all segments."""
+    return MODEL.forward(known(estimator).q, known(estimator).lengths).rotations
+
+
+@pytest.mark.parametrize("noise", [0.006, 0.013, 0.025])
+def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: float) -> None:
+    for seed, truth, side in bent_hands(10, 1.2):
+        estimator = ExtendedKalmanFilter()
+        estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
+        hands = []
+        for skeleton in measured(truth, noise).skeletons:
+            estimator.update(skeleton)
+            hands.append(pose(estimator))
+        late = truth.times > 0.5
+        assert np.degrees(hand_errors(hands, truth, side)[late].max()) < 75.0, (seed, side)
+
+
+@pytest.mark.parametrize("noise", [0.006, 0.02])
+def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
+    """As if a movement that nobody saw had ended in the wrong pose: at the latest after a second and a half."""
+    for seed, truth, side in bent_hands(6, 2.5, 0.7):
+        estimator = ExtendedKalmanFilter()
+        hands = []
+        for skeleton, time in zip(measured(truth, noise).skeletons, truth.times, strict=True):
+            estimator.update(skeleton)
+            state = estimator._state
+            if time > 0.7 and state is not None:
+                if not hands:
+                    estimator._state = state.but(q=turned_over(state.q, side))
+                hands.append(pose(estimator))
+        late = truth.times[-len(hands) :] > 2.2
+        assert np.degrees(hand_errors(hands, truth, side)[late].max()) < 75.0, (seed, side)
+
+
+def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
+    """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
+    for seed in range(320, 326):
+        truth = somebody(seed, 2.4, tempo=1.6)
+        for arm in ARMS.values():
+            estimator = ExtendedKalmanFilter()
+            outputs = run(estimator, measured(truth, 0.008, dropouts=(Dropout(1.0, 2.0, arm),)).skeletons)
+            assert errors_of(outputs, truth, 2.05)[:, np.isin(POINTS, arm)].max() < 0.15, (seed, arm)
+
+
 def test_outliers_hardly_matter() -> None:
     """5 % of the points are off by up to 1 m."""
     clean: list[float] = []

@@ -10,7 +10,7 @@ from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
-from body_tracking.skeleton import BoolArray, FloatArray, Joint
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint
 
 INVERSE = InverseKinematics(MODEL)
 RANGES = Ranges(MODEL)
@@ -46,6 +46,36 @@ def people(count: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 def of(*joints: Joint) -> BoolArray:
     """(19,) which points of the model these joints are."""
     return np.isin(MODEL.joints, joints)
+
+
+def with_bent_wrists(q: FloatArray, seed: int) -> FloatArray:
+    """(count, 35) the same with forearms and wrists turned anew: flexion from half to nearly all of its range."""
+    rng = np.random.default_rng(seed)
+    bent = q.copy()
+    for side in ("left", "right"):
+        low, high = (limits[columns_of(side) - 6] for limits in (RANGES.low, RANGES.high))
+        angles = rng.uniform(low, high, (len(q), len(low)))
+        forth = rng.random(len(q)) < 0.5
+        angles[:, 1] = np.where(forth, high[1], low[1]) * rng.uniform(0.5, 0.95, len(q))
+        tangent = np.zeros((len(q), MODEL.nv))
+        tangent[:, columns_of(side)] = angles - MODEL.difference(MODEL.neutral(), bent)[:, columns_of(side)]
+        bent = MODEL.integrate(bent, tangent)
+    return bent
+
+
+def columns_of(side: str) -> IntArray:
+    """(3,) of the tangent: pronation, flexion, deviation."""
+    names = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
+    return np.array([NAMES.index(f"{name}_{side}") for name in names], dtype=np.intp)
+
+
+def turned_over(q: FloatArray, side: str) -> FloatArray:
+    """(35,) the forearm turned by half a turn, and the wrist bent the other way."""
+    columns = columns_of(side)
+    pronation, *wrist = MODEL.difference(MODEL.neutral(), q)[columns]
+    tangent = np.zeros(MODEL.nv)
+    tangent[columns] = -np.copysign(np.pi, pronation), *(-2.0 * np.array(wrist))
+    return MODEL.integrate(q, tangent)
 
 
 def distances(q: FloatArray, lengths: FloatArray, points: FloatArray) -> FloatArray:
@@ -205,3 +235,59 @@ def test_the_cost_is_that_of_the_fit() -> None:
         for _ in range(10):
             away = MODEL.integrate(fit.q, rng.normal(scale=0.05, size=MODEL.nv))
             assert INVERSE.cost(away, noisy, stddev, length) > fit.cost
+
+
+def test_a_hand_turned_over_moves_the_thumb_alone() -> None:
+    """By twice its lever: this is why one pose is so easily taken for the other."""
+    q, lengths, _ = people(20, 11)
+    for one, length in zip(with_bent_wrists(q, 11), lengths, strict=True):
+        points = MODEL.forward(one, length).positions
+        for side in ("left", "right"):
+            moved = distances(turned_over(one, side), length, points)
+            thumb = of(Joint[f"THUMB_{side.upper()}"])
+            assert_allclose(moved[~thumb], 0.0, atol=1e-12)
+            assert_allclose(moved[thumb], 2.0 * length[MODEL.length_names.index(f"thumb_out_{side}")])
+            assert INVERSE.is_turned(one, turned_over(one, side))
+        assert not INVERSE.is_turned(one, MODEL.integrate(one, np.full(MODEL.nv, 0.1)))
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02])
+def test_a_bent_hand_is_found_in_the_likeliest_pose(noise: float) -> None:
+    """Whether it is sought from the points alone or from the pose with the hand turned over."""
+    rng = np.random.default_rng(12)
+    q, lengths, _ = people(20, 12)
+    right = 0
+    stddev = np.full(len(MODEL.joints), noise)
+    for number, (one, length) in enumerate(zip(with_bent_wrists(q, 12), lengths, strict=True)):
+        points = MODEL.forward(one, length).positions
+        noisy = points + noise * rng.normal(size=points.shape)
+        least = INVERSE.solve(noisy, stddev, length, one, max_iterations=50).cost
+        wrong = turned_over(one, ("left", "right")[number % 2])
+        found = INVERSE.solve(noisy, stddev, length, max_iterations=50)
+        assert found.cost < least + 0.1
+        again = INVERSE.solve(noisy, stddev, length, wrong, max_iterations=50, alternatives=True)
+        assert again.cost < least + 0.1
+        right += not INVERSE.is_turned(one, found.q)
+    assert right >= 0.95 * len(q)
+
+
+def test_costs_of_many_poses_are_those_of_each() -> None:
+    q, lengths, points = people(6, 13)
+    stddev = np.full(points.shape[1], 0.02)
+    missing = np.where(of(Joint.HEAD)[:, None], np.nan, points[0])
+    together = INVERSE.cost(q, missing, stddev, lengths[0])
+    assert together.shape == (len(q),)
+    assert_allclose(together, [INVERSE.cost(each, missing, stddev, lengths[0]) for each in q])
+
+
+def test_an_arm_is_turned_only_where_its_hand_is_seen() -> None:
+    q, lengths, points = people(10, 14)
+    stddev = np.full(points.shape[1], 0.02)
+    for one, length, point in zip(q, lengths, points, strict=True):
+        seen = np.where(of(Joint.THUMB_LEFT)[:, None], np.nan, point)
+        for other in INVERSE.turned_about(one, seen, stddev, length):
+            assert_allclose(other[:7], one[:7])
+            moved = MODEL.difference(one, other) != 0.0
+            assert INVERSE.is_turned(one, other)
+            assert not any(moved[k] for k, name in enumerate(NAMES) if not name.endswith("_right"))
+            assert np.abs(RANGES.excess(other))[columns_of("right") - 6].max() < 1e-9
