@@ -97,9 +97,16 @@ class KinectErrors:
     length_spread: float = _parameter(
         0.035, "standard deviation of the length of a limb or of the trunk, as a share of it", "1", 0.0, 0.5
     )
+    anatomical: float = _parameter(
+        1.0,
+        "how much of what lies between reported and anatomical joint of everybody, constant in the body",
+        "1",
+        0.0,
+        5.0,
+    )
     offset: float = _parameter(
-        0.020,
-        "standard deviation of what lies between reported and anatomical joint, constant in the body",
+        0.010,
+        "standard deviation of what lies between reported and anatomical joint of a person besides",
         "m",
         0.0,
         0.2,
@@ -256,6 +263,27 @@ SLOW_SCALE: Final[FloatArray] = np.array([_part_of(joint)[1] for joint in Joint]
 _DEPTH: Final[FloatArray] = np.array([_part_of(joint)[2] for joint in Joint])
 DEPTH_PATTERN: Final[FloatArray] = _DEPTH / np.sqrt((_DEPTH**2).mean())
 """(25,) multiples of ``depth_offset``."""
+_ANATOMICAL: Final = {
+    "SPINE_BASE": (-0.0308, -0.0071, -0.0298),
+    "SPINE_MID": (-0.0616, -0.0143, -0.0597),
+    "NECK": (-0.0366, -0.0394, -0.0199),
+    "HEAD": (-0.0366, -0.0394, -0.0199),
+    "SHOULDER_LEFT": (0.0188, -0.0678, -0.0439),
+    "ELBOW_LEFT": (-0.0184, -0.0434, -0.0303),
+    "WRIST_LEFT": (0.0323, 0.0036, -0.0341),
+    "HAND_LEFT": (0.0508, 0.0193, -0.0686),
+    "SHOULDER_RIGHT": (-0.0466, -0.0386, -0.0459),
+    "ELBOW_RIGHT": (0.0058, -0.0642, -0.0534),
+    "WRIST_RIGHT": (-0.0881, -0.0079, -0.0068),
+    "HAND_RIGHT": (-0.0734, -0.0343, 0.0039),
+    "SPINE_SHOULDER": (-0.0366, -0.0394, -0.0199),
+    "HAND_TIP_LEFT": (0.0693, 0.0350, -0.1031),
+    "THUMB_LEFT": (0.0508, 0.0193, -0.0686),
+    "HAND_TIP_RIGHT": (-0.0587, -0.0607, 0.0146),
+    "THUMB_RIGHT": (-0.0734, -0.0343, 0.0039),
+}
+"""What ``benchmarks/calibrate_simulator.py --fit`` found, metres forward, left and up in the frames of the segments."""
+ANATOMICAL: Final[FloatArray] = np.array([_ANATOMICAL.get(joint.name, (0.0, 0.0, 0.0)) for joint in Joint])
 ALONG_RAY: Final = 1.5
 """Errors along the ray against those across it."""
 _RAY_AXES: Final = np.array([1.0, 1.0, ALONG_RAY])
@@ -637,7 +665,7 @@ class _Sighting:
 
     def _offset(self, view: _View, segments: FloatArray, misreading: Misreading) -> FloatArray:
         """(n, 25, 3) what is constant: in the body's frames, and along the ray."""
-        constant = self.errors.offset * SLOW_SCALE[:, None] * misreading.offset
+        constant = self.errors.anatomical * ANATOMICAL + self.errors.offset * SLOW_SCALE[:, None] * misreading.offset
         offset = np.einsum("nik,jk->nji", view.trunk, constant)
         # limbs: by the least rotation that takes the segment's rest direction to where it points
         limbs = ~_ON_TRUNK
