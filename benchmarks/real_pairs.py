@@ -11,6 +11,7 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -28,7 +29,7 @@ from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.recording.stages import ReplaySettings
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}
 """Relative yaw of kinect2 to kinect1 in Kinect camera axes, degrees."""
@@ -49,9 +50,19 @@ def skeletons(bag: Path, topic: str) -> list[Skeleton]:
     return sorted((each[0] for each in found if each), key=lambda each: each.stamp_ns)
 
 
-def disagreement(bag: Path, result: CalibrationResult) -> float:
-    """Mean distance between what both sensors say of a joint, all joints, all frames that both cover; metres."""
-    one, two = skeletons(bag, "/kinect1/skeleton"), skeletons(bag, "/kinect2/skeleton")
+def paired(
+    one: Sequence[Skeleton], two: Sequence[Skeleton], result: CalibrationResult
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """What both sensors say at the captures of the first, where the second has frames close before and after.
+
+    Args:
+        one: frames of kinect1, in order of their stamps.
+        two: of kinect2.
+        result: where both stand, and how their clocks run.
+
+    Returns:
+        (n,) nanoseconds of kinect1's clock; (n, 25, 3) metres in ``world`` by kinect1; the same by kinect2.
+    """
     clock = result.clocks["kinect2"]
     stamps = np.array([clock.to_reference(each.stamp_ns) for each in two])
     theirs = result.poses["kinect2"].apply(np.stack([each.positions for each in two]))
@@ -62,7 +73,13 @@ def disagreement(bag: Path, result: CalibrationResult) -> float:
     covered = (at >= stamps[after - 1]) & (at <= stamps[after]) & (step > 0) & (step < 0.08 * NANOSECONDS)
     share = ((at - stamps[after - 1]) / np.maximum(step, 1))[:, None, None]
     between = theirs[after - 1] + share * (theirs[after] - theirs[after - 1])
-    return float(np.linalg.norm(ours - between, axis=-1)[covered].mean())
+    return at[covered], ours[covered], between[covered]
+
+
+def disagreement(bag: Path, result: CalibrationResult) -> float:
+    """Mean distance between what both sensors say of a joint, all joints, all frames that both cover; metres."""
+    _, ours, theirs = paired(skeletons(bag, "/kinect1/skeleton"), skeletons(bag, "/kinect2/skeleton"), result)
+    return float(np.linalg.norm(ours - theirs, axis=-1).mean())
 
 
 def settling(bag: Path, movement_ns: int, nominal: float) -> float:
