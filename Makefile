@@ -61,7 +61,7 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (half an hour)
+bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (an hour and a half)
 	@data=$${BODY_TRACKING_DATA:-../shared/data}; missed=; \
 	run() { echo; echo "== $$*"; $(BIN)/python "$$@" || missed="$$missed $$1"; }; \
 	with() { folder=$$1; shift; if [ -d "$$data/$$folder" ]; then run "$$@"; \
@@ -73,6 +73,10 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	run benchmarks/robustness.py --runs 100; \
 	with kinect_pairs benchmarks/real_pairs.py; \
 	with kinect_pairs benchmarks/real_people.py; \
+	with kinect_pairs benchmarks/simulated_pairs.py; \
+	with plug_in_gait benchmarks/plug_in_gait.py; \
+	run benchmarks/calibrate_simulator.py; \
+	run benchmarks/accuracy.py --seeds 2 --layout-seeds 1 --sensitivity-seeds 1; \
 	with kinect_vs_vicon benchmarks/kinect_vs_vicon.py; \
 	if $(BIN)/python -c 'import biorbd, opensim' 2>/dev/null; then run benchmarks/estimators.py; \
 	else echo; echo "== benchmarks/estimators.py is left out: its peers come with: $(BIN)/pip install -e '.[peers]'"; fi; \

@@ -51,6 +51,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from calibrate_simulator import PAGE, PAIRS
 from real_pairs import NOMINAL, PEOPLE, paired
 from scipy.spatial.transform import Rotation
 
@@ -436,14 +437,14 @@ def section(rows: Sequence[Row]) -> str:
     """The rows as a section of Markdown, a table per layout."""
     marked = sum(row.differs for row in rows)
     lines = [
-        "## Real and simulated pairs",
+        PAIRS,
         "",
         "Three people before two Kinect v2 sensors in each of three layouts, who stand still, step to and fro and walk",
         "about, and as many simulated people who do much the same before sensors at the same places; both calibrated",
         "alike. Medians over the three recordings of a layout, with their range in brackets. A row is marked where the",
         f"simulated figure is off by more than a half of the real one: {marked} of {len(rows)}. What happens rarely,",
         "such as bodies that are turned round, differs between three people by chance. How each statistic is defined",
-        "stands in `benchmarks/simulated_pairs.py`, which writes this section (`--markdown`).",
+        "stands in `benchmarks/simulated_pairs.py`, which writes this section.",
     ]
     for layout in dict.fromkeys(row.layout for row in rows):
         lines += ["", f"### {layout}", "", "| statistic | unit | real | simulated | |", "|---|---|---:|---:|---|"]
@@ -470,7 +471,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there, as a section of Markdown")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/simulator.md")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     args = parser.parse_args()
     files = {layout: [args.data / "kinect_pairs" / f"{who}_{layout}.csv.gz" for who in PEOPLE] for layout in NOMINAL}
@@ -486,8 +487,8 @@ def main() -> int:
             real.append(statistics(pair))
             simulated.append(statistics(simulated_pair(pair, seed)))
         rows += rows_of(layout, real, simulated)
-    if args.markdown is not None:
-        args.markdown.write_text(section(rows), encoding="utf-8")
+    if args.write:
+        PAGE.write_text(PAGE.read_text().partition(PAIRS)[0] + section(rows))
     print(
         json.dumps([{**asdict(row), "differs": row.differs} for row in rows], indent=2) if args.json else printed(rows)
     )
