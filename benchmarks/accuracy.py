@@ -1,0 +1,503 @@
+"""How accurate each method is, on simulated people of whom everything is known: single sensor, thesis, ours.
+
+Every run is a person who does one thing in their own way before Kinect v2 sensors that err like real ones
+(``calibrate_simulator.py`` says how like). All methods get the same frames. Nobody is in any of them whom the simulator
+was calibrated with, and most motions are others; nothing here was used to tune a filter.
+
+methods   ``one sensor``: what kinect1 says, in world; ``thesis ...``: the pipeline of Schlagenhauf (2017)
+          (``thesis_pipeline``); ``fused``, ``default`` and ``ekf``: this package at its defaults, offline, through the
+          messages of the live graph (calibration, fusion, filter, joint angles).
+errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from when all have
+          begun: mean 3D error (mm); the same without each joint's constant offset in the body's own frames ("fixed");
+          the latter where a joint is hidden from one sensor or more; RMSE of shoulder elevation and elbow flexion
+          (degrees); share of the frames in which these lie within 1.96 stated standard deviations; delay (ms).
+
+Parts: ``main`` (every motion in layout 4), ``layouts`` (the nine layouts), ``sensitivity`` (every parameter of the
+simulator at half and at double). Means over seeds with 95 % confidence intervals (Student). ``--write`` makes
+docs/accuracy.md and its figure.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
+
+from body_tracking import graph
+from body_tracking.cdr import decode_skeletons, encode_skeletons
+from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors, wrapped
+from body_tracking.evaluation.segments import segment_frames
+from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
+from body_tracking.recording.stages import FilterAndAngles, ReplaySettings, Upstream
+from body_tracking.simulation.kinect import KinectErrors, parameters
+from body_tracking.simulation.layouts import NUMBERS, layout
+from body_tracking.simulation.occlusion import cover
+from body_tracking.simulation.repertoire import MOTIONS
+from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+
+TEN = Schlagenhauf26().joints
+ONE, FUSED, DEFAULT, OURS = "one sensor", "fused", f"default ({DEFAULT_FILTER})", "ekf"
+METHODS = (ONE, FUSED, LKF1, LKF2, EKF, DEFAULT, OURS)
+KNOWN = ("two_handed_wave", "slow_down", "torso_twist", "move_along")
+"""Motions that the simulator was calibrated with."""
+TWIST = "torso_twist"
+ANGLES = {
+    "elevation": [ANGLE_NAMES.index(f"shoulder_elevation_{side}") for side in ("left", "right")],
+    "elbow": [ANGLE_NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")],
+}
+_FIRST_SEED = 1000
+"""Far from the subjects of the calibration."""
+_HIDDEN_FROM = 0.35
+_NORMAL = 1.959964
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What is simulated: a motion, a layout, a seed, and one parameter of the sensors times a factor, if any."""
+
+    motion: str
+    layout: int = 4
+    seed: int = _FIRST_SEED
+    parameter: str = ""
+    factor: float = 1.0
+
+    def recording(self) -> SimulatedRecording:
+        """Simulate it."""
+        errors = KinectErrors()
+        if self.parameter:
+            errors = errors.scaled(self.factor, (self.parameter,))
+        return simulate(Setup(self.motion, layout(self.layout), seed=self.seed, errors=errors))
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of one method in one run; NaN where there is nothing to say."""
+
+    error: float
+    fixed: float
+    hidden: float
+    elevation: float
+    elbow: float
+    covered_elevation: float
+    covered_elbow: float
+    delay: float
+    frames: float
+
+
+class _Collector:
+    """The second half of the graph, in memory."""
+
+    def __init__(self, settings: ReplaySettings) -> None:
+        self.fused: list[Skeleton] = []
+        self.filtered: list[Skeleton] = []
+        self._rest = FilterAndAngles(settings, self._published)
+
+    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One message of the first half, or of a sensor."""
+        if topic == graph.FUSED:
+            self.fused += decode_skeletons(cdr) or ()
+        self._rest.take(topic, cdr, log_time_ns)
+
+    def finish(self) -> None:
+        self._rest.finish()
+
+    def _published(self, topic: str, cdr: bytes) -> None:
+        if topic == graph.FILTERED:
+            self.filtered += decode_skeletons(cdr) or ()
+
+
+def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skeleton], list[Skeleton]]:
+    """Fused and filtered skeletons of the graph at its defaults."""
+    sensors = tuple(sensor.pose.sensor for sensor in recording.sensors)
+    settings = ReplaySettings(sensors, filter_name=filter_name)
+    collector = _Collector(settings)
+    upstream = Upstream(settings, collector)
+    upstream.start(recording.frames[0].received_ns)
+    for frame in recording.frames:
+        cdr = encode_skeletons(frame.skeletons)
+        (skeleton,) = decode_skeletons(cdr) or ()
+        collector.take(graph.skeleton_topic(frame.sensor), cdr, frame.received_ns)
+        upstream.push(frame.sensor, skeleton, frame.received_ns)
+    upstream.finish(recording.frames[-1].received_ns)
+    collector.finish()
+    return collector.fused, collector.filtered
+
+
+def outputs_of(recording: SimulatedRecording, methods: Sequence[str]) -> dict[str, list[Skeleton]]:
+    """What each method makes of a recording, in world and in the reference clock."""
+    reference = recording.sensors[0].pose
+    outputs: dict[str, list[Skeleton]] = {}
+    if ONE in methods:
+        outputs[ONE] = [
+            Skeleton(each.stamp_ns, "world", reference.apply(each.positions), each.states)
+            for frame in recording.frames
+            if frame.sensor == reference.sensor
+            for each in frame.skeletons
+        ]
+    hers = [name for name in (LKF1, LKF2, EKF) if name in methods]
+    if hers:
+        names = [sensor.pose.sensor for sensor in recording.sensors]
+        outputs |= {name: run_thesis(recording.frames, names, hers).outputs[name] for name in hers}
+    for name, filter_name in ((DEFAULT, DEFAULT_FILTER), (OURS, "ekf")):
+        if name in methods:
+            fused, outputs[name] = run_ours(recording, filter_name)
+            if FUSED in methods:
+                outputs[FUSED] = fused
+    return outputs
+
+
+def figures_of(run: Run, methods: Sequence[str] = METHODS) -> dict[str, Figures]:
+    """Simulate a run and measure every method."""
+    recording = run.recording()
+    truth = recording.truths[0]
+    zero = int(truth.stamps_ns[0])
+    curve = Curve((truth.stamps_ns - zero) / NANOSECONDS, truth.positions)
+    outputs = outputs_of(recording, methods)
+    silent = Figures(*[float("nan")] * len(fields(Figures)))
+    speaking = {name: each for name, each in outputs.items() if len(each) > 30}
+    begin = max(each[0].stamp_ns for each in speaking.values())
+    return {
+        name: _figures([each for each in outputs[name] if each.stamp_ns >= begin], recording, curve, zero)
+        if name in speaking
+        else silent
+        for name in methods
+    }
+
+
+def _figures(skeletons: Sequence[Skeleton], recording: SimulatedRecording, curve: Curve, zero: int) -> Figures:
+    times = np.array([(each.stamp_ns - zero) / NANOSECONDS for each in skeletons])
+    first, last = curve.span
+    inside = (times >= first) & (times <= last) & (np.diff(times, prepend=-np.inf) > 0.0)
+    times = times[inside]
+    skeletons = [each for each, there in zip(skeletons, inside, strict=True) if there]
+    found = np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in skeletons])
+    true = curve.at(times)
+    errors = joint_errors(found, true)
+    own = np.einsum("njba,njb->nja", segment_frames(true), found - true) - errors.offset
+    apart = np.linalg.norm(own, axis=-1)[:, TEN]
+    hidden = _hidden(recording, true)[:, TEN] & np.isfinite(apart)
+    angles, stddev = _angles(skeletons)
+    right, _ = _angles([_true_skeleton(each) for each in true])
+    off = wrapped(angles - right)
+    covered = np.where(np.isfinite(stddev), np.abs(off) <= _NORMAL * stddev, np.nan)
+    rmse = {name: float(np.degrees(np.sqrt(np.nanmean(off[:, columns] ** 2)))) for name, columns in ANGLES.items()}
+    cover_of = {name: _nanmean(covered[:, columns]) for name, columns in ANGLES.items()}
+    delay = find_delay(Trajectory(times, found), curve, window=0.25)
+    return Figures(
+        1e3 * float(np.nanmean(errors.mean[TEN])),
+        1e3 * float(np.nanmean(errors.fixed_mean[TEN])),
+        1e3 * float(apart[hidden].mean()) if hidden.any() else float("nan"),
+        rmse["elevation"],
+        rmse["elbow"],
+        cover_of["elevation"],
+        cover_of["elbow"],
+        1e3 * delay,
+        float(len(times)),
+    )
+
+
+def _nanmean(values: FloatArray) -> float:
+    there = np.isfinite(values)
+    return float(values[there].mean()) if there.any() else float("nan")
+
+
+def _hidden(recording: SimulatedRecording, true: FloatArray) -> BoolArray:
+    """(n, 25) which joints lie behind the body for one sensor or more."""
+    capsules = recording.truths[0].person.capsules()
+    return np.any(
+        [
+            cover((true - sensor.pose.translation) @ sensor.pose.rotation, capsules) > _HIDDEN_FROM
+            for sensor in recording.sensors
+        ],
+        axis=0,
+    )
+
+
+def _true_skeleton(positions: FloatArray) -> Skeleton:
+    return Skeleton(0, "world", positions, np.full(len(positions), TrackingState.TRACKED, dtype=np.uint8))
+
+
+def _angles(skeletons: Iterable[Skeleton]) -> tuple[FloatArray, FloatArray]:
+    """(n, m) positional angles and their standard deviations, radians; NaN and infinity where there is none."""
+    found = [positional_angles(each) for each in skeletons]
+    return np.stack([each.position for each in found]), np.stack([each.position_stddev for each in found])
+
+
+# --- many runs
+
+
+def _measure(job: tuple[Run, tuple[str, ...]]) -> dict[str, Figures]:
+    return figures_of(*job)
+
+
+def measure(jobs: Sequence[tuple[Run, tuple[str, ...]]], workers: int) -> list[dict[str, Figures]]:
+    """All runs, in their order, on several processors; shows how far it is."""
+    began, results = time.monotonic(), []
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        for number, result in enumerate(pool.imap(_measure, jobs, chunksize=1), start=1):
+            results.append(result)
+            left = (time.monotonic() - began) / number * (len(jobs) - number)
+            print(f"\r{number} of {len(jobs)} runs, {left / 60:.0f} min left ", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return results
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """A mean over seeds and half the width of its 95 % confidence interval."""
+
+    value: float
+    half: float
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Mean:
+        """Over those that are finite."""
+        known_ones = np.array([value for value in values if np.isfinite(value)])
+        if len(known_ones) == 0:
+            return cls(float("nan"), float("nan"))
+        if len(known_ones) == 1:
+            return cls(float(known_ones[0]), float("nan"))
+        spread = float(known_ones.std(ddof=1)) / np.sqrt(len(known_ones))
+        return cls(float(known_ones.mean()), float(student.ppf(0.975, len(known_ones) - 1)) * spread)
+
+    def __str__(self) -> str:
+        return f"{self.value:.1f} ± {self.half:.1f}"
+
+
+Table = dict[str, dict[str, dict[str, Mean]]]
+"""Motion (or another kind of run), method, figure."""
+
+
+def table_of(kinds: Sequence[str], results: Sequence[Mapping[str, Figures]]) -> Table:
+    """Means of the results of each kind."""
+    table: Table = {}
+    for kind in dict.fromkeys(kinds):
+        own = [result for name, result in zip(kinds, results, strict=True) if name == kind]
+        table[kind] = {
+            method: {item.name: Mean.of(getattr(each[method], item.name) for each in own) for item in fields(Figures)}
+            for method in own[0]
+        }
+    return table
+
+
+def main_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
+    """Every motion in layout 4."""
+    runs = [Run(motion, seed=_FIRST_SEED + seed) for motion in motions for seed in range(seeds)]
+    return table_of([run.motion for run in runs], measure([(run, METHODS) for run in runs], workers))
+
+
+def layouts_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
+    """Every motion in every layout; the default pipeline and the thesis's fusion and second filter."""
+    runs = [
+        Run(motion, number, _FIRST_SEED + seed) for motion in motions for number in NUMBERS for seed in range(seeds)
+    ]
+    kinds = [f"{run.motion} {run.layout}" for run in runs]
+    return table_of(kinds, measure([(run, (LKF2, DEFAULT)) for run in runs], workers))
+
+
+def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
+    """Each parameter at half and at double."""
+    runs = [
+        Run(motion, 4, _FIRST_SEED + seed, item.name, factor)
+        for item in parameters()
+        for factor in (0.5, 2.0)
+        for motion in motions
+        for seed in range(seeds)
+    ]
+    kinds = [f"{run.parameter} x{run.factor:g}" for run in runs]
+    return table_of(kinds, measure([(run, (LKF2, EKF, DEFAULT, OURS)) for run in runs], workers))
+
+
+def show(table: Table, figures: Sequence[str]) -> None:
+    """Print a table for each figure."""
+    for figure in figures:
+        print(f"\n{figure}")
+        methods = list(next(iter(table.values())))
+        width = max(len(kind) for kind in table) + 2
+        print(" " * width + "".join(f"{method[:15]:>17}" for method in methods))
+        for kind, row in table.items():
+            cells = (f"{row[method][figure].value:9.2f} ±{row[method][figure].half:6.2f}" for method in methods)
+            print(f"{kind:<{width}}" + "".join(cells))
+
+
+# --- the page
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+_HEAD = """# How accurate it is
+
+Simulated people before two Kinect v2 sensors that err like real ones ([simulator.md](simulator.md) says how like), of
+whom everything is known. All methods get the same frames. Means over people with 95 % confidence intervals; errors in
+millimetres and degrees. What each column means is in the docstring of `benchmarks/accuracy.py`, which writes this page:
+
+    python benchmarks/accuracy.py --write
+"""
+
+
+def page(parts: Mapping[str, Table], seeds: int) -> str:
+    """docs/accuracy.md."""
+    lines = [_HEAD]
+    if "main" in parts:
+        table = parts["main"]
+        lines += [
+            f"## Every motion in layout 4, {seeds} people each",
+            "",
+            f"The simulator was calibrated with {', '.join(KNOWN)}, and with other people.",
+            "",
+        ]
+        for figure, title in _TITLES.items():
+            lines += [f"### {title}", "", *_markdown(table, figure), ""]
+        lines += ["### Ratios of the default to the thesis, without constant offsets", "", *_ratios(table), ""]
+    if "layouts" in parts:
+        lines += [
+            "## Layouts",
+            "",
+            "Mean 3D error of the default pipeline by the layout of table 5.1 of Schlagenhauf (2017); the best of each",
+            "motion is framed.",
+            "",
+            "![error by motion and layout](accuracy_layouts.svg)",
+            "",
+        ]
+    if "sensitivity" in parts:
+        lines += [
+            "## Other sensors than these",
+            "",
+            "Every parameter of the simulator at half and at double; mean error without constant offsets over the",
+            "torso twist and reaching. Where a parameter is at a bound of its range, the change is smaller.",
+            "",
+            *_markdown(parts["sensitivity"], "fixed"),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+_TITLES = {
+    "error": "Mean 3D error, mm",
+    "fixed": "Mean 3D error without each joint's constant offset, mm",
+    "hidden": "The same where a joint is hidden from a sensor, mm",
+    "elevation": "Shoulder elevation, RMSE in degrees",
+    "elbow": "Elbow flexion, RMSE in degrees",
+    "covered_elevation": "Shoulder elevation: share of frames within 1.96 stated standard deviations",
+    "covered_elbow": "Elbow flexion: the same",
+    "delay": "Delay, ms",
+}
+
+
+def _markdown(table: Table, figure: str) -> list[str]:
+    methods = list(next(iter(table.values())))
+    digits = 2 if figure.startswith("covered") else 1
+    rows = [f"| | {' | '.join(methods)} |", "|---|" + "---:|" * len(methods)]
+    for kind, row in table.items():
+        cells = []
+        for method in methods:
+            mean = row[method][figure]
+            half = "" if np.isnan(mean.half) else f" ± {mean.half:.{digits}f}"
+            cells.append("-" if np.isnan(mean.value) else f"{mean.value:.{digits}f}{half}")
+        rows.append(f"| {kind} | {' | '.join(cells)} |")
+    medians = (np.nanmedian([row[method][figure].value for row in table.values()]) for method in methods)
+    rows.append("| **median** | " + " | ".join("-" if np.isnan(m) else f"**{m:.{digits}f}**" for m in medians) + " |")
+    return rows
+
+
+def _ratios(table: Table) -> list[str]:
+    pairs = [(own, hers) for own in (DEFAULT, OURS) for hers in (LKF2, EKF)]
+    rows = ["| | " + " | ".join(f"{own} / {hers}" for own, hers in pairs) + " |", "|---|" + "---:|" * len(pairs)]
+    ratios = {
+        motion: [row[own]["fixed"].value / row[hers]["fixed"].value for own, hers in pairs]
+        for motion, row in table.items()
+    }
+    rows += [f"| {motion} | " + " | ".join(f"{ratio:.2f}" for ratio in row) + " |" for motion, row in ratios.items()]
+    medians = np.median(np.array(list(ratios.values())), axis=0)
+    rows.append("| **median** | " + " | ".join(f"**{ratio:.2f}**" for ratio in medians) + " |")
+    return rows
+
+
+def draw_layouts(table: Table, path: Path) -> None:
+    """The mean error of the default by motion and layout, as a figure."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure as Picture
+
+    motions = list(dict.fromkeys(kind.rsplit(" ", 1)[0] for kind in table))
+    values = np.array([[table[f"{m} {n}"][DEFAULT]["error"].value for n in NUMBERS] for m in motions])
+    picture = Picture(figsize=(8.0, 0.42 * len(motions) + 1.6), layout="constrained")
+    FigureCanvasSVG(picture)
+    axes = picture.add_subplot()
+    image = axes.imshow(values, aspect="auto", cmap="viridis_r", vmax=float(np.nanquantile(values, 0.95)))
+    axes.set_xticks(range(len(NUMBERS)), [str(number) for number in NUMBERS])
+    axes.set_yticks(range(len(motions)), motions)
+    axes.set_xlabel("layout (1-6: both sensors at 0, 15, ... 75 degrees; 7-9: one in front, one at 30, 60, 90)")
+    for row, line in enumerate(values):
+        best = int(np.nanargmin(line))
+        for column, value in enumerate(line):
+            axes.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8)
+        axes.add_patch(_frame(best, row))
+    picture.colorbar(image, label="mean 3D error, mm")
+    picture.savefig(path, metadata={"Date": None})
+
+
+def _frame(column: int, row: int) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, fill=False, edgecolor="red", linewidth=1.5)
+
+
+def main() -> int:
+    """The benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="people per motion (default: 20)")
+    parser.add_argument("--layout-seeds", type=int, default=4, metavar="N", help="of the layouts (default: 4)")
+    parser.add_argument("--sensitivity-seeds", type=int, default=2, metavar="N", help="of each change (default: 2)")
+    parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: all")
+    parser.add_argument("--parts", default="main,layouts,sensitivity", metavar="A,B", help="default: %(default)s")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
+    parser.add_argument("--write", action="store_true", help="write docs/accuracy.md and its figure")
+    args = parser.parse_args()
+    motions = args.motions.split(",")
+    parts: dict[str, Table] = {}
+    for part in args.parts.split(","):
+        if part == "main":
+            parts[part] = main_part(args.seeds, args.workers, motions)
+            show(parts[part], [item.name for item in fields(Figures)])
+        elif part == "layouts":
+            parts[part] = layouts_part(args.layout_seeds, args.workers, motions)
+            show(parts[part], ["error", "fixed"])
+        elif part == "sensitivity":
+            parts[part] = sensitivity_part(args.sensitivity_seeds, args.workers, [TWIST, "reaching"])
+            show(parts[part], ["error", "fixed"])
+        else:
+            parser.error(f"no such part: {part}")
+    if args.write:
+        (DOCS / "accuracy.md").write_text(page(parts, args.seeds))
+        if "layouts" in parts:
+            draw_layouts(parts["layouts"], DOCS / "accuracy_layouts.svg")
+    if args.json:
+        plain = {
+            part: {
+                kind: {method: {name: asdict(mean) for name, mean in row.items()} for method, row in rows.items()}
+                for kind, rows in table.items()
+            }
+            for part, table in parts.items()
+        }
+        args.json.write_text(json.dumps(plain, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
