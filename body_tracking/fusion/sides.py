@@ -160,7 +160,8 @@ class Sides:
         """The headings of both halves that are taken for true, radians.
 
         They are those of the believed sensor; another takes over that sees the body more from the front for a while
-        and agrees with it. While the believed one is missing for a moment, its last headings stand.
+        and agrees with it. While the believed one is missing for a moment, its last headings stand; while it sees the
+        body turned round at once and another does not, that other's.
 
         Args:
             stamp: reference time, nanoseconds.
@@ -186,15 +187,31 @@ class Sides:
             self._better_since = stamp
         elif stamp - self._better_since > TRUST_AFTER:
             trusted, self._better_since = better, None
+        others = [headings[index] for index in known if index != trusted]
         self._axes = [
-            self._held(stamp, half, heading, recent, counters) for half, heading in enumerate(headings[trusted])
+            self._held(stamp, half, heading, [other[half] for other in others], recent, counters)
+            for half, heading in enumerate(headings[trusted])
         ]
         self.trusted, self._trusted_ns = names[trusted], stamp
         return self._axes
 
-    def _held(self, stamp: int, half: int, heading: float, recent: bool, counters: Counter[str]) -> float:
-        """The heading, or its opposite while the believed sensor has just turned the body around between two frames."""
-        if not (recent and math.cos(self._axes[half] - heading) < -SAME_SENSE):
+    def _held(
+        self, stamp: int, half: int, heading: float, others: Sequence[float], recent: bool, counters: Counter[str]
+    ) -> float:
+        """The heading; another sensor's, or the opposite, where the believed one turned the body between two frames.
+
+        Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
+        another one goes on as before, it errs now, for as long as that one does; else nobody knows, and for a while
+        the reversal is not believed.
+        """
+        before = self._axes[half]
+        sense = math.cos(before - heading)
+        if recent and sense < SAME_SENSE:
+            nearest = max(others, key=lambda other: math.cos(other - before), default=math.nan)
+            if math.cos(nearest - before) > math.sqrt(0.5):
+                self._reversed_since[half] = None
+                return nearest
+        if not (recent and sense < -SAME_SENSE):
             self._reversed_since[half] = None
             return heading
         since = self._reversed_since[half]

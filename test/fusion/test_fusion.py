@@ -246,6 +246,39 @@ def test_swapped_sides_of_one_sensor_are_repaired() -> None:
     assert errors(fused)[30:].max() < 0.05
 
 
+@pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
+@pytest.mark.parametrize("seconds", [0.3, 1.2, 3.0])
+def test_one_sensor_that_reverses_for_a_while_is_not_followed_and_not_held_against_the_other(
+    sensor: str, seconds: float
+) -> None:
+    """Whichever is believed: nobody turns round between two frames, and the other sensor does not say so."""
+
+    def reverse(skeleton: Skeleton) -> Skeleton:
+        stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
+        return skeleton.mirrored() if 4.0 <= stamp < 4.0 + seconds else skeleton
+
+    fused = run(made := fusion(), changed(frames(10.0), sensor, reverse))
+    assert made.counters["repaired"] > 0 and not made.counters["reversals_accepted"]
+    assert errors(fused)[30:].max() < 0.05
+
+
+@pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
+def test_nor_is_one_that_turns_the_body_at_once_by_more_than_anybody_can(sensor: str) -> None:
+    """Seen from the side a body whose sides are exchanged is turned by less than half a turn, too."""
+
+    def turn(skeleton: Skeleton) -> Skeleton:
+        stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
+        if not 4.0 <= stamp < 6.0:
+            return skeleton
+        centre = skeleton.positions[Joint.SPINE_SHOULDER]
+        return frame(skeleton.stamp, (skeleton.positions - centre) @ about_y(115.0).T + centre, sensor)
+
+    fused = run(fusion(), changed(frames(10.0), sensor, turn))
+    found = np.stack([left_right_axes(each.positions)[0] for each in fused])
+    true = left_right_axes(truth(np.array([each.stamp for each in fused])))[:, 0]
+    assert (np.einsum("ni,ni->n", found, true) > 0.0)[30:].all()
+
+
 def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
     """A sensor whose axis lies across the believed one loses its say on left and right, not the rest."""
 
