@@ -261,24 +261,23 @@ def measure(jobs: Sequence[tuple[Run, tuple[str, ...]]], workers: int) -> list[d
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """A mean over seeds and half the width of its 95 % confidence interval."""
+    """A mean over seeds, half the width of its 95 % confidence interval, and of how many it is."""
 
     value: float
     half: float
+    count: int
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Mean:
         """Over those that are finite."""
         known_ones = np.array([value for value in values if np.isfinite(value)])
         if len(known_ones) == 0:
-            return cls(float("nan"), float("nan"))
+            return cls(float("nan"), float("nan"), 0)
         if len(known_ones) == 1:
-            return cls(float(known_ones[0]), float("nan"))
+            return cls(float(known_ones[0]), float("nan"), 1)
         spread = float(known_ones.std(ddof=1)) / np.sqrt(len(known_ones))
-        return cls(float(known_ones.mean()), float(student.ppf(0.975, len(known_ones) - 1)) * spread)
-
-    def __str__(self) -> str:
-        return f"{self.value:.1f} ± {self.half:.1f}"
+        half = float(student.ppf(0.975, len(known_ones) - 1)) * spread
+        return cls(float(known_ones.mean()), half, len(known_ones))
 
 
 Table = dict[str, dict[str, dict[str, Mean]]]
@@ -350,13 +349,13 @@ millimetres and degrees. What each column means is in the docstring of `benchmar
 """
 
 
-def page(parts: Mapping[str, Table], seeds: int) -> str:
+def page(parts: Mapping[str, Table]) -> str:
     """docs/accuracy.md."""
     lines = [_HEAD]
     if "main" in parts:
         table = parts["main"]
         lines += [
-            f"## Every motion in layout 4, {seeds} people each",
+            f"## Every motion in layout 4, {_people(table)} people each",
             "",
             f"The simulator was calibrated with {', '.join(KNOWN)}, and with other people.",
             "",
@@ -397,6 +396,31 @@ _TITLES = {
     "covered_elbow": "Elbow flexion: the same",
     "delay": "Delay, ms",
 }
+
+
+def _people(table: Table) -> int:
+    return max(row[DEFAULT]["error"].count for row in table.values())
+
+
+def _save(parts: Mapping[str, Table], path: Path) -> None:
+    plain = {
+        part: {
+            kind: {method: {name: asdict(mean) for name, mean in row.items()} for method, row in rows.items()}
+            for kind, rows in table.items()
+        }
+        for part, table in parts.items()
+    }
+    path.write_text(json.dumps(plain, indent=1) + "\n")
+
+
+def _read(path: Path) -> dict[str, Table]:
+    return {
+        part: {
+            kind: {method: {name: Mean(**mean) for name, mean in row.items()} for method, row in rows.items()}
+            for kind, rows in table.items()
+        }
+        for part, table in json.loads(path.read_text()).items()
+    }
 
 
 def _markdown(table: Table, figure: str) -> list[str]:
@@ -466,12 +490,14 @@ def main() -> int:
     parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: all")
     parser.add_argument("--parts", default="main,layouts,sensitivity", metavar="A,B", help="default: %(default)s")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write all figures there; parts that it has from before stay in it"
+    )
     parser.add_argument("--write", action="store_true", help="write docs/accuracy.md and its figure")
     args = parser.parse_args()
     motions = args.motions.split(",")
-    parts: dict[str, Table] = {}
-    for part in args.parts.split(","):
+    parts = _read(args.json) if args.json and args.json.exists() else {}
+    for part in filter(None, args.parts.split(",")):
         if part == "main":
             parts[part] = main_part(args.seeds, args.workers, motions)
             show(parts[part], [item.name for item in fields(Figures)])
@@ -483,19 +509,12 @@ def main() -> int:
             show(parts[part], ["error", "fixed"])
         else:
             parser.error(f"no such part: {part}")
+    if args.json:
+        _save(parts, args.json)
     if args.write:
-        (DOCS / "accuracy.md").write_text(page(parts, args.seeds))
+        (DOCS / "accuracy.md").write_text(page(parts))
         if "layouts" in parts:
             draw_layouts(parts["layouts"], DOCS / "accuracy_layouts.svg")
-    if args.json:
-        plain = {
-            part: {
-                kind: {method: {name: asdict(mean) for name, mean in row.items()} for method, row in rows.items()}
-                for kind, rows in table.items()
-            }
-            for part, table in parts.items()
-        }
-        args.json.write_text(json.dumps(plain, indent=1) + "\n")
     return 0
 
 
