@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -97,6 +97,12 @@ class Parameter:
         if isinstance(self.default, float) and isinstance(value, int):
             return float(value)
         return value if type(value) is type(self.default) else None
+
+
+def number_field(default: float, doc: str, unit: str, low: float, high: float) -> float:
+    """A field of a parameter dataclass that is a number from ``low`` to ``high``; see :func:`parameters_from`."""
+    result: float = field(default=default, metadata={"doc": doc, "unit": unit, "min": low, "max": high})
+    return result
 
 
 def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: str = "") -> tuple[Parameter, ...]:

@@ -31,6 +31,7 @@ from body_tracking.calibration.result import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.parameters import number_field
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
@@ -66,11 +67,6 @@ class ImuSimulationError(BodyTrackingError):
     """An inertial sensor was described, or moved, as none can be."""
 
 
-def _parameter(default: float, doc: str, unit: str, low: float, high: float) -> float:
-    result: float = field(default=default, metadata={"doc": doc, "unit": unit, "min": low, "max": high})
-    return result
-
-
 @dataclass(frozen=True, slots=True)
 class ImuErrors:
     """How much an inertial sensor errs; each field's metadata says what it is, its unit and its range.
@@ -83,65 +79,69 @@ class ImuErrors:
         ImuSimulationError: a value out of its range.
     """
 
-    gyro_noise: float = _parameter(0.01, "noise density of the angular rate", "deg/s/sqrt(Hz)", 0.0, 1.0)
-    gyro_bias: float = _parameter(0.3, "stddev of the turn-on bias of the angular rate", "deg/s", 0.0, 20.0)
-    gyro_instability: float = _parameter(
+    gyro_noise: float = number_field(0.01, "noise density of the angular rate", "deg/s/sqrt(Hz)", 0.0, 1.0)
+    gyro_bias: float = number_field(0.3, "stddev of the turn-on bias of the angular rate", "deg/s", 0.0, 20.0)
+    gyro_instability: float = number_field(
         0.006, "stddev of the in-run bias of the angular rate, beside the turn-on bias", "deg/s", 0.0, 5.0
     )
-    gyro_scale: float = _parameter(0.01, "stddev of the scale of the angular rate", "1", 0.0, 0.2)
-    gyro_axes: float = _parameter(0.005, "stddev of each cross-axis sensitivity of the angular rate", "1", 0.0, 0.2)
-    gyro_range: float = _parameter(2000.0, "greatest angular rate, of 16 bits; inf: any, exactly", "deg/s", 1.0, np.inf)
-    acc_noise: float = _parameter(0.003, "noise density of the acceleration", "m/s2/sqrt(Hz)", 0.0, 1.0)
-    acc_bias: float = _parameter(0.1, "stddev of the turn-on bias of the acceleration", "m/s2", 0.0, 5.0)
-    acc_instability: float = _parameter(0.003, "stddev of the in-run bias of the acceleration", "m/s2", 0.0, 1.0)
-    acc_scale: float = _parameter(0.005, "stddev of the scale of the acceleration", "1", 0.0, 0.2)
-    acc_axes: float = _parameter(0.005, "stddev of each cross-axis sensitivity of the acceleration", "1", 0.0, 0.2)
-    acc_range: float = _parameter(
+    gyro_scale: float = number_field(0.01, "stddev of the scale of the angular rate", "1", 0.0, 0.2)
+    gyro_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the angular rate", "1", 0.0, 0.2)
+    gyro_range: float = number_field(
+        2000.0, "greatest angular rate, of 16 bits; inf: any, exactly", "deg/s", 1.0, np.inf
+    )
+    acc_noise: float = number_field(0.003, "noise density of the acceleration", "m/s2/sqrt(Hz)", 0.0, 1.0)
+    acc_bias: float = number_field(0.1, "stddev of the turn-on bias of the acceleration", "m/s2", 0.0, 5.0)
+    acc_instability: float = number_field(0.003, "stddev of the in-run bias of the acceleration", "m/s2", 0.0, 1.0)
+    acc_scale: float = number_field(0.005, "stddev of the scale of the acceleration", "1", 0.0, 0.2)
+    acc_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the acceleration", "1", 0.0, 0.2)
+    acc_range: float = number_field(
         16.0 * STANDARD_GRAVITY, "greatest acceleration, of 16 bits; inf: any, exactly", "m/s2", 1.0, np.inf
     )
-    mag_noise: float = _parameter(0.05, "noise density of the magnetic field", "uT/sqrt(Hz)", 0.0, 10.0)
-    mag_bias: float = _parameter(1.0, "stddev of what calibration leaves of hard iron", "uT", 0.0, 100.0)
-    mag_scale: float = _parameter(
+    mag_noise: float = number_field(0.05, "noise density of the magnetic field", "uT/sqrt(Hz)", 0.0, 10.0)
+    mag_bias: float = number_field(1.0, "stddev of what calibration leaves of hard iron", "uT", 0.0, 100.0)
+    mag_scale: float = number_field(
         0.01, "stddev of what calibration leaves of soft iron: of scale and each cross-axis sensitivity", "1", 0.0, 0.5
     )
-    mag_range: float = _parameter(4912.0, "greatest field, of 16 bits; inf: any, exactly", "uT", 50.0, np.inf)
-    instability_time: float = _parameter(300.0, "correlation time of the in-run biases", "s", 1.0, 1e5)
+    mag_range: float = number_field(4912.0, "greatest field, of 16 bits; inf: any, exactly", "uT", 50.0, np.inf)
+    instability_time: float = number_field(300.0, "correlation time of the in-run biases", "s", 1.0, 1e5)
 
-    tilt_time: float = _parameter(3.0, "time constant with which the driver levels by the acceleration", "s", 0.01, 1e3)
-    heading_time: float = _parameter(
+    tilt_time: float = number_field(
+        3.0, "time constant with which the driver levels by the acceleration", "s", 0.01, 1e3
+    )
+    heading_time: float = number_field(
         9.0, "time constant with which the driver turns to the magnetic field", "s", 0.01, 1e4
     )
-    driver_bias: float = _parameter(
+    driver_bias: float = number_field(
         0.03, "stddev of the turn-on bias of the angular rate that the driver's own estimate leaves", "deg/s", 0.0, 5.0
     )
-    stated_tilt: float = _parameter(1.5, "stddev of the tilt that the driver states", "deg", 0.0, 90.0)
-    stated_heading: float = _parameter(
+    stated_tilt: float = number_field(1.5, "stddev of the tilt that the driver states", "deg", 0.0, 90.0)
+    stated_heading: float = number_field(
         4.0, "stddev of the heading that the driver states, without magnetometer besides the drift", "deg", 0.0, 180.0
     )
 
-    misalignment: float = _parameter(5.0, "stddev of the mounting's rotation per axis", "deg", 0.0, 90.0)
-    tissue_sag: float = _parameter(
+    misalignment: float = number_field(5.0, "stddev of the mounting's rotation per axis", "deg", 0.0, 90.0)
+    tissue_sag: float = number_field(
         0.003, "how far the sensor sags on the flesh in its own weight; 0: tissue as stiff as bone", "m", 0.0, 0.02
     )
-    tissue_frequency: float = _parameter(8.0, "natural frequency of the sensor on the flesh", "Hz", 1.0, 12.0)
-    tissue_damping: float = _parameter(0.25, "damping ratio of it", "1", 0.01, 2.0)
-    tissue_turn: float = _parameter(
+    tissue_frequency: float = number_field(8.0, "natural frequency of the sensor on the flesh", "Hz", 1.0, 12.0)
+    tissue_damping: float = number_field(0.25, "damping ratio of it", "1", 0.01, 2.0)
+    tissue_turn: float = number_field(
         15.0, "by how much the sensor turns as it slides over the flesh: one over its radius", "rad/m", 0.0, 100.0
     )
-    twist_share: float = _parameter(
+    twist_share: float = number_field(
         0.2, "share of a segment's twist against its parent that the skin does not follow", "1", 0.0, 1.0
     )
 
-    jitter: float = _parameter(0.0002, "stddev of the instants of sampling", "s", 0.0, 0.1)
-    stamp_jitter: float = _parameter(0.0005, "stddev of the stamps about these instants", "s", 0.0, 0.1)
+    jitter: float = number_field(0.0002, "stddev of the instants of sampling", "s", 0.0, 0.1)
+    stamp_jitter: float = number_field(0.0005, "stddev of the stamps about these instants", "s", 0.0, 0.1)
     packet: int = field(
         default=2, metadata={"doc": "samples sent together, lost together", "unit": "1", "min": 1, "max": 100}
     )
-    lost: float = _parameter(0.005, "probability that a packet is lost", "1", 0.0, 1.0)
-    outages: float = _parameter(0.2, "outages of the radio", "1/min", 0.0, 60.0)
-    outage_time: float = _parameter(0.5, "mean duration of an outage", "s", 0.0, 60.0)
-    delay: float = _parameter(0.015, "time from sampling to receipt, at least", "s", 0.0, 10.0)
-    delay_jitter: float = _parameter(0.005, "what is added to it on average", "s", 0.0, 10.0)
+    lost: float = number_field(0.005, "probability that a packet is lost", "1", 0.0, 1.0)
+    outages: float = number_field(0.2, "outages of the radio", "1/min", 0.0, 60.0)
+    outage_time: float = number_field(0.5, "mean duration of an outage", "s", 0.0, 60.0)
+    delay: float = number_field(0.015, "time from sampling to receipt, at least", "s", 0.0, 10.0)
+    delay_jitter: float = number_field(0.005, "what is added to it on average", "s", 0.0, 10.0)
 
     def __post_init__(self) -> None:
         for item in fields(self):

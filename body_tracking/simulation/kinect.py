@@ -35,7 +35,15 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.motion import EXTREMITY, JOINT_CLASSES, LIMB
 from body_tracking.measurement import body_heading
-from body_tracking.parameters import Parameter, ParameterError, as_yaml, check_all, parameters_from, read_file
+from body_tracking.parameters import (
+    Parameter,
+    ParameterError,
+    as_yaml,
+    check_all,
+    number_field,
+    parameters_from,
+    read_file,
+)
 from body_tracking.sensors import RecordedFrame, optical_frame
 from body_tracking.simulation.occlusion import Capsules, obstruction
 from body_tracking.skeleton import (
@@ -67,11 +75,6 @@ class SimulatedKinectError(BodyTrackingError):
     """Errors that are out of their range, or a truth that is none."""
 
 
-def _parameter(default: float, doc: str, unit: str, low: float, high: float) -> float:
-    result: float = field(default=default, metadata={"doc": doc, "unit": unit, "min": low, "max": high})
-    return result
-
-
 @dataclass(frozen=True, slots=True)
 class KinectErrors:
     """How much a simulated Kinect v2 errs; each field's metadata says what it is, its unit and its range.
@@ -83,93 +86,93 @@ class KinectErrors:
         SimulatedKinectError: a value out of its range.
     """
 
-    white: float = _parameter(
+    white: float = number_field(
         0.00015, "standard deviation of the noise that is new in each frame, across the ray", "m", 0.0, 0.1
     )
-    bias: float = _parameter(
+    bias: float = number_field(
         0.007, "standard deviation of the error that depends on pose and view, across the ray", "m", 0.0, 0.2
     )
-    bias_turn: float = _parameter(
+    bias_turn: float = number_field(
         0.8, "how far a limb or the view has to turn for that error to become another one", "rad", 0.05, 10.0
     )
-    drift: float = _parameter(0.003, "standard deviation of the error that wanders with time", "m", 0.0, 0.2)
-    drift_time: float = _parameter(1.0, "time for which it persists", "s", 0.02, 100.0)
-    length_spread: float = _parameter(
+    drift: float = number_field(0.003, "standard deviation of the error that wanders with time", "m", 0.0, 0.2)
+    drift_time: float = number_field(1.0, "time for which it persists", "s", 0.02, 100.0)
+    length_spread: float = number_field(
         0.035, "standard deviation of the length of a limb or of the trunk, as a share of it", "1", 0.0, 0.5
     )
-    anatomical: float = _parameter(
+    anatomical: float = number_field(
         1.0,
         "how much of what lies between reported and anatomical joint of everybody, constant in the body",
         "1",
         0.0,
         5.0,
     )
-    offset: float = _parameter(
+    offset: float = number_field(
         0.010,
         "standard deviation of what lies between reported and anatomical joint of a person besides",
         "m",
         0.0,
         0.2,
     )
-    depth_offset: float = _parameter(
+    depth_offset: float = number_field(
         0.018, "root mean square over the joints of what their kind is wrong by along the ray", "m", 0.0, 0.2
     )
-    distance_growth: float = _parameter(1.5, "power of the distance with which errors grow", "1", 0.0, 4.0)
-    growth_60: float = _parameter(
+    distance_growth: float = number_field(1.5, "power of the distance with which errors grow", "1", 0.0, 4.0)
+    growth_60: float = number_field(
         0.3, "by how much errors are greater at a yaw of 60 degrees than at 30", "1", 0.0, 10.0
     )
-    growth_90: float = _parameter(
+    growth_90: float = number_field(
         2.2, "by how much errors are greater at a yaw of 90 degrees than at 30", "1", 0.0, 20.0
     )
-    turn_loss: float = _parameter(
+    turn_loss: float = number_field(
         0.3, "share of the yaw of shoulders and hips that is missing at 90 degrees", "1", 0.0, 1.0
     )
-    straightening: float = _parameter(0.3, "share of the trunk's bend that is missing", "1", 0.0, 1.0)
-    lift_damping: float = _parameter(0.4, "share of a shoulder's lift that is missing", "1", 0.0, 1.0)
-    hidden_from: float = _parameter(
+    straightening: float = number_field(0.3, "share of the trunk's bend that is missing", "1", 0.0, 1.0)
+    lift_damping: float = number_field(0.4, "share of a shoulder's lift that is missing", "1", 0.0, 1.0)
+    hidden_from: float = number_field(
         0.5, "cover from which a joint is inferred: 0 at the rim of what is before it, 1 in its middle", "1", 0.01, 1.0
     )
-    given_up: float = _parameter(
+    given_up: float = number_field(
         0.1, "share of the joints behind the middle of something that are not tracked", "1", 0.0, 1.0
     )
-    hang_over: float = _parameter(
+    hang_over: float = number_field(
         0.2, "time that a joint takes to be hidden or free, and for which exchanged limbs last", "s", 0.0, 10.0
     )
-    drag: float = _parameter(
+    drag: float = number_field(
         0.35, "share of the way to the surface before it by which a hidden joint is drawn there", "1", 0.0, 1.0
     )
-    guess: float = _parameter(
+    guess: float = number_field(
         0.04, "standard deviation of where a hidden joint is guessed, across the ray", "m", 0.0, 0.5
     )
-    mislabelled: float = _parameter(0.3, "share of the hidden joints that are said to be tracked", "1", 0.0, 1.0)
-    flicker: float = _parameter(
+    mislabelled: float = number_field(0.3, "share of the hidden joints that are said to be tracked", "1", 0.0, 1.0)
+    flicker: float = number_field(
         0.01, "share of the frames in which a hand or foot in full view is said to be inferred", "1", 0.0, 1.0
     )
-    mirrored: float = _parameter(
+    mirrored: float = number_field(
         1.0, "share of the times a person turns the back in which the sensor takes it for the front", "1", 0.0, 1.0
     )
-    mirror_hysteresis: float = _parameter(
+    mirror_hysteresis: float = number_field(
         1.1, "angle beyond the side view by which a body has to turn for left and right to change", "rad", 0.0, 1.5
     )
-    mirror_rate: float = _parameter(
+    mirror_rate: float = number_field(
         0.04, "how often left and right change by themselves in a side view", "1/s", 0.0, 10.0
     )
-    mirror_time: float = _parameter(1.3, "time for which they then stay exchanged, on average", "s", 0.01, 60.0)
-    limb_swap_rate: float = _parameter(0.003, "how often the arms, or the legs, are exchanged", "1/s", 0.0, 10.0)
-    outlier_rate: float = _parameter(0.01, "how often a joint jumps away for a few frames", "1/s", 0.0, 10.0)
-    outlier_size: float = _parameter(0.2, "how far, on average", "m", 0.0, 2.0)
-    jitter: float = _parameter(0.0002, "standard deviation of the instant of a capture", "s", 0.0, 0.01)
-    lost: float = _parameter(0.09, "share of the frames that are lost", "1", 0.0, 0.9)
-    stall_rate: float = _parameter(
+    mirror_time: float = number_field(1.3, "time for which they then stay exchanged, on average", "s", 0.01, 60.0)
+    limb_swap_rate: float = number_field(0.003, "how often the arms, or the legs, are exchanged", "1/s", 0.0, 10.0)
+    outlier_rate: float = number_field(0.01, "how often a joint jumps away for a few frames", "1/s", 0.0, 10.0)
+    outlier_size: float = number_field(0.2, "how far, on average", "m", 0.0, 2.0)
+    jitter: float = number_field(0.0002, "standard deviation of the instant of a capture", "s", 0.0, 0.01)
+    lost: float = number_field(0.09, "share of the frames that are lost", "1", 0.0, 0.9)
+    stall_rate: float = number_field(
         0.03,
         "how often the connection stalls: half of the times its frames are lost, else they come in a burst",
         "1/s",
         0.0,
         10.0,
     )
-    stall_time: float = _parameter(0.25, "for how long, on average", "s", 0.0, 10.0)
-    delay: float = _parameter(0.022, "time from capture to receipt, at least", "s", 0.0, 10.0)
-    delay_jitter: float = _parameter(0.003, "time added to it on average", "s", 0.0, 1.0)
+    stall_time: float = number_field(0.25, "for how long, on average", "s", 0.0, 10.0)
+    delay: float = number_field(0.022, "time from capture to receipt, at least", "s", 0.0, 10.0)
+    delay_jitter: float = number_field(0.003, "time added to it on average", "s", 0.0, 1.0)
 
     def __post_init__(self) -> None:
         for item in parameters():
