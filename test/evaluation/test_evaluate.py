@@ -174,6 +174,17 @@ def test_bad_input_is_told_in_one_line(
     assert not captured.out
 
 
+def test_of_several_people_it_is_said_that_the_first_is_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = str(tmp_path / "three")
+    assert main(["simulate", "-o", made, "--motion", "standing_still", "--seconds", "2", "--people", "3"]) == 0
+    assert main(["evaluate", made, "--topic", "/kinect1/skeleton", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out.partition("\n")[2])["notes"]
+    for topic in ("/kinect1/skeleton", "/ground_truth/skeleton"):
+        assert f"{made}: {topic} holds 3 people, only the first is compared" in said
+
+
 def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = bag_of(tmp_path / "typed", 0, "/filtered/skeleton", JOINT_STATE)
     assert main(["evaluate", str(folder)]) == 2
