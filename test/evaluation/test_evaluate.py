@@ -151,6 +151,9 @@ def test_a_joint_is_off_track_by_the_distance_that_is_given(
         (["{wave}", "--truth", "{nowhere}"], r"nowhere: no such recording"),
         (["{wave}", "--html", "{text}/page.html"], r"notes\.txt"),
         (["{wave}", "--off-track", "-1"], r"--off-track -1: must be more than 0"),
+        (["{wave}", "--off-track", "inf"], r"--off-track inf: must be more than 0"),
+        (["{wave}", "--truth", "{twist}", "--subject", "bob"], r"--subject: of a C3D file; the truth is .*twist"),
+        (["{wave}", "--measurements", "{text}"], r"--measurements: of a C3D file; the truth is .*wave"),
     ],
 )
 def test_bad_input_is_told_in_one_line(
