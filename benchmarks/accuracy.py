@@ -48,7 +48,8 @@ from body_tracking.recording.stages import FilterAndAngles, ReplaySettings, Upst
 from body_tracking.simulation.kinect import KinectErrors, parameters
 from body_tracking.simulation.layouts import NUMBERS, layout
 from body_tracking.simulation.occlusion import cover
-from body_tracking.simulation.repertoire import MOTIONS
+from body_tracking.simulation.people import Person
+from body_tracking.simulation.repertoire import MOTIONS, make_movement
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 
@@ -303,7 +304,7 @@ def main_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
 
 
 def layouts_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
-    """Every motion in every layout; the default pipeline and the thesis's fusion and second filter."""
+    """Every motion in every layout; the default pipeline and the thesis's second linear filter."""
     runs = [
         Run(motion, number, _FIRST_SEED + seed) for motion in motions for number in NUMBERS for seed in range(seeds)
     ]
@@ -358,6 +359,9 @@ def page(parts: Mapping[str, Table]) -> str:
             f"## Every motion in layout 4, {_people(table)} people each",
             "",
             f"The simulator was calibrated with {', '.join(KNOWN)}, and with other people.",
+            "The thesis calibrates in a T-pose, its EKF starts from one and takes the base of the spine to stand",
+            "still, which it does not where people walk or squat. Motions that begin without a T-pose: "
+            f"{', '.join(_unposed(table)) or 'none'}.",
             "",
         ]
         for figure, title in _TITLES.items():
@@ -396,6 +400,12 @@ _TITLES = {
     "covered_elbow": "Elbow flexion: the same",
     "delay": "Delay, ms",
 }
+
+
+def _unposed(motions: Iterable[str]) -> list[str]:
+    """Those that do not begin with a T-pose."""
+    anybody = Person.average("female")
+    return [motion for motion in motions if not make_movement(motion, anybody, None).tpose_s]
 
 
 def _people(table: Table) -> int:

@@ -423,7 +423,7 @@ class OnlineCalibration:
                 rotation, translation, residual = still_pose_registration(own[1:], theirs[1:])
             except CalibrationError:
                 return
-            pose = "T-pose" if is_t_pose(np.nanmean(own[1], axis=0)) else "still pose"
+            pose = "T-pose" if is_t_pose(own[1]) else "still pose"
             self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":

@@ -39,12 +39,15 @@ def is_still(stamps: FloatArray, positions: FloatArray) -> bool:
     return bool(np.median(drift[seen]) < STILL_DRIFT and np.quantile(stray[seen], 0.8) < STILL_STDDEV)
 
 
-def is_t_pose(pose: FloatArray) -> bool:
-    """Whether both arms are stretched out sideways.
+def is_t_pose(positions: FloatArray) -> bool:
+    """Whether both arms are stretched out sideways, on average.
 
     Args:
-        pose: (25, 3) metres, any frame.
+        positions: (n, 25, 3) metres, any frame, NaN where unknown; not, where one of the joints that matter always is.
     """
+    known = np.isfinite(positions)
+    with np.errstate(invalid="ignore"):
+        pose = np.where(known, positions, 0.0).sum(axis=0) / known.sum(axis=0)
     across = pose[Joint.SHOULDER_LEFT] - pose[Joint.SHOULDER_RIGHT]
     arms = (
         pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT],

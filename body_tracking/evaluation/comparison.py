@@ -35,6 +35,7 @@ from body_tracking.evaluation.summary import (
     AngleSeries,
     EvaluationError,
     bodies,
+    most_people,
     read_angles,
     read_joint_states,
     read_skeletons,
@@ -267,7 +268,8 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
         skeletons = _skeletons(bag, topic, "; make some with replay, or choose one with --topic")
         angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
         sensors = _sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK)
-        return replace(_recorded(path, topic, skeletons, angles, sensors), warnings=tuple(bag.warnings))
+        made = _recorded(path, topic, skeletons, angles, sensors)
+        return replace(made, warnings=(*bag.warnings, *_crowd(bag, topic)))
 
 
 def read_truth(path: Path, body: str | None = None) -> Recorded:
@@ -289,7 +291,7 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         sensors = _sensors(bag, graph.TRUE_CALIBRATION, graph.TRUE_CLOCK)
         made = _recorded(path, graph.TRUE_SKELETON, skeletons, angles, sensors)
         coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
-        return replace(made, coordinates=coordinates, warnings=tuple(bag.warnings))
+        return replace(made, coordinates=coordinates, warnings=(*bag.warnings, *_crowd(bag, graph.TRUE_SKELETON)))
 
 
 def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
@@ -340,6 +342,11 @@ def _skeletons(bag: BagReader, topic: str, advice: str) -> tuple[Skeleton, ...]:
             f"{topic}, at least 2 are needed"
         )
     return skeletons
+
+
+def _crowd(bag: BagReader, topic: str) -> tuple[str, ...]:
+    people = most_people(bag, topic)
+    return (f"{bag.path}: {topic} holds {people} people, only the first is compared",) if people > 1 else ()
 
 
 def _recorded(

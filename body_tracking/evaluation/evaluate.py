@@ -26,12 +26,15 @@ def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
 
     Raises:
         BagError: neither a C3D file nor a bag that can be read.
-        EvaluationError: the bag holds no truth.
+        EvaluationError: the bag holds no truth, or something was said that is of C3D files only.
         MarkerError: nothing can be made of the C3D file.
     """
     path: Path = args.truth or args.estimate
     if path.suffix.lower() == ".c3d":
         return read_markers(path, args.subject, args.measurements), True
+    for name in ("subject", "measurements"):
+        if getattr(args, name) is not None:
+            raise EvaluationError(f"--{name}: of a C3D file; the truth is {path}")
     return read_truth(path, args.body), args.own_clock
 
 
@@ -78,8 +81,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Compare, print and write."""
-    if not args.off_track > 0.0:
-        raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm")
+    if not 0.0 < args.off_track < float("inf"):
+        raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm, and finite")
     progress = Progress(0, 1000)
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)

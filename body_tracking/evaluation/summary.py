@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,16 +187,24 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
 
 def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
     """The first body of each of a topic's messages in time order; none where the topic is missing or holds others."""
+    skeletons = {everybody[0].stamp_ns: everybody[0] for everybody in _read_frames(bag, topic)}
+    return tuple(skeletons[stamp] for stamp in sorted(skeletons))
+
+
+def most_people(bag: BagReader, topic: str) -> int:
+    """The largest number of bodies in one of a topic's messages."""
+    return max((len(everybody) for everybody in _read_frames(bag, topic)), default=0)
+
+
+def _read_frames(bag: BagReader, topic: str) -> Iterator[tuple[Skeleton, ...]]:
+    """The bodies of each message, at least one; none where the topic is missing or holds others."""
     if topic not in bag.topics or bag.topics[topic].type_name != POINT_CLOUD:
-        return ()
-    skeletons: dict[int, Skeleton] = {}
+        return
     for raw in bag.messages([topic]):
         try:
-            skeleton = (decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr)))[0]
+            yield decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except MessageError:
             continue  # a damaged frame is not shown
-        skeletons[skeleton.stamp_ns] = skeleton
-    return tuple(skeletons[stamp] for stamp in sorted(skeletons))
 
 
 def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS) -> IntArray:

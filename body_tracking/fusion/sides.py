@@ -18,6 +18,9 @@ from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Jo
 SAME_SENSE = 0.5
 """Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
 
+_CLOSE = math.sqrt(0.5)
+"""... above which one sensor says the same as another, or as was said before."""
+
 MORE_FRONTAL = math.pi / 6
 """A sensor is believed more on left and right when it sees the body this much more from the front, radians ..."""
 
@@ -179,7 +182,7 @@ class Sides:
             trusted = min(known, key=lambda index: angles[index])
             self._reversed_since = [None, None]
         upper = headings[trusted][0]
-        agreeing = [index for index in known if math.cos(headings[index][0] - upper) > math.sqrt(0.5)]
+        agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE]
         better = min(agreeing, key=lambda index: angles[index])
         if angles[trusted] - angles[better] <= MORE_FRONTAL:
             self._better_since = None
@@ -201,16 +204,18 @@ class Sides:
         """The heading; another sensor's, or the opposite, where the believed one turned the body between two frames.
 
         Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
-        another one goes on as before, it errs now, for as long as that one does; else nobody knows, and for a while
-        the reversal is not believed.
+        another one goes on as before, it errs now, for as long as that one does, unless most sensors are with it; else
+        nobody knows, and for a while the reversal is not believed.
         """
         before = self._axes[half]
         sense = math.cos(before - heading)
         if recent and sense < SAME_SENSE:
-            nearest = max(others, key=lambda other: math.cos(other - before), default=math.nan)
-            if math.cos(nearest - before) > math.sqrt(0.5):
+            as_before = [other for other in others if math.cos(other - before) > _CLOSE]
+            with_it = sum(math.cos(other - heading) > _CLOSE for other in others)
+            # of as many on either side those are right that nobody has seen turn
+            if len(as_before) > with_it:
                 self._reversed_since[half] = None
-                return nearest
+                return max(as_before, key=lambda other: math.cos(other - before))
         if not (recent and sense < -SAME_SENSE):
             self._reversed_since[half] = None
             return heading

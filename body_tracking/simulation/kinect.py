@@ -213,11 +213,14 @@ def read_errors(path: Path) -> KinectErrors:
     """
     try:
         sections = read_file(path)
-        given = sections.get(SECTION, sections.get(f"/{SECTION}"))
-        if given is None:
-            raise SimulatedKinectError(
-                f"{path}: no section {SECTION}; found: {', '.join(name.strip('/') for name in sections) or 'none'}"
-            )
+    except ParameterError as error:
+        raise SimulatedKinectError(str(error)) from error
+    given = sections.get(SECTION, sections.get(f"/{SECTION}"))
+    if given is None:
+        raise SimulatedKinectError(
+            f"{path}: no section {SECTION}; found: {', '.join(name.strip('/') for name in sections) or 'none'}"
+        )
+    try:
         values = check_all(parameters(), given)
     except ParameterError as error:
         raise SimulatedKinectError(f"{path}: {error}") from error

@@ -93,8 +93,13 @@ def around(
         )
     except ValueError as error:
         raise LayoutError(f"layout: distances, heights or pitches that are not one or {count} ({error})") from error
-    if not np.isfinite([azimuth, distance, height, pitch]).all() or (distance <= 0.0).any():
-        raise LayoutError(f"layout: distances {distance.tolist()}, expected finite numbers greater than zero")
+    if not np.isfinite(azimuth).all():
+        raise LayoutError(f"layout: azimuths {np.degrees(azimuth).round(3).tolist()} degrees, expected finite numbers")
+    if not np.isfinite([distance, height, pitch]).all() or (distance <= 0.0).any():
+        raise LayoutError(
+            f"layout: distances {distance.tolist()} (expected greater than zero), heights {height.tolist()}, pitches "
+            f"{pitch.tolist()}: expected finite numbers"
+        )
     # the first sensor looks along x at the person, who stands so that the sensor is at its azimuth
     yaw = np.pi - azimuth[0]
     position = np.array([distance[0], 0.0, -height[0]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ from body_tracking.calibration.online import CalibrationParameters, CalibrationU
 from body_tracking.calibration.result import CalibrationResult
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import about_y, frame, walk
 
 Change = Callable[[Skeleton], Skeleton]
@@ -163,6 +164,20 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
     level, line, values = calibration.status()
     assert (level, line) == (0, "calibrated")
     assert values["kinect2 clock_from"] == "motion"
+
+
+def test_a_joint_that_nobody_ever_sees_is_no_reason_to_warn() -> None:
+    unseen = [Joint.FOOT_LEFT, Joint.FOOT_RIGHT]
+
+    def without(skeleton: Skeleton) -> Skeleton:
+        positions, states = skeleton.positions.copy(), skeleton.states.copy()
+        positions[unseen], states[unseen] = np.nan, TrackingState.NOT_TRACKED
+        return replace(skeleton, positions=positions, states=states)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibration, _ = run(tuple((name, without(seen), now) for name, seen, now in stream(8.0)))
+    assert any("still pose" in event or "T-pose" in event for event in calibration.events)
 
 
 def test_somebody_who_never_stands_still_is_enough() -> None:

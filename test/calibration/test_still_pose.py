@@ -44,12 +44,13 @@ def test_a_body_that_is_not_seen_is_not_still() -> None:
 
 
 def test_the_t_pose_is_recognised() -> None:
-    assert is_t_pose(POSE)
-    assert is_t_pose(seen("slow_down", make_movement("slow_down", PERSON).duration))
-    assert not is_t_pose(seen("standing_still", 1.0))
+    assert is_t_pose(POSE[None])
+    assert is_t_pose(seen("slow_down", make_movement("slow_down", PERSON).duration)[None])
+    assert not is_t_pose(seen("standing_still", 1.0)[None])
     arms_down = POSE.copy()
     arms_down[[6, 10]] = POSE[[4, 8]] + [0.0, 0.5, 0.0]
-    assert not is_t_pose(arms_down)
+    assert not is_t_pose(arms_down[None])
+    assert not is_t_pose(np.where(np.arange(25)[:, None] == 6, np.nan, POSE)[None])
 
 
 def test_the_averages_are_registered_on_what_both_track() -> None:

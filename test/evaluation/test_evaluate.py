@@ -151,6 +151,9 @@ def test_a_joint_is_off_track_by_the_distance_that_is_given(
         (["{wave}", "--truth", "{nowhere}"], r"nowhere: no such recording"),
         (["{wave}", "--html", "{text}/page.html"], r"notes\.txt"),
         (["{wave}", "--off-track", "-1"], r"--off-track -1: must be more than 0"),
+        (["{wave}", "--off-track", "inf"], r"--off-track inf: must be more than 0"),
+        (["{wave}", "--truth", "{twist}", "--subject", "bob"], r"--subject: of a C3D file; the truth is .*twist"),
+        (["{wave}", "--measurements", "{text}"], r"--measurements: of a C3D file; the truth is .*wave"),
     ],
 )
 def test_bad_input_is_told_in_one_line(
@@ -172,6 +175,17 @@ def test_bad_input_is_told_in_one_line(
     assert captured.err.startswith("body_tracking: ") and captured.err.count("\n") == 1
     assert re.search(message, captured.err), captured.err
     assert not captured.out
+
+
+def test_of_several_people_it_is_said_that_the_first_is_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = str(tmp_path / "three")
+    assert main(["simulate", "-o", made, "--motion", "standing_still", "--seconds", "2", "--people", "3"]) == 0
+    assert main(["evaluate", made, "--topic", "/kinect1/skeleton", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out.partition("\n")[2])["notes"]
+    for topic in ("/kinect1/skeleton", "/ground_truth/skeleton"):
+        assert f"{made}: {topic} holds 3 people, only the first is compared" in said
 
 
 def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

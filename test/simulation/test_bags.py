@@ -383,7 +383,7 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
         (("--layout", "10"), "layout 10: expected 1 to 9"),
         (("--around=1,x",), "--around 1,x: expected degrees, separated by commas"),
         (("--around=",), "--around : expected degrees"),
-        (("--around=nan",), "expected finite numbers"),
+        (("--around=5,nan",), "layout: azimuths [5.0, nan] degrees, expected finite numbers"),
         (("--people", "0"), "0 people: expected 1 to 6"),
         (("--people", "7"), "7 people: expected 1 to 6"),
         (("--seconds", "2"), "torso_twist: 2.0 s, it takes "),
@@ -392,7 +392,7 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
         (("--imus", "nose"), "segment 'nose': expected one of pelvis, "),
         (("--imus", "pelvis,pelvis"), "--imus pelvis,pelvis: pelvis comes twice"),
         (("--imus", "pelvis", "--imu-rate", "0"), "a rate of 0.0 Hz"),
-        (("--config", "nowhere.yaml"), "nowhere.yaml"),
+        (("--config", "nowhere.yaml"), "body_tracking: nowhere.yaml: cannot be read"),
     ],
 )
 def test_what_cannot_be_simulated_is_one_line(
