@@ -167,7 +167,9 @@ class _Actor:
 
     def truth(self, times: FloatArray) -> Truth:
         """Everything about the person at (n,) seconds."""
-        before, after = self.course(times - _STEP), self.course(times + _STEP)
+        # a movement is known from its beginning to its end
+        inside = np.clip(times, _STEP, self.movement.duration - _STEP)
+        before, after = self.course(inside - _STEP), self.course(inside + _STEP)
         velocities = (joints(self.person, after) - joints(self.person, before)) / (2.0 * _STEP)
         stamps = START_NS + np.round(times * NANOSECONDS).astype(np.int64)
         course = self.course(times)

@@ -92,6 +92,14 @@ def test_the_truth_is_one_body_with_its_velocities() -> None:
     assert truth.stamps_ns[0] == pytest.approx(START_NS, abs=NANOSECONDS // 100)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_velocities_are_whole_from_the_first_instant_on(seed: int) -> None:
+    """Whichever side of the start the first capture falls to."""
+    truth = simulate(Setup("random", seconds=SHORT, seed=seed)).truths[0]
+    assert_allclose(truth.velocities[0], truth.velocities[1], atol=0.05 + 0.2 * np.abs(truth.velocities[1]).max())
+    assert np.abs(truth.rates[0]).max() > 0.5 * np.abs(truth.rates[1]).max()
+
+
 def test_people_stand_side_by_side_and_are_told_apart() -> None:
     recording = simulate(Setup("standing_still", layout(1), number=3, seconds=3.0))
     bases = np.stack([truth.positions[0, Joint.SPINE_BASE] for truth in recording.truths])
