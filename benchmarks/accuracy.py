@@ -10,7 +10,8 @@ methods   ``one sensor``: what kinect1 says, in world; ``thesis ...``: the pipel
 errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from when all have
           begun: mean 3D error (mm); the same without each joint's constant offset in the body's own frames ("fixed");
           the latter where a joint is hidden from one sensor or more; RMSE of shoulder elevation and elbow flexion
-          (degrees); share of the frames in which these lie within 1.96 stated standard deviations; delay (ms) by the stamps, without what a method waits for.
+          (degrees); share of the frames in which these lie within 1.96 stated standard deviations; delay (ms) by the
+          stamps, without what a method waits for.
 
 Parts: ``main`` (every motion in layout 4), ``layouts`` (the nine layouts), ``sensitivity`` (every parameter of the
 simulator at half and at double). Means over seeds with 95 % confidence intervals (Student). ``--write`` makes
