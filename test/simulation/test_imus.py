@@ -142,7 +142,7 @@ def degrees(value: float) -> float:
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_at_rest_it_feels_gravity_upwards_and_no_rotation(seed: int) -> None:
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat, np.array([2.0, -1.0, 1.2])), duration=0.3)
@@ -152,7 +152,7 @@ def test_at_rest_it_feels_gravity_upwards_and_no_rotation(seed: int) -> None:
 
 
 @given(st.floats(0.2, 20.0), st.floats(0.0, 0.1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_the_motion_is_asked_for_its_own_time_only(duration: float, phase: float) -> None:
     asked: list[float] = []
 
@@ -167,7 +167,7 @@ def test_the_motion_is_asked_for_its_own_time_only(duration: float, phase: float
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_rates_and_accelerations_are_the_derivatives_of_the_motion(seed: int) -> None:
     """Up to 5 Hz, off by no more than the next terms of the series over the step h = 0.1 ms.
 
@@ -186,7 +186,7 @@ def test_rates_and_accelerations_are_the_derivatives_of_the_motion(seed: int) ->
 
 
 @given(SEEDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_integrating_the_angular_rate_gives_the_rotation_back(seed: int) -> None:
     samples = measured(Swing.draw(seed), duration=3.0, rate_hz=1000.0, mounting=usual_mounting("forearm_left"))
     rates, steps = samples.angular_velocity, np.diff(samples.truth.times)[:, None]
@@ -200,7 +200,7 @@ def test_integrating_the_angular_rate_gives_the_rotation_back(seed: int) -> None
 
 
 @given(SEEDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_integrating_the_specific_force_twice_gives_the_way_back(seed: int) -> None:
     samples = measured(Swing.draw(seed), duration=3.0, rate_hz=1000.0, mounting=usual_mounting("hand_right"))
     times, places = samples.truth.times, samples.truth.positions
@@ -228,7 +228,7 @@ def test_a_sensor_beside_the_axis_feels_the_centripetal_acceleration() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_all_three_are_told_in_the_frame_of_the_sensor(seed: int) -> None:
     """Turned on its place, it says the same, turned back."""
     motion, turn = Swing.draw(seed), so3.exp(np.random.default_rng(seed).normal(size=3))
@@ -243,7 +243,7 @@ def test_all_three_are_told_in_the_frame_of_the_sensor(seed: int) -> None:
 
 
 @given(SEEDS, st.floats(-3.0, 3.0), st.floats(-1.5, 1.5))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_turned_to_world_the_field_is_the_earths(seed: int, north: float, dip: float) -> None:
     where = Surroundings(dip=dip, north=north)
     samples = measured(Swing.draw(seed), duration=0.5, surroundings=where)
@@ -267,7 +267,7 @@ def test_the_field_of_iron_is_twice_as_strong_along_its_axis_and_falls_with_the_
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_the_field_of_iron_has_no_sources_and_no_curl(seed: int) -> None:
     rng = np.random.default_rng(seed)
     iron = Iron(np.zeros(3), rng.normal(size=3))
@@ -282,7 +282,7 @@ def test_the_field_of_iron_has_no_sources_and_no_curl(seed: int) -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_field_lines_enter_a_ball_of_soft_iron_at_right_angles(seed: int) -> None:
     direction = np.random.default_rng(seed).normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -388,7 +388,7 @@ def test_beyond_the_range_it_says_the_end_of_the_range_and_within_it_whole_steps
 
 
 @given(SEEDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_without_tissue_it_keeps_its_place_on_the_segment(seed: int) -> None:
     errors = replace(IDEAL, misalignment=5.0)
     motion, mounting = Swing.draw(seed), usual_mounting("forearm_right")
@@ -416,7 +416,7 @@ def test_misalignment_is_spread_as_stated() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_at_rest_tissue_lets_the_sensor_down_by_its_sag_whatever_the_pose(seed: int) -> None:
     """And turns it by the sag across the limb over the radius."""
     errors = replace(IDEAL, tissue_sag=0.001, tissue_turn=10.0)
@@ -531,7 +531,7 @@ def test_usual_mountings_point_away_from_the_body_and_mirror_each_other(segment:
 
 
 @given(SEEDS, st.floats(-3.0, 3.0))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_at_rest_a_driver_with_magnetometer_knows_its_orientation_to_east_north_up(seed: int, north: float) -> None:
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat), duration=0.5, oriented=True, surroundings=Surroundings(north=north))
@@ -712,7 +712,7 @@ def test_off_and_on_again_it_is_silent_in_between_and_starts_with_other_biases_a
     packet=st.integers(1, 12),
     delay_jitter=st.floats(0.0, 0.2),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_stamps_and_arrivals_keep_their_order_and_tell_the_own_clock(
     seed: int, rate_hz: float, offset_ns: int, drift: float, jitter: float, packet: int, delay_jitter: float
 ) -> None:

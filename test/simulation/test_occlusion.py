@@ -62,7 +62,7 @@ def test_the_trunk_never_covers_the_spine() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_segment_never_covers_the_joints_at_its_ends(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sight = rng.normal([0.0, 0.0, 2.5], 0.4, (5, 25, 3))
@@ -72,7 +72,7 @@ def test_a_segment_never_covers_the_joints_at_its_ends(seed: int) -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_cover_is_what_the_nearest_of_many_points_on_ray_and_axis_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.05, 0.3)
@@ -88,7 +88,7 @@ def test_cover_is_what_the_nearest_of_many_points_on_ray_and_axis_says(seed: int
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_cover_does_not_depend_on_where_the_sensor_looks(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sight = rng.normal([0.0, 0.0, 2.5], 0.4, (4, 25, 3))

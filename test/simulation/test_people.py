@@ -103,7 +103,7 @@ def test_the_heavier_are_the_thicker() -> None:
     assert np.corrcoef(thickness, build)[0, 1] > 0.9
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(seeds)
 def test_knees_are_where_thigh_and_shank_reach_and_bend_forward(seed: int) -> None:
     rng = np.random.default_rng(seed)

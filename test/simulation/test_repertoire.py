@@ -78,14 +78,14 @@ def shoulder_yaw(positions: FloatArray) -> FloatArray:
     return np.degrees(np.unwrap(np.arctan2(-line[:, 0], line[:, 1])))
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(names, seeds)
 def test_no_angle_leaves_its_range(name: str, seed: int) -> None:
     _, movement = somebody(name, seed)
     assert np.abs(RANGES.excess(watched(movement).q)).max() == 0.0
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(names, seeds)
 def test_bones_keep_their_lengths(name: str, seed: int) -> None:
     person, movement = somebody(name, seed)
@@ -95,7 +95,7 @@ def test_bones_keep_their_lengths(name: str, seed: int) -> None:
     assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-9)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(names, seeds)
 def test_feet_are_never_below_the_floor_and_stay_where_they_stand(name: str, seed: int) -> None:
     person, movement = somebody(name, seed)
@@ -142,7 +142,7 @@ def test_velocities_lead_from_one_configuration_to_the_next(name: str) -> None:
     assert_allclose(MODEL.difference(course.q[:-2], course.q[2:]), integral, atol=2e-5)
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(names, seeds)
 def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
     person, movement = somebody(name, seed)
@@ -153,7 +153,7 @@ def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
     assert speeds[:, Joint.SPINE_BASE].max() < 2.6
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.sampled_from([name for name in MOTIONS if name not in FREE]), seeds)
 def test_exercises_begin_and_end_in_a_t_pose(name: str, seed: int) -> None:
     person, movement = somebody(name, seed)
@@ -253,7 +253,7 @@ def test_the_shoulders_of_the_standard_twist_turn_by_90_degrees_to_each_side() -
     assert ((lumbar[np.abs(lumbar) > 3.0] * thoracic[np.abs(lumbar) > 3.0]) > 0.0).all()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seeds)
 def test_everybody_twists_far(seed: int) -> None:
     person, movement = somebody("torso_twist", seed)
