@@ -480,7 +480,10 @@ def draw_layouts(table: Table, path: Path) -> None:
     for row, line in enumerate(values):
         best = int(np.nanargmin(line))
         for column, value in enumerate(line):
-            axes.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8)
+            dark = image.norm(value) > 0.6
+            axes.text(
+                column, row, f"{value:.0f}", ha="center", va="center", fontsize=8, color="white" if dark else "black"
+            )
         axes.add_patch(_frame(best, row))
     picture.colorbar(image, label="mean 3D error, mm")
     picture.savefig(path, metadata={"Date": None})
