@@ -8,6 +8,10 @@ A depth sensor's skeleton is wrong by centimetres but trembles by millimetres: m
 joint placed beside the anatomical one, a tilt by the viewing direction). A filter told that all of it were white would
 average it away on paper only. So the measurement covariance ``R`` is split: ``white_noise_share`` of it drives the
 gain, the rest is carried along and added to the covariance that is handed out; gating allows for all of it.
+
+What no sensor shows does not fly on as it last moved: at constant velocity a hand that is hidden in mid-reach would be
+a metre away after half a second. It is carried along by the nearest joint towards the trunk that is seen, and its own
+movement against that one fades (an Ornstein-Uhlenbeck process, whose velocity has the initial deviation for ever).
 """
 
 from __future__ import annotations
@@ -24,7 +28,16 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+from body_tracking.skeleton import (
+    BONES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Skeleton,
+    TrackingState,
+)
 
 ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
@@ -35,6 +48,18 @@ _MAX_RANGE = 100.0
 _REFERENCE_DISTANCE = 2.0
 """Metres within which the measurement noise no longer shrinks."""
 _EYE3 = np.eye(3)
+_ALL: IntArray = np.arange(N_JOINTS, dtype=np.intp)
+
+
+def _towards_trunk() -> IntArray:
+    """(25,) the next joint towards the base of the spine, which is its own."""
+    towards = _ALL.copy()
+    for parent, child in BONES:
+        towards[child] = parent
+    return towards
+
+
+_TOWARDS_TRUNK = _towards_trunk()
 
 
 class FilterError(BodyTrackingError):
@@ -249,6 +274,8 @@ class LinearKalmanFilter:
         # Every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it.
         self._unit_noise: FloatArray = joint_densities(densities)[:, None, None] * unit_step
         self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
+        # an Ornstein-Uhlenbeck velocity of variance s driven by white noise of density q fades in 2 s / q
+        self._fading_time: FloatArray = 2.0 * p.initial_velocity_stddev**2 / joint_densities(densities)
         self._gate = float(chi2.ppf(p.gate_probability, 3))
         self.counters: dict[str, int] = dict.fromkeys(
             (
@@ -374,10 +401,14 @@ class LinearKalmanFilter:
         """Predict all joints, update the observed ones, take back those beyond the gate; returns (25,) these."""
         kalman = self._kalman
         size = 3 * self._order
-        transition = np.eye(size)  # eq. 5.11, 5.12
-        if self._order == 2:
-            transition[:3, 3:] = step * _EYE3
-        kalman.predict(F=transition, Q=self._unit_noise * step**self._noise_powers)
+        carrier = self._carriers(observed)
+        if self._order == 2 and (carrier != _ALL).any():
+            self._predict_carried(carrier, step)
+        else:
+            transition = np.eye(size)  # eq. 5.11, 5.12
+            if self._order == 2:
+                transition[:3, 3:] = step * _EYE3
+            kalman.predict(F=transition, Q=self._unit_noise * step**self._noise_powers)
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
@@ -388,6 +419,7 @@ class LinearKalmanFilter:
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
         if not suspects.any():
+            self._carry(carrier, ~observed)
             return suspects
 
         # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is an outlier.
@@ -398,7 +430,58 @@ class LinearKalmanFilter:
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
+        self._carry(carrier, ~observed | rejected)
         return rejected
+
+    def _carriers(self, observed: BoolArray) -> IntArray:
+        """(25,) which joint carries each along: itself where it is seen, now and when it was last looked for."""
+        loose = ~observed | (self._unmeasured > 0.0)
+        carrier = _ALL
+        if self._order == 2 and loose.any():
+            for _ in _ALL:  # as far as the longest chain at most
+                further = np.where(loose[carrier], _TOWARDS_TRUNK[carrier], carrier)
+                if (further == carrier).all():
+                    break
+                carrier = further
+        return carrier
+
+    def _predict_carried(self, carrier: IntArray, step: float) -> None:
+        """Predict all joints; those with another carrier (25,) move with it, and less and less against it.
+
+        With ``tau`` the fading time, ``f = exp(-step / tau)``, ``r = tau (1 - f)`` and ``u`` the carrier's velocity,
+        ``x' = x + r v + (step - r) u`` and ``v' = f v + (1 - f) u``; the noise is that of an integrated
+        Ornstein-Uhlenbeck velocity (Gillespie 1996, eq. 2.8-2.9), which for a long ``tau`` is that of eq. 5.12. Where
+        nothing on the way is seen the base of the spine carries, and goes on as it last moved, if that is known.
+        """
+        free = carrier != _ALL
+        carrying = np.where(self._alive[carrier, None, None], self._kalman.x[carrier, 3:], 0.0)
+        tau = np.where(free, self._fading_time, 1.0)
+        fade = np.where(free, np.exp(-step / tau), 1.0)
+        reach = np.where(free, tau * (1.0 - fade), step)
+        transition = np.zeros((N_JOINTS, 6, 6))
+        transition[:] = np.eye(6)
+        transition[:, :3, 3:] = reach[:, None, None] * _EYE3
+        transition[:, 3:, 3:] = fade[:, None, None] * _EYE3
+        control = np.zeros((N_JOINTS, 6, 3))
+        control[:, :3] = (step - reach)[:, None, None] * _EYE3
+        control[:, 3:] = (1.0 - fade)[:, None, None] * _EYE3
+
+        noise = self._unit_noise * step**self._noise_powers
+        # per unit density: of velocity, of both, of position
+        vv = 0.5 * tau * (1.0 - fade**2)
+        tv = 0.5 * reach**2
+        tt = tau**2 * (step - 2.0 * reach + vv)
+        blocks = np.stack([np.stack([tt, tv], axis=-1), np.stack([tv, vv], axis=-1)], axis=-2)
+        density = self._unit_noise[:, 3, 3]
+        noise = np.where(free[:, None, None], density[:, None, None] * np.kron(blocks, _EYE3), noise)
+        self._kalman.predict(u=Stacked.of(carrying), B=Stacked.of(control), F=Stacked.of(transition), Q=noise)
+
+    def _carry(self, carrier: IntArray, unseen: BoolArray) -> None:
+        """What the measurements corrected of a carrier's motion, its unseen joints (25,) do, too."""
+        if self._order == 2:
+            carried = unseen & (carrier != _ALL)
+            correction = self._kalman.x - self._kalman.x_prior
+            self._kalman.x[carried] += correction[carrier[carried]]
 
     def _distances(self) -> FloatArray:
         """(25,) squared Mahalanobis distances of the last update's innovations; 0 where nothing was observed."""
