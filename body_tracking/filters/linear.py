@@ -12,6 +12,10 @@ gain, the rest is carried along and added to the covariance that is handed out; 
 What no sensor shows does not fly on as it last moved: at constant velocity a hand that is hidden in mid-reach would be
 a metre away after half a second. It is carried along by the nearest joint towards the trunk that is seen, and its own
 movement against that one fades (an Ornstein-Uhlenbeck process, whose velocity has the initial deviation for ever).
+
+A limb that is thrust forward is no outlier, and following it with the gain of a quiet one leaves it farther behind with
+every frame until it is taken for one. So each joint's process noise grows with its surprising innovations, and is back
+soon (adjustable level of the process noise, Bar-Shalom, Li and Kirubarajan 2001, section 11.2).
 """
 
 from __future__ import annotations
@@ -48,6 +52,10 @@ _MAX_RANGE = 100.0
 _REFERENCE_DISTANCE = 2.0
 """Metres within which the measurement noise no longer shrinks."""
 _EYE3 = np.eye(3)
+_SURPRISING, _MOST_SURPRISING = 4.0, 10.0
+"""Times its expectation from which a normalised innovation squared raises the process noise, and up to which."""
+_MOST_LEVEL = np.log(200.0)
+"""Of a joint with 50 m/s2, the fastest that people punch, instead of 3."""
 _ALL: IntArray = np.arange(N_JOINTS, dtype=np.intp)
 
 
@@ -166,6 +174,25 @@ class LinearKalmanParameters:
             "unit": "",
             "min": 0.001,
             "max": 1.0,
+        },
+    )
+    adaptation: float = field(
+        default=0.5,
+        metadata={
+            "doc": "by how much the logarithm of a joint's process noise rises with each normalised innovation squared "
+            "beyond four times its expectation; 0 leaves the noise as it is",
+            "unit": "",
+            "min": 0.0,
+            "max": 10.0,
+        },
+    )
+    adaptation_time: float = field(
+        default=0.1,
+        metadata={
+            "doc": "time constant with which that fades: a thrust lasts that long",
+            "unit": "s",
+            "min": 0.001,
+            "max": 100.0,
         },
     )
     initial_velocity_stddev: float = field(
@@ -306,6 +333,7 @@ class LinearKalmanFilter:
         self._stamp_ns = 0
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
+        self._level: FloatArray = np.zeros(N_JOINTS)
         self._unmeasured: FloatArray = np.zeros(N_JOINTS)
         self._rejected: FloatArray = np.zeros(N_JOINTS)
         self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
@@ -402,13 +430,16 @@ class LinearKalmanFilter:
         kalman = self._kalman
         size = 3 * self._order
         carrier = self._carriers(observed)
-        if self._order == 2 and (carrier != _ALL).any():
-            self._predict_carried(carrier, step)
+        self._level *= np.exp(-step / self.parameters.adaptation_time)
+        noise_of_step = self._unit_noise * step**self._noise_powers
+        usual = np.exp(self._level)[:, None, None]
+        if (carrier != _ALL).any():
+            self._predict_carried(carrier, usual * noise_of_step, step)
         else:
             transition = np.eye(size)  # eq. 5.11, 5.12
             if self._order == 2:
                 transition[:3, 3:] = step * _EYE3
-            kalman.predict(F=transition, Q=self._unit_noise * step**self._noise_powers)
+            kalman.predict(F=transition, Q=usual * noise_of_step)
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
@@ -418,18 +449,25 @@ class LinearKalmanFilter:
         distances = self._distances()
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
+        surprise = np.clip(distances / 3.0 - _SURPRISING, 0.0, _MOST_SURPRISING - _SURPRISING)
+        level = self._level
+        self._level = np.minimum(level + self.parameters.adaptation * surprise, _MOST_LEVEL)
         if not suspects.any():
             self._carry(carrier, ~observed)
             return suspects
 
-        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is an outlier.
-        # Once more for these, with all of the noise: a change is then followed without a kick to the velocity.
+        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is thrust
+        # forward, or it is an outlier. Once more for these, with all of the noise of both kinds: a change is then
+        # followed with a small kick to the velocity only.
         kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
+        raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - usual, 0.0) * noise_of_step
+        kalman.P = Stacked.of(np.asarray(kalman.P_prior) + raised)
         noise = np.where(suspects[:, None, None], noise, white)
         kalman.update(measurement, R=Stacked.of(noise), H=Stacked.of(observation))
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
+        self._level[rejected] = level[rejected]  # nobody moves like that
         self._carry(carrier, ~observed | rejected)
         return rejected
 
@@ -445,7 +483,7 @@ class LinearKalmanFilter:
                 carrier = further
         return carrier
 
-    def _predict_carried(self, carrier: IntArray, step: float) -> None:
+    def _predict_carried(self, carrier: IntArray, noise: FloatArray, step: float) -> None:
         """Predict all joints; those with another carrier (25,) move with it, and less and less against it.
 
         With ``tau`` the fading time, ``f = exp(-step / tau)``, ``r = tau (1 - f)`` and ``u`` the carrier's velocity,
@@ -466,7 +504,6 @@ class LinearKalmanFilter:
         control[:, :3] = (step - reach)[:, None, None] * _EYE3
         control[:, 3:] = (1.0 - fade)[:, None, None] * _EYE3
 
-        noise = self._unit_noise * step**self._noise_powers
         # per unit density: of velocity, of both, of position
         vv = 0.5 * tau * (1.0 - fade**2)
         tv = 0.5 * reach**2
@@ -508,8 +545,7 @@ class LinearKalmanFilter:
         kalman.P[joints] = np.diag([0.0] * 3 + [self.parameters.initial_velocity_stddev**2] * (3 * self._order - 3))
         kalman.P[joints, :3, :3] = self.parameters.white_noise_share * noise[joints]
         self._alive |= joints
-        self._unmeasured[joints] = 0.0
-        self._rejected[joints] = 0.0
+        self._level[joints] = self._unmeasured[joints] = self._rejected[joints] = 0.0
 
     def _output(self, skeleton: Skeleton, used: BoolArray) -> Skeleton | None:
         alive = self._alive

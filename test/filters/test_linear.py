@@ -71,7 +71,7 @@ def run(
 def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
     """Random covariances, uneven time steps, joints that come and go; every state and covariance to 1e-11."""
     rng = np.random.default_rng(1)
-    parameters = LinearKalmanParameters(white_noise_share=1.0, gate_probability=1.0, predict_for=60.0)
+    parameters = LinearKalmanParameters(white_noise_share=1.0, gate_probability=1.0, predict_for=60.0, adaptation=0.0)
     stacked = LinearKalmanFilter(model, parameters)
     order = 2 if model == CONSTANT_VELOCITY else 1
     names = ("trunk", "limb", "extremity")
@@ -288,6 +288,22 @@ def test_an_outlier_is_rejected_and_a_move_for_good_is_followed() -> None:
     first = frames[0]
     assert first is not None and first.states[Joint.WRIST_RIGHT] == TrackingState.INFERRED
     assert_array_equal(np.delete(first.states, Joint.WRIST_RIGHT), np.delete(TRACKED, Joint.WRIST_RIGHT))
+
+
+def test_a_punch_is_followed() -> None:
+    """An elbow that is thrust forward at 45 m/s2 and stopped as hard; without adaptation it is left half a metre."""
+    elbow = Joint.ELBOW_RIGHT
+    times = np.arange(45) / 30.0
+    path = np.repeat(BODY[None], len(times), axis=0)
+    path[:, elbow, 0] += 0.22 * (1.0 - np.cos(2.0 * np.pi * np.clip(times - 1.0, 0.0, 0.44) / 0.44))
+
+    def worst(**parameters: float) -> float:
+        tracker = LinearKalmanFilter(CONSTANT_VELOCITY, LinearKalmanParameters(**parameters))
+        off = np.array([result.positions[elbow] for result in run(tracker, path)]) - path[:, elbow]
+        return float(np.linalg.norm(off, axis=1).max())
+
+    assert worst() < 0.08
+    assert worst(adaptation=0.0) > 0.3
 
 
 def test_the_slow_part_of_the_noise_opens_the_gate_and_stays_in_the_covariance() -> None:
