@@ -15,6 +15,8 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
   poses (``lengths``), and only considered here: what errs for seconds would otherwise be learnt as a length. They are
   brought in every second, until they are known to some millimetres or for a minute, and then stay as they are.
 - Ranges of motion bound what nothing observes. They enter as rarely as they would be new information.
+- Where a sensor takes the centres of the joints to be, beside the anatomical ones, never changes, is the same for all
+  sensors of a kind, and so shows in no innovation. What it does to the pose is added to what is handed out.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 from scipy.stats import chi2
 
@@ -34,7 +37,7 @@ from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.lengths import SegmentLengths, proportions
-from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.model import Linearisation, ModelError
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
@@ -201,6 +204,14 @@ class EkfParameters:
         0.0,
         9.0,
     )
+    offset_scale: float = number_field(
+        1.0,
+        "distance of the joints' centres by a sensor that states covariances from the anatomical ones, in standard "
+        "deviations of body_tracking.measurement; no filter can know it, and it is added to what is handed out",
+        "1",
+        0.0,
+        10.0,
+    )
     slow_time: float = number_field(3.0, "time for which a sensor's slow errors persist", "s", 0.05, 1000.0)
     gate_probability: float = number_field(
         0.9999,
@@ -293,6 +304,7 @@ class _SensorState(_Changeable):
         slow: (2,) scales of the slow variance: of points by themselves, of limbs.
         slow_estimate: (2,) their running estimates, of which only significant ones are used.
         slow_information: (2,) of the estimates.
+        stated: it says itself how much it errs, as one that was measured against anatomy does.
     """
 
     stamps: tuple[int, ...]
@@ -303,6 +315,7 @@ class _SensorState(_Changeable):
     slow: FloatArray
     slow_estimate: FloatArray
     slow_information: FloatArray
+    stated: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,6 +444,7 @@ class ExtendedKalmanFilter:
         self._own: IntArray = (3 * self._points * first[:, :, None] + first[:, None, :]).astype(np.intp)
         self._pose_prior()
         self._lengths_covariance = proportions()
+        self._prior_information = block_diag(np.diag(self._rest_information), np.linalg.inv(self._lengths_covariance))
         self.counters: dict[str, int] = dict.fromkeys(
             (
                 "frames",
@@ -461,6 +475,8 @@ class ExtendedKalmanFilter:
         self._history: deque[tuple[_State, _Measurement]] = deque()
         self._waiting: list[_Measurement] = []
         self._started_by: tuple[str, int] | None = None
+        self._last_handed_out: tuple[_State, Linearisation, FloatArray] | None = None
+        self._last_displaced: tuple[int, FloatArray] | None = None
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
 
@@ -862,7 +878,7 @@ class ExtendedKalmanFilter:
             q = self.model.integrate(q, correction[t])
             lengths = lengths if state.settled else lengths + correction[self._lengths]
         lines = self.model.linearise(q, lengths)
-        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
+        observation = self._observation(lines)
         spread = state.covariance if covariance is None else covariance
         curvature = self.model.curvature(lines, spread[t, t])
         innovation = (measurement.positions - lines.posture.positions - curvature).reshape(-1)
@@ -916,6 +932,7 @@ class ExtendedKalmanFilter:
             np.array([slow, 0.0]),
             np.array([slow, 0.0]),
             np.full(2, 4.0),
+            measurement.skeleton.covariances is not None,
         )
 
     def _seen_by(self, sensor: _SensorState, measurement: _Measurement, used: BoolArray) -> _SensorState:
@@ -1502,12 +1519,49 @@ class ExtendedKalmanFilter:
     def _body(self) -> int:
         return 0 if self._newest is None else self._newest.body
 
+    def _observation(self, lines: Linearisation) -> FloatArray:
+        """(57, 53) derivative of the points by tangent and lengths."""
+        both = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
+        return both.reshape(-1, self._observed)
+
+    def _handed_out(self, state: _State) -> tuple[Linearisation, FloatArray]:
+        """Where the points are, and the covariance (85, 85) to hand out: what the filter knows, and what it cannot."""
+        if self._last_handed_out is None or self._last_handed_out[0] is not state:
+            lines, covariance = self.model.linearise(state.q, state.lengths), state.covariance
+            if self.parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
+                covariance = covariance.copy()
+                covariance[: self._observed, : self._observed] += self._displaced(state, lines)
+            self._last_handed_out = state, lines, covariance
+        return self._last_handed_out[1:]
+
+    def _displaced(self, state: _State, lines: Linearisation) -> FloatArray:
+        """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
+
+        By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
+        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` is how the filter weighs the points and ``P`` what is known
+        without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
+        offsets, err by more.
+        """
+        period = state.stamp_ns // _SLOW_PERIOD_NS
+        if self._last_displaced is None or self._last_displaced[0] != period:  # it changes slowly, as the pose does
+            weights = sum(
+                (1.0 / (sensor.white + sensor.slow[0] * self._base_variance) for sensor in state.sensors.values()),
+                np.zeros(self._points),
+            )
+            weighted = self._observation(lines).T * weights.repeat(_DIMENSIONS)
+            gain = np.linalg.solve(weighted @ self._observation(lines) + self._prior_information, weighted)
+            offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
+            displacement = gain * offsets.repeat(_DIMENSIONS)
+            self._last_displaced = period, displacement @ displacement.T
+        return self._last_displaced[1]
+
     def _estimate(self, state: _State) -> ModelEstimate:
+        _, told = self._handed_out(state)
         covariance = np.empty((2 * self._nv, 2 * self._nv))
         for row, rows in enumerate((self._tangent, self._velocities)):
             for column, columns in enumerate((self._tangent, self._velocities)):
                 block = slice(row * self._nv, (row + 1) * self._nv), slice(column * self._nv, (column + 1) * self._nv)
-                covariance[block] = state.covariance[rows, columns]
+                covariance[block] = told[rows, columns]
         return ModelEstimate(
             state.stamp_ns,
             self._frame_id,
@@ -1516,14 +1570,14 @@ class ExtendedKalmanFilter:
             state.velocity,
             covariance,
             state.lengths,
-            np.sqrt(state.covariance.diagonal()[self._lengths]),
+            np.sqrt(told.diagonal()[self._lengths]),
         )
 
     def _output(self, state: _State, skeleton: Skeleton) -> Skeleton:
-        lines = self.model.linearise(state.q, state.lengths)
+        lines, told = self._handed_out(state)
         joints = self.model.joints
-        observation = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1).reshape(-1, self._observed)
-        spread = observation @ state.covariance[: self._observed, : self._observed] @ observation.T
+        observation = self._observation(lines)
+        spread = observation @ told[: self._observed, : self._observed] @ observation.T
         positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
         covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)

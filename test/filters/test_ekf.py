@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import chi2
 
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.linear import FilterError
@@ -15,6 +16,7 @@ from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
+from body_tracking.measurement import BASE_STDDEV
 from body_tracking.simulation.random_people import (
     ARMS,
     EVERYTHING,
@@ -127,6 +129,34 @@ def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -
     others = np.setdiff1d(np.arange(N_JOINTS), POINTS)
     assert_array_equal(last.states[others], TrackingState.NOT_TRACKED)
     assert_sound(outputs, estimator)
+
+
+def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_handed_out() -> None:
+    """Constant offsets of the deviation that the measurement model states, of people in random poses."""
+    rng = np.random.default_rng(5)
+    stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
+    # of forearms and hands it is true to first order only
+    near = np.array([k for k in OBSERVED if not MODEL.coordinate_names[k].startswith(("forearm", "wrist"))])
+    told, hidden = [], []
+    for seed in range(25):
+        truth = somebody(100 + seed, 1.0)
+        offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
+        frames = [
+            replace(frame, positions=frame.positions + offsets, covariances=stated)
+            for frame in measured(truth, 0.004, seed).skeletons
+        ]
+        estimates = []
+        for parameters in (EkfParameters(), EkfParameters(offset_scale=0.0)):
+            estimator = ExtendedKalmanFilter(parameters)
+            run(estimator, frames)
+            estimates.append(known(estimator))
+        assert_array_equal(estimates[0].q, estimates[1].q)
+        for estimate, found in zip(estimates, (told, hidden), strict=True):
+            error = MODEL.difference(estimate.q, truth.q[-1])[near]
+            found.append(error**2 / estimate.covariance.diagonal()[near])
+    assert 0.6 < np.mean(told) < 1.7
+    assert 0.9 < np.mean(np.array(told) < chi2.ppf(0.95, 1)) < 0.99
+    assert np.mean(np.array(hidden) < chi2.ppf(0.95, 1)) < 0.6
 
 
 def test_its_uncertainty_is_true() -> None:
