@@ -1229,7 +1229,8 @@ class ExtendedKalmanFilter:
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
         try:
-            fit = self.inverse.solve(points, stddev, state.lengths)
+            # to tell whether a pose is worth it takes half the steps that it takes to tell the pose
+            fit = self.inverse.solve(points, stddev, state.lengths, tolerance=_CLOSE)
             # lengths that were learnt in a wrong pose are wrong, too
             lengths = self._lengths_of(points)
             size = float(np.median(lengths / state.lengths))
@@ -1247,6 +1248,7 @@ class ExtendedKalmanFilter:
         if fit.cost > share * present:
             return state
         self.counters["restarts"] += 1
+        fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
         return self._new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
 
     def _leaning(
