@@ -222,15 +222,32 @@ class FilterStage:
             skeletons: the bodies in it, in the sensor's own frame and clock.
             now_ns: as above.
         """
-        self._received[sensor] += 1
-        subject = self._subjects[sensor].pick(skeletons)
-        if subject is None or self.alignment is None:
-            return
-        aligned = self.alignment.push(sensor, subject)
+        aligned = self._aligned(sensor, skeletons)
         if aligned is not None:
             self.poll(now_ns)
-            waiting_ns = now_ns if self._steady is None else self._steady()
-            self._take(self._ordering.push(sensor, aligned, waiting_ns), now_ns)
+            self._take(self._ordering.push(sensor, aligned, self._waiting_ns(now_ns)), now_ns)
+
+    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """The same for one of several frames that are here: the next :meth:`poll` takes them together, in their order.
+
+        Args:
+            sensor: as above.
+            skeletons: as above.
+            now_ns: as above.
+        """
+        aligned = self._aligned(sensor, skeletons)
+        if aligned is not None:
+            self._ordering.hold(sensor, aligned, self._waiting_ns(now_ns))
+
+    def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
+        """The person in ``world``; None where the sensor is not calibrated, or shows nobody."""
+        self._received[sensor] += 1
+        subject = self._subjects[sensor].pick(skeletons)
+        return None if subject is None or self.alignment is None else self.alignment.push(sensor, subject)
+
+    def _waiting_ns(self, now_ns: int) -> int:
+        """The time in the clock by which frames wait."""
+        return now_ns if self._steady is None else self._steady()
 
     def poll(self, now_ns: int) -> None:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""

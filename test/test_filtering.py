@@ -47,9 +47,12 @@ def events() -> list[Event]:
 
 
 def staged(
-    events: list[Event], wanted: Callable[[str], bool] | None = None, **settings: float
+    events: list[Event], wanted: Callable[[str], bool] | None = None, busy: float = 0.0, **settings: float
 ) -> tuple[FilterStage, list[tuple[str, int]], list[Skeleton]]:
-    """The stage after all events; topic and stamp of what it published; the skeletons."""
+    """The stage after all events; topic and stamp of what it published; the skeletons.
+
+    With ``busy``, it looks at what has come once in so many seconds only, and takes that together.
+    """
     published: list[tuple[str, int]] = []
     skeletons: list[Skeleton] = []
 
@@ -62,8 +65,15 @@ def staged(
     stage = FilterStage(chosen, publish, wanted)
     for sensor in SENSORS:
         stage.set_pose(level_pose(sensor))
+    looked_ns = events[0][0]
     for now_ns, sensor, skeleton in events:
-        stage.on_sensor(sensor, [skeleton], now_ns)
+        if busy == 0.0:
+            stage.on_sensor(sensor, [skeleton], now_ns)
+            continue
+        while now_ns > looked_ns:
+            stage.poll(looked_ns)
+            looked_ns += round(busy * NANOSECONDS)
+        stage.hold(sensor, [skeleton], looked_ns)
     while (deadline_ns := stage.deadline_ns) is not None:
         stage.poll(deadline_ns)
     return stage, published, skeletons
@@ -78,6 +88,42 @@ def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events
     assert stamps == sorted(set(stamps))
     assert_allclose(ordered[-1].positions, early[-1].positions, rtol=0.0, atol=1e-6)
     assert ordered[-1].stamp_ns == early[-1].stamp_ns
+
+
+@pytest.mark.parametrize("busy", [0.03, 0.08, 0.15])
+def test_who_is_busy_for_long_takes_what_came_meanwhile_in_its_order(events: list[Event], busy: float) -> None:
+    prompt, _, ordered = staged(events, predict_after=1.0)
+    lagging, _, together = staged(events, busy=busy, predict_after=1.0)
+    assert lagging.counters["late_frames"] <= prompt.counters["late_frames"]
+    assert lagging.counters["frames"] == prompt.counters["frames"]
+    # each frame has its output still, one after the other
+    stamps = [skeleton.stamp_ns for skeleton in together]
+    assert stamps == sorted(set(stamps)) and set(stamps) >= {skeleton.stamp_ns for skeleton in ordered}
+    assert_allclose(together[-1].positions, ordered[-1].positions, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("busy", [0.0, 0.002])
+def test_a_burst_after_a_stall_goes_back_once_and_its_frames_all_count(events: list[Event], busy: float) -> None:
+    # the second sensor's connection stalls for 0.18 s
+    begin_ns = events[len(events) // 2][0]
+    end_ns = begin_ns + round(0.18 * NANOSECONDS)
+    held = [event[1] == SENSORS[1] and begin_ns <= event[0] < end_ns for event in events]
+    first_ns = next(skeleton.stamp_ns for (_, _, skeleton), late in zip(events, held, strict=True) if late)
+    newer = [
+        skeleton
+        for (now_ns, _, skeleton), late in zip(events, held, strict=True)
+        if not late and now_ns < end_ns and skeleton.stamp_ns > first_ns
+    ]
+    stalled = sorted(
+        ((end_ns if late else now_ns, sensor, seen) for (now_ns, sensor, seen), late in zip(events, held, strict=True)),
+        key=lambda event: event[:2],
+    )
+    smooth, _, ordered = staged(events)
+    stage, _, late_ones = staged(stalled, busy=busy)
+    assert stage.counters["frames"] == smooth.counters["frames"] and stage.counters["too_late"] == 0
+    late_frames, taken_again = (stage.counters[name] - smooth.counters[name] for name in ("late_frames", "taken_again"))
+    assert late_frames >= 3 and 0 < taken_again <= len(newer)
+    assert_allclose(late_ones[-1].positions, ordered[-1].positions, rtol=0.0, atol=1e-6)
 
 
 def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:

@@ -454,6 +454,7 @@ class ExtendedKalmanFilter:
                 "branches",
                 "repeated_stamps",
                 "late_frames",
+                "taken_again",
                 "too_late",
                 "backward_jumps",
                 "gaps",
@@ -469,7 +470,8 @@ class ExtendedKalmanFilter:
 
     def reset(self) -> None:
         """Forget the person; the counters stay."""
-        self._state: _State | None = None
+        self._last: _State | None = None
+        self._late: list[_Measurement] = []
         self._frame_id = ""
         self._newest: Skeleton | None = None
         self._history: deque[tuple[_State, _Measurement]] = deque()
@@ -506,7 +508,7 @@ class ExtendedKalmanFilter:
         return self.filtered if self.take(skeleton, sensor) else None
 
     def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
-        """Take one frame.
+        """Take one frame; one that comes late counts from when the estimate is next needed, together with others.
 
         Args:
             skeleton: in a fixed frame with z up; ``/fused/skeleton``, or one sensor's brought into ``world``.
@@ -517,13 +519,16 @@ class ExtendedKalmanFilter:
             trunk yet.
         """
         measurement = self._measurement(skeleton, sensor)
-        state = self._state
+        state = self._last
+        if state is not None and measurement.stamp_ns >= state.stamp_ns:
+            state = self._state
         if state is not None and not self._in_time(measurement, state):
             return False
-        state = self._state  # a jump of time may have reset it
+        state = self._last  # a jump of time may have reset it
         self.counters["frames"] += 1
         if state is not None and measurement.stamp_ns < state.stamp_ns:
-            self._state = self._replay(measurement)
+            self.counters["late_frames"] += 1
+            self._late.append(measurement)
             return False
         self._newest = skeleton
         if state is None:
@@ -608,9 +613,21 @@ class ExtendedKalmanFilter:
         if last is not None and measurement.stamp_ns in last.stamps:
             return True
         own = measurement.sensor, measurement.stamp_ns
-        return own == self._started_by or any((each.sensor, each.stamp_ns) == own for _, each in self._history)
+        taken = (*self._late, *(each for _, each in self._history))
+        return own == self._started_by or any((each.sensor, each.stamp_ns) == own for each in taken)
 
     # --- time
+
+    @property
+    def _state(self) -> _State | None:
+        """After all frames, the late ones in their places; None before a start."""
+        if self._late and self._last is not None:
+            self._last = self._replay(self._last)
+        return self._last
+
+    @_state.setter
+    def _state(self, state: _State | None) -> None:
+        self._last = state
 
     def _remember(self, state: _State, measurement: _Measurement) -> _State:
         """Take a frame in its order, and keep what a later, older one would have to be put before."""
@@ -620,17 +637,25 @@ class ExtendedKalmanFilter:
         self._history.append((state, measurement))
         return self._step(state, measurement)
 
-    def _replay(self, late: _Measurement) -> _State:
-        """Go back to before a late frame, and take it and all later ones again in their order."""
-        self.counters["late_frames"] += 1
-        first = next((k for k, (_, m) in enumerate(self._history) if m.stamp_ns > late.stamp_ns), len(self._history))
-        again = [self._history.pop() for _ in range(len(self._history) - first)][::-1]
-        state = again[0][0] if again else self._state
-        assert state is not None
-        if state.stamp_ns > late.stamp_ns:  # it is older than all that is remembered
-            self._history.extend(again)
-            return self._state if self._state is not None else state
-        for measurement in (late, *(m for _, m in again)):
+    def _replay(self, state: _State) -> _State:
+        """Go back to before the first late frame, and take all late and all later ones in their order.
+
+        A connection that stalls delivers many at once: to go back for each of them would cost the later ones so many
+        times.
+        """
+        oldest_ns = self._history[0][0].stamp_ns if self._history else state.stamp_ns
+        late = [each for each in self._late if each.stamp_ns >= oldest_ns]  # others are older than all remembered ones
+        self._late = []
+        if not late:
+            return state
+        first_ns = min(each.stamp_ns for each in late)
+        again = []
+        while self._history and self._history[-1][1].stamp_ns > first_ns:
+            state, measurement = self._history.pop()
+            again.append(measurement)
+        self.counters["taken_again"] += len(again)
+        # of frames of one stamp the late ones come last
+        for measurement in sorted(again[::-1] + late, key=lambda each: each.stamp_ns):
             state = self._remember(state, measurement)
         return state
 
@@ -1221,7 +1246,8 @@ class ExtendedKalmanFilter:
     def _restarted(self, state: _State, points: FloatArray, stddev: FloatArray, share: float) -> _State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
         try:
-            fit = self.inverse.solve(points, stddev, state.lengths)
+            # to tell whether a pose is worth it takes half the steps that it takes to tell the pose
+            fit = self.inverse.solve(points, stddev, state.lengths, tolerance=_CLOSE)
             # lengths that were learnt in a wrong pose are wrong, too
             lengths = self._lengths_of(points)
             size = float(np.median(lengths / state.lengths))
@@ -1239,6 +1265,7 @@ class ExtendedKalmanFilter:
         if fit.cost > share * present:
             return state
         self.counters["restarts"] += 1
+        fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
         return self._new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
 
     def _leaning(

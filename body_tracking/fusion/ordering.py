@@ -56,6 +56,7 @@ class Ordering:
         self._wait_ns = round(wait * NANOSECONDS)
         self._sources = {sensor: _Source() for sensor in sensors}
         self._waiting: list[_Waiting] = []
+        self._of_before: list[tuple[str, Skeleton]] = []  # a jump of time
         self._arrived = 0
         self._left_ns: int | None = None
 
@@ -72,10 +73,23 @@ class Ordering:
         """
         # What has waited long enough does not know this frame, whether or not somebody polled in between.
         ready = self.poll(now_ns)
+        self.hold(sensor, skeleton, now_ns)
+        return ready + self.poll(now_ns)
+
+    def hold(self, sensor: str, skeleton: Skeleton, now_ns: int) -> None:
+        """Take one frame that goes on with the next :meth:`poll` at the earliest: others are known to be there already.
+
+        What has waited long enough then lets those others go first, if they are older: it costs nobody any time.
+
+        Args:
+            sensor: as in :meth:`push`.
+            skeleton: as in :meth:`push`.
+            now_ns: as in :meth:`push`.
+        """
         source = self._sources[sensor]
         stamp_ns = skeleton.stamp_ns
         if source.newest_ns is not None and stamp_ns < source.newest_ns - CLOCK_JUMP * NANOSECONDS:
-            ready += self.flush()
+            self._of_before = self.flush()
             source = self._sources[sensor]
         if source.newest_ns is None or stamp_ns > source.newest_ns:
             if source.newest_ns is not None and (step := (stamp_ns - source.newest_ns) / NANOSECONDS) < CLOCK_JUMP:
@@ -83,7 +97,6 @@ class Ordering:
             source.newest_ns = stamp_ns
         self._arrived += 1
         insort(self._waiting, _Waiting(stamp_ns, self._arrived, now_ns + self._wait_ns, sensor, skeleton))
-        return ready + self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[tuple[str, Skeleton]]:
         """The frames that need wait no longer, in the order of their capture.
@@ -91,7 +104,7 @@ class Ordering:
         Args:
             now_ns: as in :meth:`push`.
         """
-        ready = []
+        ready, self._of_before = self._of_before, []
         while (deadline_ns := self.deadline_ns) is not None:
             first = self._waiting[0]
             due = self._due(first.stamp_ns)
@@ -110,7 +123,8 @@ class Ordering:
 
     def flush(self) -> list[tuple[str, Skeleton]]:
         """All frames that wait, in the order of their capture; what comes next is of another time."""
-        ready = [(each.sensor, each.skeleton) for each in self._waiting]
+        ready = [*self._of_before, *((each.sensor, each.skeleton) for each in self._waiting)]
+        self._of_before = []
         self._waiting.clear()
         self._left_ns = None
         for sensor in self._sources:

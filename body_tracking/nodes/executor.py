@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -28,15 +28,25 @@ _LOOK_PERIOD_NS = 100_000_000
 _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
+@runtime_checkable
+class TakesTogether(Protocol):
+    """A node that only notes messages as they are handed over, and then works on all that have come."""
+
+    def messages_taken(self) -> None:
+        """Called after the last callback of all the messages that were there."""
+
+
 class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
     Messages and timers take a short way with a wait set that is kept; everything else (services, events, guard
-    conditions) goes rclpy's own, and is looked at ten times a second while messages keep coming.
+    conditions) goes rclpy's own, and is looked at ten times a second while messages keep coming. Timers come after the
+    messages: one that stands for a message that does not come must not overtake it while the node is busy.
     """
 
     def __init__(self, node: Node) -> None:
         super().__init__()
+        self._taken = node.messages_taken if isinstance(node, TakesTogether) else None
         self._changed = True
         self._stopped = False
         self.add_node(node)
@@ -120,13 +130,15 @@ class LeanExecutor(SingleThreadedExecutor):
                 wait_set.wait(-1 if whole else _LOOK_PERIOD_NS - since_ns)
                 if not self._context.ok():
                     return
-                executed = _execute_timers(timers)
-                for subscription, taken in _take_all(subscriptions, wait_set):
-                    executed += 1 + _execute_timers(timers)
+                messages = _take_all(subscriptions, wait_set)
+                for subscription, taken in messages:
                     if self._stopped:
                         return
                     only_message = subscription._callback_type is _MESSAGE_ONLY
                     subscription.callback(*(taken[:1] if only_message else taken))
+                if messages and self._taken is not None:
+                    self._taken()
+                executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None
                     continue

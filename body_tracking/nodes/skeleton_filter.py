@@ -161,16 +161,21 @@ class SkeletonFilterNode(GraphNode):
         self.set_alarms()
 
     def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
-        """Filter and publish."""
+        """Note, for when all that have come are there."""
         assert self.stage is not None
         self.sent_ns = sent_ns
-        self.stage.on_sensor(sensor, skeletons, self.now_ns())
-        self.set_alarms()
+        self.stage.hold(sensor, skeletons, self.now_ns())
+
+    def messages_taken(self) -> None:
+        """Filter and publish what sensors have sent."""
+        assert self.stage is not None
+        if self.stage.by_sensor:
+            self.on_alarm()
+        self.sent_ns = None
 
     def on_alarm(self) -> None:
-        """A frame has waited long enough, or nothing has come for so long that it is to be said what is expected."""
+        """Publish what frames say that need wait no longer, or what is to be expected where none has come for long."""
         assert self.stage is not None
-        self.sent_ns = None
         try:
             self.stage.poll(self.now_ns())
         except BodyTrackingError as error:

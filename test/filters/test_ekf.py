@@ -376,6 +376,69 @@ def test_late_frames_of_several_sensors_count_as_if_they_had_come_in_order() -> 
     assert_same(known(in_order), known(late), 1e-9)
 
 
+def stalled(seed: int, held: int = 6) -> tuple[list[tuple[Skeleton, str]], int]:
+    """Frames of two sensors as they arrive, the last of the second one in a burst, and how many arrive before that."""
+    rng = np.random.default_rng(seed)
+    person, motion = RandomPerson.draw(rng), RandomMotion(rng, 2.0)
+    frames = []
+    for number in range(2):
+        truth = truth_of(person, motion, capture_times(1.5, rng) + 0.017 * number)
+        frames += [(skeleton, f"kinect{number}") for skeleton in measured(truth, seed=number).skeletons]
+    frames.sort(key=lambda each: each[0].stamp_ns)
+    if frames[-1][1] == "kinect1":
+        frames.pop()  # the other one's comes last
+    burst = [each for each in frames if each[1] == "kinect1"][-held:]
+    in_time = [each for each in frames if each not in burst]
+    return in_time + burst, len(in_time)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: int) -> None:
+    frames, in_time = stalled(seed)
+    together, one_by_one, in_order = ExtendedKalmanFilter(), ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for skeleton, sensor in frames:
+        assert together.take(skeleton, sensor) == one_by_one.take(skeleton, sensor)
+        asked = one_by_one.estimate  # has the frame's share in it
+    assert asked is not None
+    for skeleton, sensor in sorted(frames, key=lambda each: each[0].stamp_ns):
+        in_order.take(skeleton, sensor)
+    late = frames[in_time:]
+    first_ns = late[0][0].stamp_ns
+    newer = [skeleton for skeleton, _ in frames[:in_time] if skeleton.stamp_ns > first_ns]
+    assert_same(known(together), known(one_by_one), 1e-12)
+    assert_same(known(together), known(in_order), 1e-12)
+    assert together.counters["late_frames"] == one_by_one.counters["late_frames"] == len(late)
+    assert together.counters["taken_again"] == len(newer) < one_by_one.counters["taken_again"]
+    assert in_order.counters["taken_again"] == 0
+
+
+def test_a_late_frame_that_is_repeated_before_it_was_put_in_its_place_counts_once() -> None:
+    frames, in_time = stalled(4)
+    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for number, (skeleton, sensor) in enumerate(frames):
+        for _ in range(2 if number >= in_time else 1):
+            twice.take(skeleton, sensor)
+        once.take(skeleton, sensor)
+    assert twice.counters["repeated_stamps"] == len(frames) - in_time
+    assert_same(known(once), known(twice), 0.0)
+
+
+def test_late_frames_count_in_what_is_predicted_and_in_the_next_frame() -> None:
+    frames, in_time = stalled(5)
+    (last, its_sensor), others = frames[in_time - 1], frames[: in_time - 1]
+    before, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    for skeleton, sensor in sorted(others + frames[in_time:], key=lambda each: each[0].stamp_ns):
+        before.take(skeleton, sensor)
+    for skeleton, sensor in others + frames[in_time:]:
+        late.take(skeleton, sensor)
+    expected, told = before.predict(last.stamp_ns), late.predict(last.stamp_ns)
+    assert expected is not None and told is not None
+    assert_same(expected[1], told[1], 1e-12)
+    for estimator in (before, late):
+        assert estimator.take(last, its_sensor)
+    assert_same(known(before), known(late), 1e-12)
+
+
 def test_what_is_too_late_is_dropped_and_counted() -> None:
     skeletons = measured(somebody(7, 2.0)).skeletons
     held, others = skeletons[40], [*skeletons[:40], *skeletons[41:50]]

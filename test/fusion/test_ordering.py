@@ -68,6 +68,32 @@ def test_a_frame_waits_for_an_older_one_and_no_longer() -> None:
     assert ordering.deadline_ns is None
 
 
+def test_of_frames_that_are_here_together_the_oldest_goes_first_however_long_another_one_waited() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    now = known(ordering, {"a": 10 * MS, "b": 0})
+    assert ordering.push("a", frame(now + 10 * MS), now + 10 * MS) == []
+    # nobody looked for longer than it may wait
+    later = now + 60 * MS
+    ordering.hold("a", frame(now + 10 * MS + PERIOD), later)
+    ordering.hold("b", frame(now), later)
+    ordering.hold("b", frame(now + PERIOD), later)
+    assert stamps(ordering.poll(later)) == [now, now + 10 * MS, now + PERIOD, now + 10 * MS + PERIOD]
+    assert ordering.deadline_ns is None
+    assert ordering.counters["in vain"] == 0
+
+
+def test_what_is_held_when_time_jumps_back_goes_first() -> None:
+    ordering = Ordering(("a", "b"), 0.02)
+    now = known(ordering, {"a": 10 * MS, "b": 0}) + 5 * NANOSECONDS
+    for stamp_ns in (now, now + PERIOD, 0, PERIOD):
+        ordering.hold("a", frame(stamp_ns), now + PERIOD)
+    ordering.hold("b", frame(now + 5 * MS), now + PERIOD)
+    ordering.hold("b", frame(5 * MS), now + PERIOD)
+    left = stamps(ordering.poll(now + PERIOD)) + stamps(ordering.poll(now + PERIOD + 20 * MS))
+    assert left[:2] == [now, now + PERIOD]
+    assert sorted(left[2:]) == [0, 5 * MS, PERIOD, now + 5 * MS]
+
+
 def test_a_frame_that_waited_long_enough_goes_on_alone() -> None:
     polled, pushed = Ordering(("a", "b"), 0.02), Ordering(("a", "b"), 0.02)
     for ordering in (polled, pushed):

@@ -117,6 +117,37 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
     spinning.thread.join(10.0)
 
 
+class Noting(rclpy.node.Node):  # type: ignore[misc]
+    """Notes what comes, and when all has come; one who waits in vain for a message overtakes none that is here."""
+
+    def __init__(self) -> None:
+        super().__init__("noting")
+        self.said: list[str] = []
+        for topic in ("one", "two"):
+            self.create_subscription(String, topic, lambda message: self.said.append(message.data), 10)
+        self.create_timer(0.02, lambda: self.said.append("timer"), clock=STEADY)
+
+    def messages_taken(self) -> None:
+        self.said.append("all")
+
+
+def test_a_node_is_told_when_it_has_all_messages_that_were_there(node: rclpy.node.Node) -> None:
+    noting = Noting()
+    publishers = [node.create_publisher(String, topic, 10) for topic in ("one", "two")]
+    assert until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
+    for number in range(6):
+        publishers[number % 2].publish(String(data=str(number)))
+    time.sleep(0.1)  # the timer is ready, too
+    spinning = Spinning(noting)
+    assert until(lambda: "timer" in noting.said)
+    assert noting.said[:8] == [*"012345", "all", "timer"]
+    publishers[0].publish(String(data="more"))
+    assert until(lambda: noting.said.count("all") == 2)
+    assert noting.said[noting.said.index("more") + 1] == "all"
+    rclpy.shutdown()
+    spinning.thread.join(10.0)
+
+
 @pytest.mark.parametrize("work", [0.0, 0.03])
 def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> None:
     publisher = node.create_publisher(String, "text", 10)
