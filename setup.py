@@ -47,6 +47,7 @@ setup(
         "pyyaml>=6",
         "matplotlib>=3.8",
         "filterpy>=1.4.5",
+        "vqf>=2.1",
         "mcap>=1.2",
         "lz4>=4",
         "zstandard>=0.22",

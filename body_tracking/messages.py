@@ -21,6 +21,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
+from body_tracking.sensors.imu import ImuSample, check_magnetic_field
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -521,6 +522,80 @@ def magnetic_field_to_message(
         magnetic_field=_vector(field, types),
         magnetic_field_covariance=types.floats(covariance.reshape(-1)),
     )
+
+
+def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any | None]:
+    """``sensor_msgs/Imu`` and, if there is a field, ``sensor_msgs/MagneticField`` of a reading.
+
+    What the reading does not have is marked by -1 as REP-145 says; a covariance that is not known is zero.
+    """
+    absent = np.zeros((3, 3))
+    absent[0, 0] = -1.0
+    unknown = np.zeros((3, 3))
+    stated = unknown if sample.orientation_covariance is None else sample.orientation_covariance
+    imu = imu_to_message(
+        sample.stamp_ns,
+        sample.frame_id,
+        np.zeros(3) if sample.angular_velocity is None else sample.angular_velocity,
+        np.zeros(3) if sample.acceleration is None else sample.acceleration,
+        sample.orientation,
+        (
+            absent if sample.orientation is None else stated,
+            absent if sample.angular_velocity is None else unknown,
+            absent if sample.acceleration is None else unknown,
+        ),
+        types,
+    )
+    if sample.magnetic_field is None:
+        return imu, None
+    field = magnetic_field_to_message(sample.stamp_ns, sample.frame_id, sample.magnetic_field, unknown, types)
+    return imu, field
+
+
+def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) -> ImuSample:
+    """The reading in a ``sensor_msgs/Imu``, without what its covariances say is absent (-1, REP-145).
+
+    Args:
+        message: of a ROS install or of a recording.
+        magnetic_field: (3,) tesla of the same instant, if there is one.
+
+    Raises:
+        MessageError: a covariance that has not nine elements.
+        ImuSampleError: what no inertial sensor can have said.
+    """
+    covariances = {}
+    for name in ("orientation", "angular_velocity", "linear_acceleration"):
+        values = np.array(getattr(message, f"{name}_covariance"), dtype=np.float64)
+        if values.size != 9:
+            raise MessageError(f"{name}_covariance of {values.size} elements, expected 9")
+        covariances[name] = values.reshape(3, 3)
+    there = {name: covariance[0, 0] != -1.0 for name, covariance in covariances.items()}
+    q, stated = message.orientation, covariances["orientation"]
+    return ImuSample(
+        to_nanoseconds(message.header.stamp),
+        str(message.header.frame_id),
+        np.array([q.x, q.y, q.z, q.w]) if there["orientation"] else None,
+        # all zeros: not known
+        stated if there["orientation"] and stated.any() else None,
+        _array(message.angular_velocity) if there["angular_velocity"] else None,
+        _array(message.linear_acceleration) if there["linear_acceleration"] else None,
+        magnetic_field,
+    )
+
+
+def message_to_magnetic_field(message: Any) -> tuple[int, str, FloatArray]:
+    """(stamp in nanoseconds, frame, (3,) tesla) of a ``sensor_msgs/MagneticField``.
+
+    Raises:
+        ImuSampleError: not finite, or beyond 1e-3 T.
+    """
+    field = _array(message.magnetic_field)
+    check_magnetic_field(field)
+    return to_nanoseconds(message.header.stamp), str(message.header.frame_id), field
+
+
+def _array(vector: Any) -> FloatArray:
+    return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
 
 
 # --- calibration

@@ -29,6 +29,7 @@ LIBRARIES = {
     "yaml": ("pyyaml", "python3-yaml"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "filterpy": ("filterpy", "python3-filterpy-pip"),
+    "vqf": ("vqf", None),
     "mcap": ("mcap", None),
     "lz4": ("lz4", None),
     "zstandard": ("zstandard", None),

@@ -1,6 +1,8 @@
 """``body_tracking import``: recordings of other formats, one or several views, as one bag.
 
-A message's header stamp is the sensor's own clock exactly as recorded; the bag's log time is the time of receipt.
+Skeletons go to ``/<sensor>/skeleton``, inertial readings to ``/<sensor>/imu/data`` (with orientation) or
+``/<sensor>/imu/data_raw``, and ``/<sensor>/imu/mag``; joint angles in a file to ``/ground_truth/joint_states``. A
+message's header stamp is the sensor's own clock exactly as recorded; the bag's log time is the time of receipt.
 """
 
 from __future__ import annotations
@@ -11,21 +13,41 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import POINT_CLOUD, skeletons_to_cloud
-from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.graph import DEFAULT_BODY, TRUE_ANGLES
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.messages import (
+    IMU,
+    JOINT_STATE,
+    MAGNETIC_FIELD,
+    POINT_CLOUD,
+    angles_to_joint_states,
+    sample_to_messages,
+    skeletons_to_cloud,
+)
+from body_tracking.recording.qos import RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.sensors import RecordedFrame, Recording
 from body_tracking.sensors.csv_recording import CsvRecording, sensor_column
+from body_tracking.sensors.imu import ImuRecording, RecordedAngles, RecordedImu
+from body_tracking.sensors.imu_csv import ImuCsvRecording, is_imu_csv
+from body_tracking.sensors.mvnx import MvnxRecording
 from body_tracking.sensors.ntu import NtuRecording
 from body_tracking.skeleton import NANOSECONDS
 
 CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
+MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
+
+_Item = RecordedFrame | RecordedImu | RecordedAngles
+_Message = tuple[str, str, Qos, object]
+"""Topic, its type and quality, message."""
 
 
 class ImportFileError(BodyTrackingError):
@@ -38,13 +60,15 @@ class ImportedSensor:
 
     Attributes:
         frames: messages.
-        bodies: the most bodies in one frame.
+        bodies: the most bodies in one frame; 0 of an inertial sensor.
         seconds: from the first to the last receipt.
+        topics: where they went.
     """
 
     frames: int
     bodies: int
     seconds: float
+    topics: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +102,12 @@ class ImportReport:
                 "frames": self.frames,
                 "recording_s": self.seconds,
                 "sensors": {
-                    name: {"frames": sensor.frames, "bodies": sensor.bodies, "seconds": sensor.seconds}
+                    name: {
+                        "frames": sensor.frames,
+                        "bodies": sensor.bodies,
+                        "seconds": sensor.seconds,
+                        "topics": list(sensor.topics),
+                    }
                     for name, sensor in self.sensors.items()
                 },
                 "problems": self.problems,
@@ -93,11 +122,13 @@ class _Tally:
     frames: int = 0
     bodies: int = 0
     times_ns: list[int] = field(default_factory=list)
+    topics: dict[str, None] = field(default_factory=dict)
 
-    def add(self, frame: RecordedFrame) -> None:
+    def add(self, item: RecordedFrame | RecordedImu, topics: Iterable[str]) -> None:
         self.frames += 1
-        self.bodies = max(self.bodies, len(frame.skeletons))
-        times = (*self.times_ns, frame.received_ns)
+        self.bodies = max(self.bodies, len(item.skeletons) if isinstance(item, RecordedFrame) else 0)
+        self.topics |= dict.fromkeys(topics)
+        times = (*self.times_ns, item.received_ns)
         self.times_ns = [min(times), max(times)]
 
     @property
@@ -106,7 +137,7 @@ class _Tally:
 
 
 def open_recording(path: Path, sensor: str | None = None, partial: bool = False) -> Recording:
-    """The reader for a file, chosen by its suffix.
+    """The reader for a file of skeletons, chosen by its suffix.
 
     Args:
         path: ``.csv``, ``.csv.gz`` or ``.skeleton``.
@@ -123,6 +154,22 @@ def open_recording(path: Path, sensor: str | None = None, partial: bool = False)
     if path.suffix.lower() == NTU_SUFFIX:
         return NtuRecording(path, sensor, partial)
     raise ImportFileError(f"{path}: not a {', '.join((*CSV_SUFFIXES, NTU_SUFFIX))} file")
+
+
+def _open_any(path: Path, name: str | None, partial: bool) -> Recording | ImuRecording:
+    """The reader for a file of skeletons or of inertial readings."""
+    if path.is_file():
+        if path.name.lower().endswith(MVNX_SUFFIXES):
+            if name is not None:
+                raise ImportFileError(f"--sensor {name}={path}: an MVNX file names its sensors itself")
+            return MvnxRecording(path, partial)
+        if _is_inertial(path):
+            return ImuCsvRecording(path, None if name is None else name.split(","), partial)
+    return open_recording(path, name, partial)
+
+
+def _is_inertial(path: Path) -> bool:
+    return path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and is_imu_csv(path)
 
 
 def import_files(
@@ -155,7 +202,7 @@ def import_files(
     if twice:
         raise ImportFileError(f"{twice[0]}: is to be imported twice")
     recordings = [
-        open_recording(path, name, partial) for path, name in zip(files, _names(files, sensors or {}), strict=True)
+        _open_any(path, name, partial) for path, name in zip(files, _names(files, sensors or {}), strict=True)
     ]
     tallies: dict[str, _Tally] = {}
     owners: dict[str, Path] = {}
@@ -168,22 +215,26 @@ def import_files(
     try:
         shown = _Progress(recordings) if progress else None
         streams = [_ordered(recording, number) for number, recording in enumerate(recordings)]
-        for _, number, frame in heapq.merge(*streams, key=lambda item: item[:2]):
-            path = files[number]
-            if owners.setdefault(frame.sensor, path) != path:
-                raise ImportFileError(f"sensor {frame.sensor!r} is in {owners[frame.sensor]} and in {path}")
-            topic = f"/{frame.sensor}/skeleton"
-            if frame.sensor not in tallies:
-                writer.add_topic(topic, POINT_CLOUD, SENSOR_DATA)
-                tallies[frame.sensor] = _Tally()
-            writer.write_message(topic, skeletons_to_cloud(frame.skeletons, BAG_MESSAGES), frame.received_ns)
-            tallies[frame.sensor].add(frame)
+        topics: set[str] = set()
+        for _, number, item in heapq.merge(*streams, key=lambda item: item[:2]):
+            path, messages = files[number], _messages(item)
+            owner = TRUE_ANGLES if isinstance(item, RecordedAngles) else item.sensor
+            if owners.setdefault(owner, path) != path:
+                what = owner if isinstance(item, RecordedAngles) else f"sensor {owner!r}"
+                raise ImportFileError(f"{what} is in {owners[owner]} and in {path}")
+            for topic, type_name, qos, message in messages:
+                if topic not in topics:
+                    writer.add_topic(topic, type_name, qos)
+                    topics.add(topic)
+                writer.write_message(topic, message, item.received_ns)
+            if not isinstance(item, RecordedAngles):
+                tallies.setdefault(item.sensor, _Tally()).add(item, [topic for topic, *_ in messages])
             if shown is not None:
                 shown.update()
         if shown is not None:
             shown.end()
         if not tallies:
-            raise ImportFileError(f"{', '.join(map(str, files))}: no body in any frame")
+            raise ImportFileError(f"{', '.join(map(str, files))}: no body in any frame, and no inertial reading")
         writer.close()
     except BaseException:
         writer.discard()
@@ -195,7 +246,8 @@ def import_files(
     return ImportReport(
         bag=bag,
         sensors={
-            name: ImportedSensor(tally.frames, tally.bodies, tally.seconds) for name, tally in sorted(tallies.items())
+            name: ImportedSensor(tally.frames, tally.bodies, tally.seconds, tuple(tally.topics))
+            for name, tally in sorted(tallies.items())
         },
         seconds=(max(times) - min(times)) / NANOSECONDS,
         problems=dict(problems),
@@ -212,23 +264,42 @@ def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]
     for path in files:
         name = given.get(path)
         if name is None and path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and not sensor_column(path):
-            name = f"kinect{sum(value is not None for value in names) + 1}"
+            # an inertial reader names its sensors itself
+            name = None if _is_inertial(path) else f"kinect{sum(value is not None for value in names) + 1}"
         names.append(name)
     return names
 
 
-def _ordered(recording: Recording, number: int) -> Iterator[tuple[int, int, RecordedFrame]]:
-    """Frames with a key that never falls, so that merging keeps each file's own order."""
+def _messages(item: _Item) -> list[_Message]:
+    """What is written of an item."""
+    if isinstance(item, RecordedFrame):
+        cloud = skeletons_to_cloud(item.skeletons, BAG_MESSAGES)
+        return [(f"/{item.sensor}/skeleton", POINT_CLOUD, SENSOR_DATA, cloud)]
+    if isinstance(item, RecordedAngles):
+        nothing = np.full(len(item.names), np.nan)
+        angles = JointAngles(item.received_ns, item.names, item.angles, nothing, nothing, nothing)
+        states, _ = angles_to_joint_states(angles, DEFAULT_BODY, "", BAG_MESSAGES)
+        return [(TRUE_ANGLES, JOINT_STATE, RELIABLE, states)]
+    imu, field_message = sample_to_messages(item.sample, BAG_MESSAGES)
+    kind = "data_raw" if item.sample.orientation is None else "data"
+    found: list[_Message] = [(f"/{item.sensor}/imu/{kind}", IMU, SENSOR_DATA, imu)]
+    if field_message is not None:
+        found.append((f"/{item.sensor}/imu/mag", MAGNETIC_FIELD, SENSOR_DATA, field_message))
+    return found
+
+
+def _ordered(recording: Recording | ImuRecording, number: int) -> Iterator[tuple[int, int, _Item]]:
+    """Items with a key that never falls, so that merging keeps each file's own order."""
     latest = -(2**63)
-    for frame in recording:
-        latest = max(latest, frame.received_ns)
-        yield latest, number, frame
+    for item in recording:
+        latest = max(latest, item.received_ns)
+        yield latest, number, item
 
 
 class _Progress:
     """One line on stderr that is written over; nothing where stderr is no terminal, or for short imports."""
 
-    def __init__(self, recordings: Sequence[Recording]) -> None:
+    def __init__(self, recordings: Sequence[Recording | ImuRecording]) -> None:
         self._recordings = recordings
         self._due_s = time.monotonic() + 1.0
         self._shown = False
@@ -253,18 +324,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``import`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser(
         "import",
-        help="turn CSV recordings or NTU RGB+D .skeleton files into a bag",
-        description="Turn recordings into one bag with a topic /<sensor>/skeleton per sensor. Header stamps are the "
+        help="turn CSV recordings, NTU RGB+D .skeleton or Xsens .mvnx files into a bag",
+        description="Turn recordings into one bag with a topic /<sensor>/skeleton per camera, and /<sensor>/imu/data "
+        "or data_raw, and /<sensor>/imu/mag, per inertial sensor. Header stamps are the "
         "sensors' own clocks as recorded, the bag's log time is the time of receipt. Formats: docs/recordings.md.",
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz or .skeleton")
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz")
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="BAG", help="the bag (a folder) to make")
     parser.add_argument(
         "--sensor",
         action="append",
         default=[],
         metavar="NAME[=FILE]",
-        help="the sensor's name, where the file does not tell it or tells another; with several files, once per file",
+        help="the sensor's name, where the file does not tell it or tells another; with several files, once per file; "
+        "NAME,NAME,... for a file of several inertial sensors",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
     parser.add_argument("--partial", action="store_true", help="import files that are cut off as far as they go")
@@ -285,9 +358,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(report.as_json())
         return 0
-    for name, sensor in report.sensors.items():
+    for sensor in report.sensors.values():
         bodies = f", up to {sensor.bodies} bodies" if sensor.bodies > 1 else ""
-        print(f"/{name}/skeleton: {sensor.frames} frames in {sensor.seconds:.1f} s{bodies}")
+        kind = "frames" if sensor.bodies else "readings"
+        print(f"{', '.join(sensor.topics)}: {sensor.frames} {kind} in {sensor.seconds:.1f} s{bodies}")
     for problem, count in report.problems.items():
         print(f"counted: {count} {problem}")
     for warning in report.warnings:

@@ -12,11 +12,12 @@ import pytest
 
 from body_tracking.cli import main
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
+from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons, message_to_magnetic_field, message_to_sample
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.info import bag_info
 from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.sensors.mvnx import MvnxRecording
 from body_tracking.skeleton import JOINT_NAMES, Skeleton
 
 COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
@@ -158,7 +159,7 @@ def test_import_and_info_as_json(tmp_path, capsys):
     code, out, _ = run(capsys, "import", file, "-o", tmp_path / "bag", "--sensor", "left", "--json")
     report = json.loads(out)
     assert code == 0 and report["frames"] == 11 and report["recording_s"] == 1.0
-    assert report["sensors"] == {"left": {"frames": 11, "bodies": 1, "seconds": 1.0}}
+    assert report["sensors"] == {"left": {"frames": 11, "bodies": 1, "seconds": 1.0, "topics": ["/left/skeleton"]}}
     code, out, _ = run(capsys, "bag", "info", tmp_path / "bag", "--json")
     info = json.loads(out)
     assert code == 0 and info["messages"] == 11 and info["duration_s"] == 1.0 and info["warnings"] == []
@@ -221,3 +222,92 @@ def test_what_is_wrong_is_one_line(tmp_path, monkeypatch, capsys, arguments, tex
     code, out, err = run(capsys, *arguments)
     assert code == 2 and text in err and len(err.strip().splitlines()) == 1 and out == ""
     assert (tmp_path / "taken" / "precious.txt").exists() and not (tmp_path / "bag").exists()
+
+
+# --- inertial sensors
+
+IMU_CSV = """stamp,received,sensor,angular_velocity_x,angular_velocity_y,angular_velocity_z,\
+linear_acceleration_x,linear_acceleration_y,linear_acceleration_z,\
+magnetic_field_x,magnetic_field_y,magnetic_field_z
+100.00,5.00,forearm_left,0.1,0.2,0.3,0,0,9.8,2e-5,0,-4e-5
+100.01,5.02,forearm_left,0.1,0.2,0.3,0,0,9.8,,,
+200.00,5.01,hand_left,0.1,0.2,0.3,0,0,9.8,,,
+"""
+
+
+def inertial(bag: Path) -> dict[str, list[tuple[int, object]]]:
+    """(log time, message) of each message by topic."""
+    found: dict[str, list[tuple[int, object]]] = {}
+    with BagReader(bag) as reader:
+        for message in reader.messages():
+            type_name = reader.topics[message.topic].type_name
+            found.setdefault(message.topic, []).append((message.log_time_ns, deserialize(type_name, message.cdr)))
+    return found
+
+
+def test_inertial_readings_go_where_those_of_drivers_go(tmp_path):
+    (tmp_path / "imu.csv").write_text(IMU_CSV)
+    report = import_files([tmp_path / "imu.csv"], tmp_path / "bag")
+    assert report.sensors["forearm_left"].topics == ("/forearm_left/imu/data_raw", "/forearm_left/imu/mag")
+    found = inertial(tmp_path / "bag")
+    assert {topic: [at for at, _ in messages] for topic, messages in found.items()} == {
+        "/forearm_left/imu/data_raw": [5_000_000_000, 5_020_000_000],
+        "/forearm_left/imu/mag": [5_000_000_000],
+        "/hand_left/imu/data_raw": [5_010_000_000],
+    }
+    sample = message_to_sample(found["/forearm_left/imu/data_raw"][0][1])
+    assert (sample.stamp_ns, sample.frame_id) == (100_000_000_000, "forearm_left_link")
+    assert sample.orientation is None
+    np.testing.assert_array_equal(sample.angular_velocity, [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(sample.acceleration, [0.0, 0.0, 9.8])
+    _, frame_id, magnetic = message_to_magnetic_field(found["/forearm_left/imu/mag"][0][1])
+    assert frame_id == "forearm_left_link"
+    np.testing.assert_array_equal(magnetic, [2e-5, 0.0, -4e-5])
+
+
+def test_inertial_readings_and_skeletons_are_one_bag(tmp_path):
+    (tmp_path / "imu.csv").write_text(IMU_CSV)
+    files = [write_csv(tmp_path / "a.csv", [{"stamp": 5.005}]), tmp_path / "imu.csv"]
+    report = import_files(files, tmp_path / "bag")
+    assert {name: sensor.bodies for name, sensor in report.sensors.items()} == {
+        "kinect1": 1,
+        "forearm_left": 0,
+        "hand_left": 0,
+    }
+
+
+def test_a_suit_goes_along_with_its_own_angles(shared_data, tmp_path):
+    path = shared_data / "imu" / "xsens_upper_body" / "test_mocap.mvnx.gz"
+    report = import_files([path], tmp_path / "bag")
+    found = inertial(tmp_path / "bag")
+    assert len(report.sensors) == 11 and report.frames == 11 * 112
+    frames = [frame for frame in MvnxRecording(path).frames() if frame.kind == "normal"]
+    angles = found["/ground_truth/joint_states"]
+    assert [at for at, _ in angles] == [round(k * 1e9 / 60.0) for k in range(112)]
+    assert angles[0][1].name[8 * 3 : 8 * 3 + 3] == [f"jRightElbow_{axis}_body1" for axis in "xyz"]
+    for (_, message), frame in zip(angles, frames, strict=True):
+        np.testing.assert_array_equal(message.position, frame.joint_angles.reshape(-1))
+    for (_, message), frame in zip(found["/forearm_left/imu/data"], frames, strict=True):
+        sample = message_to_sample(message)
+        np.testing.assert_allclose(sample.orientation, frame.sensor_xyzw[9], atol=1e-5)
+        assert sample.angular_velocity is None and sample.orientation_covariance is None
+
+
+def test_two_imus_are_named_together(shared_data, tmp_path, capsys):
+    (path,) = (shared_data / "imu" / "two_arm_imus").glob("*.csv.gz")
+    names = "upper_arm_left,forearm_left"
+    assert main(["import", str(path), "-o", str(tmp_path / "bag"), "--sensor", names]) == 0
+    out = capsys.readouterr().out
+    assert "/forearm_left/imu/data, /forearm_left/imu/mag: 3051 readings in 61.0 s" in out
+    assert main(["import", str(path), "-o", str(tmp_path / "other"), "--sensor", "wrist"]) == 2
+    assert "1 sensor name(s) for 2 sensor(s)" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_suit_cannot_be_named(tmp_path):
+    (tmp_path / "a.mvnx").write_text("<mvnx/>")
+    with pytest.raises(BodyTrackingError, match="names its sensors itself"):
+        import_files([tmp_path / "a.mvnx"], tmp_path / "bag", sensors={tmp_path / "a.mvnx": "wrist"})
+    with pytest.raises(BodyTrackingError, match=r"a\.mvnx"):
+        import_files([tmp_path / "a.mvnx"], tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
