@@ -1,0 +1,91 @@
+"""ISB joint angles straight from the orientations of segments, without the body model between them.
+
+The same sequences as convention ``isb`` of ``kinematics.conventions``, which tells the angles of a configuration of the
+model. Where sensors give every orientation, the rotation of a joint has three angles even where the model's joint has
+two: the carrying angle of an elbow, the twist of a wrist. They are told here under names of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.inertial.alignment import AlignmentError
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import KNOWN_SHARE, convention
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import BoolArray, FloatArray
+
+_UNTOLD = {"elbow": "elbow_carrying", "wrist": "wrist_twist", "clavicle": "clavicle_axial", "neck": "neck_axial"}
+"""What the convention does not tell of a joint, by the first word of the angles that it does tell."""
+_UNKNOWN = np.pi / 6.0
+"""Radians of deviation of an angle of which nothing is known, as in ``conventions``."""
+
+
+class SegmentAngles:
+    """Rotations of segments to ISB angles.
+
+    Attributes:
+        names: of the angles: those of convention ``isb`` and the third ones of its joints of two.
+    """
+
+    def __init__(self, model: UpperBody) -> None:
+        isb = convention("isb", model)
+        # all its chains are between segments: one stage
+        ((self._sequences, self._parents, self._children, rows),) = isb._stages
+        told = dict(zip((isb._rows - rows.start).tolist(), isb.names, strict=True))
+        names = []
+        for place in range(rows.stop - rows.start):
+            if place in told:
+                names.append(told[place])
+                continue
+            neighbour = next(told[other] for other in range(3 * (place // 3), 3 * (place // 3) + 3) if other in told)
+            side = neighbour.rpartition("_")[2]
+            word = _UNTOLD[neighbour.partition("_")[0]]
+            names.append(f"{word}_{side}" if side in ("left", "right") else word)
+        self.names = tuple(names)
+
+    def __call__(
+        self,
+        stamp_ns: int,
+        rotations: FloatArray,
+        covariances: FloatArray | None = None,
+        previous: JointAngles | None = None,
+    ) -> JointAngles:
+        """Angles at one instant.
+
+        Args:
+            stamp_ns: nanoseconds.
+            rotations: (12, 3, 3) segments to world, in the order of ``UpperBody.segment_names``; NaN without sensor.
+            covariances: (12, 3, 3) radians squared, each in its segment's own frame and independent of the others; None
+                where nothing is known of them.
+            previous: the angles before, which these continue.
+
+        Returns:
+            Angles in radians, their velocities NaN; NaN with an infinite deviation where a segment is missing.
+
+        Raises:
+            AlignmentError: rotations or covariances of another shape.
+        """
+        if rotations.shape != (12, 3, 3) or (covariances is not None and covariances.shape != (12, 3, 3)):
+            raise AlignmentError(f"segment angles: rotations of shape {rotations.shape}, expected (12, 3, 3)")
+        known: BoolArray = np.logical_and.reduce(np.isfinite(rotations.reshape(12, 9)), axis=1)
+        whole = np.where(known[:, None, None], rotations, np.eye(3))
+        own = np.zeros((12, 3, 3)) if covariances is None else np.where(known[:, None, None], covariances, 0.0)
+        back = whole[self._parents].swapaxes(-1, -2)
+        relative = back @ whole[self._children]
+        # in the parent's frame: Q e_child - e_parent
+        spread = relative @ own[self._children] @ relative.swapaxes(-1, -2) + own[self._parents]
+        before = None
+        if previous is not None and previous.names == self.names:
+            before = np.where(np.isfinite(previous.position), previous.position, 0.0).reshape(-1, 3)
+        split = self._sequences.split(relative, np.diagonal(spread, axis1=1, axis2=2), before)
+        angles = split.angles.reshape(-1).copy()
+        variance = np.einsum("cij,cjk,cik->ci", split.gradients, spread, split.gradients).reshape(-1)
+        stddev = np.sqrt(np.maximum(variance, 0.0))
+        stddev[stddev > KNOWN_SHARE * _UNKNOWN] = np.inf
+        if covariances is None:
+            stddev[:] = np.inf
+        missing = np.repeat(~(known[self._parents] & known[self._children]), 3)
+        angles[missing], stddev[missing] = np.nan, np.inf
+        unknown = np.full(len(angles), np.nan)
+        return JointAngles(stamp_ns, self.names, angles, unknown, stddev, np.full(len(angles), np.inf))

@@ -1,0 +1,471 @@
+"""Which way the earth of each inertial sensor faces, and how the sensor is turned on its segment, kept over time.
+
+A Kalman filter on the errors of an :class:`~body_tracking.inertial.alignment.Alignment`: delta, a small rotation of
+each sensor's segment in the segment's own frame, and the heading psi. With R of eq. 1, a segment's orientation is off
+by
+
+    e = delta + (R^T z) d psi                                                                                        (8)
+
+Between observations both walk: headings as gyroscopes drift without a magnetometer, alignments as straps creep. What
+observes them:
+
+- a bone that a camera sees, along the axis a of a segment: ``P^T R^T d = -P^T [a]x e``, P square to a               (9)
+- a whole segment's orientation: ``log(R^T R_seen) = e``                                                            (10)
+- an elbow, whose axes of flexion and pronation stay square: ``(R1 a1) . (R2 a2) = 0`` (Mueller 2016)               (11)
+- ranges of motion: an angle beyond its limit is taken for the limit, and one within it for nothing (Lehmann, Laidig and
+  Seel 2020 use them so for headings)                                                                               (12)
+
+Without a camera only differences of headings are observed: what is common to all of them drifts, and the covariance
+says so. Errors of a camera's skeleton, of joints' axes and of a person at a limit last; an observation repeated within
+that time counts as a part of one: its variance is multiplied by ``max(1, 2 tau / dt)``. An observation that departs by
+more than noise does is given the weight of a Student's t (4 degrees of freedom).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from body_tracking.inertial.alignment import (
+    TISSUE_STDDEV,
+    Alignment,
+    AlignmentError,
+    across,
+    elbow_segment_axes,
+    rotation_vectors,
+)
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.ranges import RANGES
+from body_tracking.skeleton import FloatArray, Joint
+
+HEADING_WALK: Final = float(np.radians(0.4))
+"""Radians per root second of a heading without magnetometer: 3 degrees in a minute, as of 0.05 deg/s of bias."""
+ALIGNMENT_WALK: Final = float(np.radians(0.05))
+"""Radians per root second and axis of an alignment: a degree and a half in a quarter of an hour."""
+CAMERA_TIME: Final = 1.0
+"""Seconds that the errors of a camera's skeleton last."""
+ELBOW_STDDEV: Final = float(np.radians(6.0))
+"""Radians by which the axes of an elbow are not square: carrying angle, and the flesh."""
+ELBOW_TIME: Final = 20.0
+"""Seconds that this lasts: it is a person's own, but its direction turns with the movement."""
+RANGE_STDDEV: Final = float(np.radians(8.0))
+"""Radians by which people's limits differ from the published ones."""
+RANGE_TIME: Final = 5.0
+_FREEDOM = 4.0
+_FAR = 0.5
+"""Radians of a heading's deviation from which an observation is first turned to."""
+_DIFFERENCE = 1e-5
+_Z: Final = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bone:
+    """What of a skeleton shows a segment's direction.
+
+    Attributes:
+        axis: (3,) unit vector in the segment's frame.
+        start, end: joints between which it lies.
+    """
+
+    axis: FloatArray
+    start: Joint
+    end: Joint
+
+
+def bone_of(segment: str) -> Bone | None:
+    """The bone of a segment whose long axis a camera sees; None for those that it does not."""
+    side = segment.rpartition("_")[2]
+    ends: dict[str, tuple[FloatArray, str, str]] = {
+        "pelvis": (np.array([0.0, 1.0, 0.0]), "HIP_RIGHT", "HIP_LEFT"),
+        "upper_trunk": (np.array([0.0, 1.0, 0.0]), "SHOULDER_RIGHT", "SHOULDER_LEFT"),
+    }
+    if side in ("left", "right"):
+        down, end = -_Z, side.upper()
+        ends |= {
+            f"upper_arm_{side}": (down, f"SHOULDER_{end}", f"ELBOW_{end}"),
+            f"forearm_{side}": (down, f"ELBOW_{end}", f"WRIST_{end}"),
+            f"hand_{side}": (down, f"WRIST_{end}", f"HAND_{end}"),
+        }
+    if segment not in ends:
+        return None
+    axis, start, stop = ends[segment]
+    return Bone(axis, Joint[start], Joint[stop])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """How far an observation was from what was expected.
+
+    Attributes:
+        residual: (m,) radians.
+        covariance: (m, m) expected of it.
+        turn: (3,) radians: the smallest rotation of the segment, in its own frame, that would explain it; NaN where the
+            observation is not of a single sensor.
+        weight: at most 1: what it was given.
+    """
+
+    residual: FloatArray
+    covariance: FloatArray
+    turn: FloatArray
+    weight: float
+
+
+_Linear = tuple[FloatArray, FloatArray]
+"""(m,) residual and (m, 4 k) its derivative by the error, at a state."""
+
+
+class HeadingTracker:
+    """Alignments and headings of k sensors over time; every ``observe`` takes the sensors' rotations of that instant.
+
+    Attributes:
+        alignment: the present one.
+    """
+
+    def __init__(
+        self,
+        alignment: Alignment,
+        *,
+        heading_walk: FloatArray | float = HEADING_WALK,
+        alignment_walk: float = ALIGNMENT_WALK,
+    ) -> None:
+        """Start.
+
+        Args:
+            alignment: such as of a pose.
+            heading_walk: (k,) or one for all, radians per root second; less for sensors with magnetometers.
+            alignment_walk: radians per root second.
+        """
+        self.alignment = alignment
+        k = len(alignment.segments)
+        walk = np.full((k, 4), alignment_walk)
+        walk[:, 3] = heading_walk
+        self._walk: FloatArray = walk.reshape(-1) ** 2
+        self._stamp: float | None = None
+        self._last: dict[tuple[str, ...], float] = {}
+
+    def predict(self, stamp: float) -> None:
+        """Up to a time, seconds.
+
+        Raises:
+            AlignmentError: earlier than the last one.
+        """
+        if self._stamp is not None:
+            if stamp < self._stamp:
+                raise AlignmentError(f"headings: {stamp:.3f} s comes before {self._stamp:.3f} s")
+            a = self.alignment
+            grown = a.covariance + np.diag(self._walk * (stamp - self._stamp))
+            self.alignment = Alignment(a.segments, a.rotations, a.headings, grown)
+        self._stamp = stamp
+
+    def loosen(self, segment: str, stddev: float) -> None:
+        """Know less of a sensor's alignment, and of its heading, such as after a slip or when it was switched on.
+
+        Args:
+            segment: whose sensor.
+            stddev: radians per axis, added.
+        """
+        number = self._number(segment)
+        a = self.alignment
+        covariance = a.covariance.copy()
+        rows = np.arange(4 * number, 4 * number + 4)
+        covariance[rows, rows] += stddev**2
+        self.alignment = Alignment(a.segments, a.rotations, a.headings, covariance)
+
+    def orientation_covariance(self, segment: str, rotation: FloatArray) -> FloatArray:
+        """(3, 3) radians squared, of the segment's orientation in its own frame (eq. 8), for its sensor's (3, 3)."""
+        number = self._number(segment)
+        world = self.alignment.oriented(number, rotation)
+        by = self._turning(number, world)
+        result: FloatArray = by @ self.alignment.covariance @ by.T
+        return result
+
+    def observe_bone(
+        self, stamp: float, segment: str, rotation: FloatArray, direction: FloatArray, stddev: float
+    ) -> Innovation | None:
+        """A camera sees a bone (eq. 9).
+
+        Args:
+            stamp: seconds.
+            segment: that has a :func:`bone_of`.
+            rotation: (3, 3) sensor to earth at that time.
+            direction: (3,) in world, of any length; nothing is taken of one that is not finite.
+            stddev: radians of it, per direction.
+
+        Raises:
+            AlignmentError: a segment without bone or without sensor, or a stamp that comes before the last one.
+        """
+        bone, number = bone_of(segment), self._number(segment)
+        if bone is None:
+            raise AlignmentError(f"{segment}: no bone shows its direction")
+        length = float(np.linalg.norm(direction))
+        if not (np.isfinite(length) and length > 0.0 and np.isfinite(rotation).all()):
+            return None
+        seen, square, axis = direction / length, across(bone.axis), bone.axis
+
+        def linear(a: Alignment) -> _Linear:
+            world = a.oriented(number, rotation)
+            local = world.T @ seen
+            aside = square.T @ local
+            size = float(np.linalg.norm(aside))
+            # the angle between, not its sine, which is small of the opposite direction too
+            angle = np.arctan2(size, float(axis @ local))
+            aside = aside * (angle / size) if size > 1e-9 else np.array([angle, 0.0])
+            return aside, -square.T @ so3.skew(axis) @ self._turning(number, world)
+
+        def turned(a: Alignment) -> float:
+            points = a.oriented(number, rotation) @ axis
+            flat = np.linalg.norm(points[:2]) * np.linalg.norm(seen[:2])
+            if flat < 0.2:
+                return 0.0
+            return float(np.arctan2(points[0] * seen[1] - points[1] * seen[0], points[:2] @ seen[:2]))
+
+        noise = (stddev**2 + TISSUE_STDDEV**2) * np.eye(2)
+        back = (-square.T @ so3.skew(axis)).T  # its pseudoinverse: the rows are square to each other
+        return self._update(stamp, ("bone", segment), linear, noise, CAMERA_TIME, number, turned, back)
+
+    def observe_orientation(
+        self, stamp: float, segment: str, rotation: FloatArray, orientation: FloatArray, covariance: FloatArray
+    ) -> Innovation:
+        """A camera's skeleton, or its model, tells how a whole segment is turned (eq. 10).
+
+        Args:
+            stamp: seconds.
+            segment: which one.
+            rotation: (3, 3) sensor to earth at that time.
+            orientation: (3, 3) segment to world.
+            covariance: (3, 3) radians squared of it, in the segment's frame.
+        """
+        number = self._number(segment)
+
+        def linear(a: Alignment) -> _Linear:
+            world = a.oriented(number, rotation)
+            off = rotation_vectors(world.T @ orientation)
+            return off, self._turning(number, world)
+
+        def turned(a: Alignment) -> float:
+            apart = orientation @ a.oriented(number, rotation).T
+            return float(np.arctan2(apart[1, 0] - apart[0, 1], apart[0, 0] + apart[1, 1]))
+
+        noise = covariance + TISSUE_STDDEV**2 * np.eye(3)
+        return self._update(stamp, ("orientation", segment), linear, noise, CAMERA_TIME, number, turned, np.eye(3))
+
+    def observe_heading(self, stamp: float, segment: str, heading: float, stddev: float, lasting: float) -> Innovation:
+        """Something else tells a heading, such as a magnetometer; its errors last so many seconds."""
+        number = self._number(segment)
+
+        def linear(a: Alignment) -> _Linear:
+            jacobian = np.zeros((1, len(a.covariance)))
+            jacobian[0, 4 * number + 3] = 1.0
+            off = heading - a.headings[number]
+            return np.array([np.arctan2(np.sin(off), np.cos(off))]), jacobian
+
+        return self._update(stamp, ("heading", segment), linear, np.array([[stddev**2]]), lasting)
+
+    def observe_elbow(
+        self, stamp: float, side: str, upper: FloatArray, lower: FloatArray, stddev: float = ELBOW_STDDEV
+    ) -> Innovation:
+        """An elbow bends and turns about axes that are square (eq. 11).
+
+        Args:
+            stamp: seconds.
+            side: ``left`` or ``right``.
+            upper: (3, 3) the upper arm's sensor to its earth at that time.
+            lower: (3, 3) the forearm's likewise.
+            stddev: radians.
+        """
+        numbers = self._number(f"upper_arm_{side}"), self._number(f"forearm_{side}")
+        axes = elbow_segment_axes(side)
+
+        def linear(a: Alignment) -> _Linear:
+            worlds = [a.oriented(i, rotation) for i, rotation in zip(numbers, (upper, lower), strict=True)]
+            pointing = [world @ axis for world, axis in zip(worlds, axes, strict=True)]
+            jacobian = np.zeros((1, len(a.covariance)))
+            for i, world, axis, other in zip(numbers, worlds, axes, pointing[::-1], strict=True):
+                jacobian[0] += -(other @ world @ so3.skew(axis)) @ self._turning(i, world)
+            return np.array([-float(pointing[0] @ pointing[1])]), jacobian
+
+        return self._update(stamp, ("elbow", side), linear, np.array([[stddev**2]]), ELBOW_TIME)
+
+    def observe_range(
+        self, stamp: float, parent: str, child: str, rotations: tuple[FloatArray, FloatArray]
+    ) -> Innovation | None:
+        """A joint does not leave its range of motion (eq. 12); None where it is within.
+
+        Args:
+            stamp: seconds.
+            parent: segment of one of :data:`JOINTS`.
+            child: its other segment.
+            rotations: (3, 3) of the two sensors to their earths at that time.
+
+        Raises:
+            AlignmentError: no joint between those.
+        """
+        limits = _limits(parent, child)
+        numbers = self._number(parent), self._number(child)
+
+        def angles(worlds: list[FloatArray]) -> FloatArray:
+            found: FloatArray = Rotation.from_matrix(worlds[0].T @ worlds[1]).as_euler("YXZ")
+            return found
+
+        def excess(a: Alignment) -> tuple[FloatArray, list[FloatArray]]:
+            worlds = [a.oriented(i, rotation) for i, rotation in zip(numbers, rotations, strict=True)]
+            found = angles(worlds)
+            return np.maximum(found - limits[:, 1], 0.0) + np.minimum(found - limits[:, 0], 0.0), worlds
+
+        beyond = np.abs(excess(self.alignment)[0]) > 0.0
+        if not beyond.any():
+            self.predict(stamp)
+            return None
+
+        def linear(a: Alignment) -> _Linear:
+            over, worlds = excess(a)
+            jacobian = np.zeros((3, len(a.covariance)))
+            for place, number in enumerate(numbers):
+                gradient = np.empty((3, 3))
+                for axis in range(3):
+                    step = so3.quat_to_matrix(so3.exp(_DIFFERENCE * np.eye(3)[axis]))
+                    ends = []
+                    for turn in (step, step.T):
+                        moved = list(worlds)
+                        moved[place] = worlds[place] @ turn
+                        ends.append(angles(moved))
+                    apart = ends[0] - ends[1]
+                    gradient[:, axis] = np.arctan2(np.sin(apart), np.cos(apart)) / (2.0 * _DIFFERENCE)
+                jacobian += gradient @ self._turning(number, worlds[place])
+            return -over[beyond], jacobian[beyond]
+
+        noise = RANGE_STDDEV**2 * np.eye(int(beyond.sum()))
+        return self._update(stamp, ("range", parent, child), linear, noise, RANGE_TIME)
+
+    def _number(self, segment: str) -> int:
+        if segment not in self.alignment.segments:
+            raise AlignmentError(f"{segment}: carries no sensor")
+        return self.alignment.segments.index(segment)
+
+    def _turning(self, number: int, world: FloatArray) -> FloatArray:
+        """(3, 4 k) the segment's own turning by the error (eq. 8)."""
+        by = np.zeros((3, len(self.alignment.covariance)))
+        by[:, 4 * number : 4 * number + 3] = np.eye(3)
+        by[:, 4 * number + 3] = world[2]
+        return by
+
+    def _update(
+        self,
+        stamp: float,
+        kind: tuple[str, ...],
+        linear: Callable[[Alignment], _Linear],
+        noise: FloatArray,
+        lasting: float,
+        number: int | None = None,
+        turned: Callable[[Alignment], float] | None = None,
+        back: FloatArray | None = None,
+    ) -> Innovation:
+        """The iterated update; ``turned`` tells by how much a heading that is hardly known is off at first."""
+        self.predict(stamp)
+        before = self.alignment
+        prior = before.covariance
+        since = stamp - self._last.get(kind, -np.inf)
+        self._last[kind] = stamp
+        effective = noise * max(1.0, 2.0 * lasting / max(since, 1e-3))
+        residual, jacobian = linear(before)
+        expected = jacobian @ prior @ jacobian.T + noise
+        distance = float(residual @ np.linalg.solve(expected, residual))
+        turn = np.full(3, np.nan) if back is None else back @ residual
+        error = np.zeros(len(prior))
+        weight = min(1.0, (_FREEDOM + len(residual)) / (_FREEDOM + distance))
+        if number is not None and turned is not None and prior[4 * number + 3, 4 * number + 3] > _FAR**2:
+            error[4 * number + 3], weight = turned(before), 1.0
+        effective = effective / weight
+        covariance = prior
+        for _ in range(3):
+            residual_at, jacobian = linear(before.moved(error, prior))
+            gain = prior @ jacobian.T @ np.linalg.inv(jacobian @ prior @ jacobian.T + effective)
+            error = gain @ (residual_at + jacobian @ error)
+            # Joseph's form: rounding leaves it positive
+            left = np.eye(len(prior)) - gain @ jacobian
+            covariance = left @ prior @ left.T + gain @ effective @ gain.T
+        self.alignment = before.moved(error, covariance)
+        return Innovation(residual, expected, turn, weight)
+
+
+def _limits(parent: str, child: str) -> FloatArray:
+    """(3, 2) radians: least and greatest turn of a child in its parent about y, x and z, one after the other."""
+    side = child.rpartition("_")[2]
+    kind = (parent.removesuffix(f"_{side}"), child.removesuffix(f"_{side}"))
+    if kind not in JOINTS or (side in ("left", "right") and parent not in (f"{kind[0]}_{side}", kind[0])):
+        raise AlignmentError(f"{parent} and {child}: no joint between them has a range")
+    y, x, z = JOINTS[kind]
+    if side == "right":  # the mirror image at the sagittal plane
+        x, z = (-x[1], -x[0]), (-z[1], -z[0])
+    return np.radians([y, x, z])
+
+
+def _sum(*names: str) -> tuple[float, float]:
+    return sum(RANGES[name][0] for name in names), sum(RANGES[name][1] for name in names)
+
+
+def _against(limits: tuple[float, float]) -> tuple[float, float]:
+    return -limits[1], -limits[0]
+
+
+_GIRDLE = 45.0
+"""Degrees by which the clavicle turns about itself, and an elbow and a wrist (15) about axes that the model has not."""
+
+JOINTS: Final[dict[tuple[str, str], tuple[tuple[float, float], tuple[float, float], tuple[float, float]]]] = {
+    ("pelvis", "upper_trunk"): (
+        _sum("lumbar_flexion", "thoracic_flexion"),
+        _sum("lumbar_lateral", "thoracic_lateral"),
+        _sum("lumbar_axial", "thoracic_axial"),
+    ),
+    ("upper_trunk", "head"): (RANGES["neck_flexion"], RANGES["neck_lateral"], (-80.0, 80.0)),
+    ("upper_trunk", "clavicle"): (
+        (-_GIRDLE, _GIRDLE),
+        RANGES["clavicle_elevation"],
+        _against(RANGES["clavicle_protraction"]),
+    ),
+    ("upper_arm", "forearm"): (
+        _against(RANGES["elbow_flexion"]),
+        (-15.0, 15.0),
+        _against(RANGES["forearm_pronation"]),
+    ),
+    ("forearm", "hand"): (
+        _against(RANGES["wrist_deviation"]),
+        _against(RANGES["wrist_flexion"]),
+        (-15.0, 15.0),
+    ),
+}
+"""Degrees about y, x and z of the parent, of joints whose two segments may both carry a sensor; those of the left side.
+A shoulder is missing: it goes nearly everywhere."""
+
+
+def wahba_heading(
+    rotations: FloatArray, axis: FloatArray, directions: FloatArray, weights: FloatArray | None = None
+) -> tuple[float, float]:
+    """The heading that turns a sensor's axis to directions seen over a movement, all at once.
+
+    Wahba's problem about the vertical alone: ``psi = arg sum w (conj(p) d)`` of the horizontal parts p and d as complex
+    numbers, which maximises ``sum w p . Rz(psi)^T d``.
+
+    Args:
+        rotations: (n, 3, 3) sensor to earth.
+        axis: (3,) in the sensor's frame.
+        directions: (n, 3) unit vectors in world; NaN where unknown.
+        weights: (n,) not negative; equal when None.
+
+    Returns:
+        Radians, and the concentration from 0 (anything) to 1 (all agree); NaN and 0 where nothing is horizontal.
+    """
+    points = rotations @ axis
+    known = np.isfinite(directions).all(axis=1)
+    p = points[known, 0] + 1j * points[known, 1]
+    d = directions[known, 0] + 1j * directions[known, 1]
+    w = np.ones(len(p)) if weights is None else weights[known]
+    total = (w * np.conj(p) * d).sum()
+    most = float((w * np.abs(p) * np.abs(d)).sum())
+    if most <= 1e-6 * max(float(w.sum()), 1.0):
+        return float("nan"), 0.0
+    return float(np.angle(total)), float(np.abs(total)) / most

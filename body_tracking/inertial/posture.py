@@ -1,0 +1,164 @@
+"""The body model's configuration of the orientations of some of its segments, with its uncertainty.
+
+The most probable configuration q, by Gauss-Newton over the segments s that carry a sensor, and with what is known of
+every angle by its range of motion (as weak a measurement as in the skeleton filter):
+
+    sum_s |log(R_s(q)^T R_s)|^2 / S_s  +  sum_i ((q_i - centre_i) / stddev_i)^2  +  ((T q) / stddev_T)^2            (14)
+
+The last one shares the twist of the trunk. An elbow and a wrist have two angles for a rotation of three; what is left
+is measurement error, spread over both segments by their covariances. Points are not observed: the base stays where it
+is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from body_tracking.inertial.alignment import AlignmentError, rotation_vectors
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
+from body_tracking.kinematics.upper_body import PARENTS, UpperBody
+from body_tracking.skeleton import FloatArray
+
+_STEPS = 15
+_ENOUGH = 1e-8
+
+
+class OrientationKinematics:
+    """Orientations of segments to configurations of ``upper_body``."""
+
+    def __init__(self, model: UpperBody, segments: Sequence[str]) -> None:
+        """For the segments that carry sensors.
+
+        Raises:
+            AlignmentError: a segment that the model does not have, or none.
+        """
+        unknown = [name for name in segments if name not in model.segment_names]
+        if unknown or not segments:
+            raise AlignmentError(f"orientation kinematics: segments {', '.join(unknown) or 'none'}")
+        self._model, self._ranges = model, Ranges(model)
+        self._numbers = np.array([model.segment_names.index(name) for name in segments], dtype=np.intp)
+        self._lengths = model.default_lengths()
+
+    def solve(
+        self, rotations: FloatArray, covariances: FloatArray, start: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The most probable configuration (eq. 14).
+
+        Args:
+            rotations: (k, 3, 3) segments to world.
+            covariances: (k, 3, 3) radians squared, in the segments' own frames.
+            start: (35,) a configuration to start from, such as that of the frame before; its base is kept.
+
+        Returns:
+            (35,) configuration, (32, 32) covariance of its tangent, infinite for the position of the base.
+
+        Raises:
+            AlignmentError: shapes that do not belong together, or numbers that are not finite.
+        """
+        k = len(self._numbers)
+        if rotations.shape != (k, 3, 3) or covariances.shape != (k, 3, 3):
+            raise AlignmentError(
+                f"orientation kinematics of {k} segments: shapes {rotations.shape} and {covariances.shape}"
+            )
+        if not (np.isfinite(rotations).all() and np.isfinite(covariances).all()):
+            raise AlignmentError("orientation kinematics: an orientation or its covariance is not finite")
+        model, ranges = self._model, self._ranges
+        weights = np.linalg.inv(covariances)
+        q = self._start(rotations) if start is None else start.copy()
+        part = ranges.coordinates
+        information = np.eye(model.nv - 3)
+        damping, cost = 0.0, np.inf
+        best = q
+        for _ in range(_STEPS):
+            lines = model.linearise(q, self._lengths)
+            world = lines.posture.rotations[self._numbers]
+            off = rotation_vectors(world.swapaxes(-1, -2) @ rotations)
+            turning = world.swapaxes(-1, -2) @ lines.rotation_jacobian[self._numbers]
+            jacobian = (so3.right_jacobian_inverse(-off) @ turning)[..., 3:]
+            soft = ranges.soft_coordinates(q)
+            away = (soft.values - ranges.centre) / ranges.stddev
+            twist = float(ranges.twist @ soft.values) / np.radians(TWIST_SHARING_STDDEV)
+            weighted = np.einsum("kij,kj->ki", weights, off)
+            now = float((weighted * off).sum() + away @ away + twist**2)
+            if now > cost + _ENOUGH:  # a step too far: shorter from where it was best
+                damping = max(10.0 * damping, 1.0)
+                q = best
+                cost = np.inf
+                continue
+            done = cost - now < _ENOUGH
+            best, cost = q, now
+            information = np.einsum("kai,kab,kbj->ij", jacobian, weights, jacobian)
+            gradient = np.einsum("kai,ka->i", jacobian, weighted)
+            scaled = soft.gradients / ranges.stddev[:, None]
+            rows = slice(part.start - 3, part.stop - 3)
+            information[rows, rows] += scaled.T @ scaled
+            gradient[rows] -= scaled.T @ away
+            shared = (ranges.twist @ soft.gradients) / np.radians(TWIST_SHARING_STDDEV)
+            information[rows, rows] += np.outer(shared, shared)
+            gradient[rows] -= shared * twist
+            if done:
+                break
+            step = np.zeros(model.nv)
+            step[3:] = np.linalg.solve(information + damping * np.diag(information.diagonal()), gradient)
+            q = model.integrate(q, step)
+        covariance = np.diag(np.full(model.nv, np.inf))
+        covariance[3:, 3:] = np.linalg.inv(information)
+        return best, covariance
+
+    def estimate(
+        self,
+        stamp_ns: int,
+        rotations: FloatArray,
+        covariances: FloatArray,
+        lengths: FloatArray,
+        previous: FloatArray | None = None,
+        frame_id: str = "world",
+    ) -> ModelEstimate:
+        """The same as what angle conventions take; no velocity is known.
+
+        Args:
+            stamp_ns: nanoseconds.
+            rotations: as of :meth:`solve`.
+            covariances: as of :meth:`solve`.
+            lengths: (21,) metres.
+            previous: (35,) the configuration before.
+            frame_id: of the orientations.
+        """
+        model = self._model
+        q, covariance = self.solve(rotations, covariances, previous)
+        whole = np.diag(np.full(2 * model.nv, np.inf))
+        whole[: model.nv, : model.nv] = covariance
+        unknown = np.full(model.nv, np.nan)
+        return ModelEstimate(stamp_ns, frame_id, 0, q, unknown, whole, lengths, np.zeros(len(lengths)))
+
+    def _start(self, rotations: FloatArray) -> FloatArray:
+        """Every ball joint as its nearest sensors have it, the other angles at the middle of their ranges."""
+        model = self._model
+        q = model.neutral()
+        own = dict(zip(self._numbers.tolist(), rotations, strict=True))
+
+        def nearest(segment: int) -> FloatArray | None:
+            while segment >= 0:
+                if segment in own:
+                    found: FloatArray = own[segment]
+                    return found
+                segment = PARENTS[segment]
+            return None
+
+        trunk = nearest(model.segment_names.index("upper_trunk"))
+        base = nearest(0)
+        base = trunk if base is None else base
+        if base is None:
+            base = next(iter(own.values())) if trunk is None else trunk
+        q[model.quaternion_of("pelvis")] = so3.matrix_to_quat(base)
+        q[model.scalar_q] = self._ranges.centre[model.scalar_v - 6]
+        for side in ("left", "right"):
+            segment = model.segment_names.index(f"upper_arm_{side}")
+            if segment in own:
+                clavicle = model.forward(q, self._lengths).rotations[PARENTS[segment]]
+                q[model.quaternion_of(f"upper_arm_{side}")] = so3.matrix_to_quat(clavicle.T @ own[segment])
+        return q

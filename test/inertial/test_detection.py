@@ -1,0 +1,127 @@
+"""Exchanged and slipped sensors are named, and sensors that are where they should be are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from body_tracking.inertial.alignment import AlignmentError, pose_covariance, pose_rotations, yaw
+from body_tracking.inertial.clock import Turning
+from body_tracking.inertial.detection import (
+    SLIP_TIME,
+    SlipDetector,
+    assign,
+    likelihood_by_motion,
+    likelihood_by_pose,
+)
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.simulation.imus import usual_mounting
+from body_tracking.skeleton import FloatArray
+
+MODEL = UpperBody()
+WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+NUMBERS = [MODEL.segment_names.index(name) for name in WORN]
+MEANT = np.array([so3.quat_to_matrix(usual_mounting(name).quat_xyzw).T for name in WORN])
+LEFT_RIGHT = [0, 3, 2, 1, 4]
+UPPER_LOWER = [0, 2, 1, 3, 4]
+
+
+def turnings(seed: int, noise: float) -> tuple[list[Turning], list[Turning]]:
+    """The rates of sensors and of bones: each limb moves in its own way, a forearm with its upper arm besides."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, 40.0, 0.02)
+    knots = np.arange(0.0, 41.0, 0.4)
+    own = np.array([np.interp(times, knots, np.abs(rng.normal(size=len(knots)))) for _ in WORN])
+    own[2] += 0.7 * own[1]
+    own[4] += 0.7 * own[3]
+    felt = [Turning(times, np.abs(each + noise * rng.normal(size=len(times)))) for each in own]
+    seen = [Turning(times[::2], np.abs(each[::2] + noise * rng.normal(size=len(times[::2])))) for each in own]
+    return felt, seen
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], LEFT_RIGHT, UPPER_LOWER], ids=["none", "left_right", "upper_lower"])
+def test_a_skeleton_shows_which_sensors_are_exchanged(order: list[int]) -> None:
+    for seed in range(3):
+        felt, seen = turnings(seed, 0.3)
+        found = assign(WORN, likelihood_by_motion([felt[number] for number in order], [None, *seen[1:]]))
+        assert found.segments == tuple(WORN[number] for number in order)
+        assert {frozenset(pair) for pair in found.exchanged} == {
+            frozenset((WORN[n], WORN[m])) for n, m in enumerate(order) if n != m
+        }
+
+
+def held(rng: np.random.Generator, order: list[int]) -> FloatArray:
+    """What sensors put on in an order measure in a T-pose of somebody."""
+    pose = pose_rotations(MODEL, "t")[NUMBERS]
+    off = rng.multivariate_normal(np.zeros(15), pose_covariance(MODEL, "t", WORN)).reshape(5, 3)
+    mounted = MEANT @ so3.quat_to_matrix(so3.exp(np.radians(6.0) * rng.normal(size=(5, 3))))
+    measured = pose @ so3.quat_to_matrix(so3.exp(off)) @ mounted.swapaxes(-1, -2)
+    # the stream called WORN[n] is on the segment order[n]
+    return (yaw(rng.uniform(-3.0, 3.0)) @ measured)[order]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([[0, 1, 2, 3, 4], LEFT_RIGHT]))
+def test_a_pose_of_sensors_with_magnetometers_tells_left_from_right(seed: int, order: list[int]) -> None:
+    measured = held(np.random.default_rng(seed), order)
+    pose = pose_rotations(MODEL, "t")[NUMBERS]
+    found = assign(WORN, likelihood_by_pose(WORN, measured, pose, MEANT, common_heading=True))
+    for number, name in enumerate(found.segments):
+        assert name.endswith(WORN[order[number]].rpartition("_")[2])
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31))
+def test_a_pose_of_sensors_with_headings_of_their_own_tells_the_trunk_from_an_arm(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    order = [1, 0, 2, 3, 4]
+    # hanging arms: their sensors' x points down, that of the chest up
+    pose = pose_rotations(MODEL, "n")[NUMBERS]
+    off = so3.quat_to_matrix(so3.exp(np.radians(6.0) * rng.normal(size=(5, 3))))
+    hanging = yaw(rng.uniform(-3.0, 3.0, 5)) @ pose @ off @ MEANT.swapaxes(-1, -2)
+    found = assign(WORN, likelihood_by_pose(WORN, hanging[order], pose, MEANT, common_heading=False))
+    assert found.segments.index("upper_trunk") == 1
+
+
+def test_what_is_not_sure_is_not_named_and_no_table_is_refused() -> None:
+    table = np.zeros((5, 5))
+    table[1, 3] = table[3, 1] = 2.0
+    assert assign(WORN, table).exchanged == ()
+    table[1, 3] = table[3, 1] = 4.0
+    table[2, 4] = 0.5
+    found = assign(WORN, table)
+    assert found.exchanged == (("upper_arm_left", "upper_arm_right"), ("upper_arm_right", "upper_arm_left"))
+    with pytest.raises(AlignmentError, match="finite"):
+        assign(WORN, np.full((5, 5), np.nan))
+
+
+def test_a_slip_is_found_within_seconds_and_noise_and_outliers_are_none() -> None:
+    rng = np.random.default_rng(0)
+    times = np.arange(0.0, 120.0, 0.1)
+    fades = np.exp(-0.1 / 1.0)
+    turn = np.array([0.0, np.radians(20.0), 0.0])
+    detector, found = SlipDetector("forearm_left"), []
+    error = rng.normal(size=3)
+    for now in times.tolist():
+        error = fades * error + np.sqrt(1.0 - fades**2) * rng.normal(size=3)
+        seen = np.radians(4.0) * error + (turn if now > 90.0 else 0.0)
+        if rng.random() < 0.1:
+            seen = rng.normal(size=3)
+        slip = detector.update(now, seen, float(np.radians(4.0)))
+        if slip is not None:
+            found.append(slip)
+            break
+    assert len(found) == 1
+    assert 90.0 < found[0].stamp < 90.0 + 1.5 * SLIP_TIME
+    assert found[0].segment == "forearm_left"
+    np.testing.assert_allclose(found[0].turn, turn, atol=np.radians(10.0))
+
+
+def test_a_slip_smaller_than_what_is_known_is_none() -> None:
+    detector = SlipDetector("forearm_left")
+    turn = np.array([0.0, np.radians(20.0), 0.0])
+    assert all(detector.update(0.1 * n, turn, float(np.radians(15.0))) is None for n in range(600))
+    assert detector.update(0.0, np.full(3, np.nan), 0.1) is None

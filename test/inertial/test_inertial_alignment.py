@@ -1,0 +1,238 @@
+"""Poses and movements align sensors: exactly without errors, and within what is stated with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from body_tracking.inertial.alignment import (
+    Alignment,
+    AlignmentError,
+    Stream,
+    align_by_elbow,
+    align_in_pose,
+    elbow_segment_axes,
+    hinge_axes,
+    mean_rotation,
+    pose_covariance,
+    pose_of,
+    pose_rotations,
+    rotation_vectors,
+    still_periods,
+    with_axes,
+    wrapped,
+    yaw,
+)
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import FloatArray
+
+MODEL = UpperBody()
+WORN = ("pelvis", "upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+NUMBERS = [MODEL.segment_names.index(name) for name in WORN]
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_rotations(rng: np.random.Generator, count: int, size: float = 2.0) -> FloatArray:
+    return so3.quat_to_matrix(so3.exp(size * rng.normal(size=(count, 3))))
+
+
+def worn(rng: np.random.Generator, pose: FloatArray, covariance: FloatArray, mounting: float) -> tuple[FloatArray, ...]:
+    """Meant and true mountings, headings, and what is measured of people who are off the pose by a covariance."""
+    k = len(pose)
+    meant = random_rotations(rng, k)
+    true = meant @ random_rotations(rng, k, mounting)
+    psi = rng.uniform(-np.pi, np.pi, k)
+    off = rng.multivariate_normal(np.zeros(3 * k), covariance).reshape(k, 3)
+    held = pose @ so3.quat_to_matrix(so3.exp(off))
+    return meant, true, psi, yaw(psi).swapaxes(-1, -2) @ held @ true.swapaxes(-1, -2)
+
+
+def test_the_poses_are_what_people_call_them() -> None:
+    names = MODEL.segment_names
+    hanging, t = pose_rotations(MODEL, "n"), pose_rotations(MODEL, "t")
+    np.testing.assert_allclose(hanging, np.broadcast_to(np.eye(3), (12, 3, 3)), atol=1e-12)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for part in ("upper_arm", "forearm", "hand"):
+            along = t[names.index(f"{part}_{side}")] @ [0.0, 0.0, -1.0]
+            np.testing.assert_allclose(along, [0.0, sign, 0.0], atol=1e-12)
+            thumb = t[names.index(f"{part}_{side}")] @ [1.0, 0.0, 0.0]
+            np.testing.assert_allclose(thumb, [1.0, 0.0, 0.0], atol=1e-12)
+    with pytest.raises(AlignmentError, match="expected 't' or 'n'"):
+        pose_rotations(MODEL, "x")  # type: ignore[arg-type]
+
+
+@settings(max_examples=20, deadline=None)
+@given(SEEDS, st.sampled_from(["t", "n"]))
+def test_a_pose_held_exactly_with_known_mountings_gives_them_back_and_the_headings(seed: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    pose = pose_rotations(MODEL, kind)[NUMBERS]  # type: ignore[arg-type]
+    spread = pose_covariance(MODEL, kind, WORN)  # type: ignore[arg-type]
+    meant, true, psi, measured = worn(rng, pose, np.zeros_like(spread), 0.0)
+    found = align_in_pose(WORN, measured, pose, spread, mountings=meant)
+    np.testing.assert_allclose(found.rotations, true, atol=1e-6)
+    np.testing.assert_allclose(wrapped(found.headings - psi), 0.0, atol=1e-6)
+    for number in range(len(WORN)):
+        np.testing.assert_allclose(found.oriented(number, measured[number][None])[0], pose[number], atol=1e-6)
+
+
+def test_alignment_and_heading_are_within_what_is_stated() -> None:
+    pose, spread = pose_rotations(MODEL, "t")[NUMBERS], pose_covariance(MODEL, "t", WORN)
+    single, together = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        meant, true, psi, measured = worn(rng, pose, spread, np.radians(10.0))
+        found = align_in_pose(WORN, measured, pose, spread, mountings=meant)
+        error = np.concatenate(
+            [rotation_vectors(found.rotations.swapaxes(-1, -2) @ true), wrapped(psi - found.headings)[:, None]], axis=1
+        ).reshape(-1)
+        together.append(float(error @ np.linalg.solve(found.covariance, error)))
+        single.append(error / found.stddev.reshape(-1))
+    inside = float((np.array(together) < chi2.ppf(0.95, 24)).mean())
+    assert inside >= 0.85
+    assert 0.92 <= float((np.abs(single) < 1.96).mean()) <= 0.98
+
+
+def test_without_mounting_and_heading_the_pose_is_right_and_the_heading_unknown() -> None:
+    rng = np.random.default_rng(1)
+    pose, spread = pose_rotations(MODEL, "n")[NUMBERS], pose_covariance(MODEL, "n", WORN)
+    _, _, _, measured = worn(rng, pose, np.zeros_like(spread), 0.5)
+    found = align_in_pose(WORN, measured, pose, spread)
+    for number in range(len(WORN)):
+        np.testing.assert_allclose(found.oriented(number, measured[number][None])[0], pose[number], atol=1e-6)
+    assert (found.stddev[:, 3] > np.radians(90.0)).all()
+
+
+def test_sensors_that_share_a_heading_are_aligned_without_known_mountings_up_to_that_heading() -> None:
+    rng = np.random.default_rng(2)
+    pose, spread = pose_rotations(MODEL, "t")[NUMBERS], pose_covariance(MODEL, "t", WORN)
+    _, true, _, _ = worn(rng, pose, np.zeros_like(spread), 0.5)
+    measured = yaw(-0.7) @ pose @ true.swapaxes(-1, -2)
+    k = len(WORN)
+    found = align_in_pose(
+        WORN, measured, pose, spread, headings=np.full(k, 0.7), heading_covariance=np.radians(5.0) ** 2 * np.eye(k)
+    )
+    np.testing.assert_allclose(found.rotations, true, atol=1e-6)
+
+
+def stream(segment: str, times: FloatArray, rotations: FloatArray, rates: FloatArray | None = None) -> Stream:
+    return Stream(segment, times, rotations, np.zeros((len(times), 3)) if rates is None else rates)
+
+
+def test_still_poses_are_found_and_told_apart() -> None:
+    times = np.arange(0.0, 12.0, 0.02)
+    mounting = np.eye(3)[None]
+    # hanging for 4 s, up to the side in 2 s, there for 3 s, and on
+    raised = np.interp(times, [0.0, 4.0, 6.0, 9.0, 12.0], [0.0, 0.0, 0.5 * np.pi, 0.5 * np.pi, np.pi])
+    rates = np.zeros((len(times), 3))
+    rates[:, 0] = np.gradient(raised, times)
+    rotations = so3.quat_to_matrix(so3.exp(raised[:, None] * [1.0, 0.0, 0.0]))
+    arm = stream("upper_arm_left", times, rotations, rates + 0.01)
+    periods = still_periods([arm])
+    assert [pose_of([arm], mounting, each) for each in periods] == ["n", "t"]
+    np.testing.assert_allclose([[each.begin, each.end] for each in periods], [[0.0, 4.0], [6.0, 9.0]], atol=0.25)
+    trunk = stream("upper_trunk", times, rotations, rates)
+    assert pose_of([trunk], mounting, periods[0]) is None
+    assert still_periods([arm.between(4.2, 5.8)]) == ()
+
+
+def elbow(seed: int, seconds: float = 20.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, and orientations of an upper arm and of its forearm, which bends and turns."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, seconds, 0.02)
+    waves = np.sin(2.0 * np.pi * times[:, None, None] * rng.uniform(0.1, 0.7, (5, 3)) + rng.uniform(0, 6.3, (5, 3)))
+    sums = waves.mean(axis=-1)
+    upper = so3.quat_to_matrix(so3.exp(sums[:, :3]))
+    flexion, pronation = elbow_segment_axes("right")
+    bend = so3.exp((1.0 + sums[:, 3])[:, None] * flexion)
+    turn = so3.exp(1.2 * sums[:, 4][:, None] * pronation)
+    return times, upper, upper @ so3.quat_to_matrix(so3.quat_multiply(bend, turn))
+
+
+def sensed(segment: str, times: FloatArray, world: FloatArray, true: FloatArray, psi: float) -> Stream:
+    """Of a segment's orientations what a perfect sensor says."""
+    sensor = yaw(-psi) @ world @ true.T
+    rates = np.zeros((len(times), 3))
+    rates[1:-1] = rotation_vectors(sensor[:-2].swapaxes(-1, -2) @ sensor[2:]) / (times[2] - times[0])
+    return Stream(segment, times[1:-1], sensor[1:-1], rates[1:-1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_movement_of_an_elbow_finds_its_heading_and_axes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times, upper, lower = elbow(seed)
+    segments = ("upper_arm_right", "forearm_right")
+    true, psi = random_rotations(rng, 2), rng.uniform(-2.0, 2.0, 2)
+    streams = [sensed(*each) for each in zip(segments, (times, times), (upper, lower), true, psi, strict=True)]
+    off = np.radians([5.0, 5.0, 5.0, 20.0]) * np.clip(rng.normal(size=(2, 4)), -1.5, 1.5)
+    prior = np.diag(np.tile(np.radians([5.0, 5.0, 5.0, 20.0]) ** 2, 2))
+    start = Alignment(segments, true, psi, prior).moved(off.reshape(-1), prior)
+    fit = align_by_elbow(start, "right", *streams)
+    assert fit is not None
+    assert (fit.after < fit.before).all()
+    assert fit.information > 1.0
+    before, after = (wrapped(np.array(a.headings[1] - a.headings[0] - psi[1] + psi[0])) for a in (start, fit.alignment))
+    assert abs(after) < max(0.4 * abs(before), np.radians(3.0))
+    np.testing.assert_array_less(np.linalg.eigvalsh(fit.alignment.covariance - start.covariance), 1e-9)
+
+
+def test_an_elbow_that_does_not_move_says_nothing() -> None:
+    times, upper, _ = elbow(0)
+    segments = ("upper_arm_right", "forearm_right")
+    streams = [sensed(name, times, upper, np.eye(3), 0.0) for name in segments]
+    start = Alignment(segments, np.broadcast_to(np.eye(3), (2, 3, 3)), np.zeros(2), 0.01 * np.eye(8))
+    assert align_by_elbow(start, "right", *streams) is None
+    with pytest.raises(AlignmentError, match="no sensor on upper_arm_left"):
+        align_by_elbow(start, "left", *streams)
+
+
+def test_a_hinge_shows_its_axis_in_both_sensors_and_corrects_an_alignment() -> None:
+    rng = np.random.default_rng(0)
+    times, upper, _ = elbow(0)
+    flexion, _ = elbow_segment_axes("right")
+    bend = 1.0 + 0.8 * np.sin(3.0 * times)
+    lower = upper @ so3.quat_to_matrix(so3.exp(bend[:, None] * flexion))
+    true = random_rotations(rng, 2)
+    segments = ("upper_arm_right", "forearm_right")
+    streams = [sensed(*each) for each in zip(segments, (times, times), (upper, lower), true, (0.3, -1.0), strict=True)]
+    prior = np.radians(8.0) ** 2 * np.eye(8)
+    off = np.radians([6.0, 3.0, -6.0, 0.0, -4.0, 5.0, 6.0, 0.0])
+    start = Alignment(segments, true, np.zeros(2), prior).moved(off, prior)
+    axes = hinge_axes(*streams, (start.rotations[0] @ flexion, start.rotations[1] @ flexion))
+    assert axes is not None
+    for found, rotation in zip((axes.first, axes.second), true, strict=True):
+        assert np.degrees(np.arccos(min(float(found @ rotation @ flexion), 1.0))) < 1.0
+    better = with_axes(start, (0, 1), axes, (flexion, flexion))
+    for number in range(2):
+        told = [float(a.rotations[number] @ flexion @ true[number] @ flexion) for a in (start, better)]
+        assert np.arccos(min(told[1], 1.0)) < 0.7 * np.arccos(told[0])
+    with pytest.raises(AlignmentError, match="not the one aligned"):
+        with_axes(start, (0, 1), axes, (-flexion, flexion))
+
+
+def test_the_mean_of_rotations_about_one_is_that_one() -> None:
+    rng = np.random.default_rng(0)
+    middle = random_rotations(rng, 1)[0]
+    small = 0.1 * rng.normal(size=(50, 3))
+    spread = middle @ so3.quat_to_matrix(so3.exp(np.concatenate([small, -small])))
+    np.testing.assert_allclose(mean_rotation(spread), middle, atol=1e-9)
+
+
+def test_what_is_no_stream_and_no_pose_is_refused() -> None:
+    with pytest.raises(AlignmentError, match="shapes"):
+        Stream("pelvis", np.arange(3.0), np.zeros((2, 3, 3)), np.zeros((3, 3)))
+    with pytest.raises(AlignmentError, match="ascend"):
+        Stream("pelvis", np.zeros(2), np.zeros((2, 3, 3)), np.zeros((2, 3)))
+    with pytest.raises(AlignmentError, match="finite"):
+        Stream("pelvis", np.zeros(1), np.full((1, 3, 3), np.nan), np.zeros((1, 3)))
+    empty = Stream("forearm_right", np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    assert still_periods([empty]) == ()
+    start = Alignment(("upper_arm_right", "forearm_right"), np.zeros((2, 3, 3)), np.zeros(2), np.eye(8))
+    assert align_by_elbow(start, "right", empty, empty) is None
+    with pytest.raises(AlignmentError, match="measured"):
+        align_in_pose(("pelvis",), np.full((1, 3, 3), np.nan), np.eye(3)[None], np.eye(3))
+    with pytest.raises(AlignmentError, match="no segment tail"):
+        pose_covariance(MODEL, "t", ("tail",))

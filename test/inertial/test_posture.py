@@ -1,0 +1,87 @@
+"""Orientations of segments give the configuration back, with a covariance that says what no sensor sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from body_tracking.inertial.alignment import AlignmentError
+from body_tracking.inertial.posture import OrientationKinematics
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.conventions import angles_of
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.simulation.random_people import RandomMotion
+from body_tracking.skeleton import FloatArray
+
+MODEL = UpperBody()
+LENGTHS = MODEL.default_lengths()
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def configuration(seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return RandomMotion(rng, 4.0).configuration(np.array([2.0]))[0]
+
+
+def sharp(count: int, degrees: float = 0.05) -> FloatArray:
+    return np.broadcast_to(np.radians(degrees) ** 2 * np.eye(3), (count, 3, 3))
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS)
+def test_all_segments_give_the_configuration_back(seed: int) -> None:
+    q = configuration(seed)
+    rotations = MODEL.forward(q, LENGTHS).rotations
+    found, covariance = OrientationKinematics(MODEL, MODEL.segment_names).solve(rotations, sharp(12))
+    again = MODEL.forward(found, LENGTHS).rotations
+    assert np.degrees(np.abs(so3.log(so3.matrix_to_quat(again.swapaxes(-1, -2) @ rotations)))).max() < 0.1
+    np.testing.assert_allclose(MODEL.difference(q, found)[3:], 0.0, atol=np.radians(0.5))
+    assert np.isinf(covariance.diagonal()[:3]).all()
+    assert np.degrees(np.sqrt(covariance.diagonal()[3:])).max() < 0.5
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_errors_are_within_what_is_stated_and_what_no_sensor_sees_keeps_its_range(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    worn = ("pelvis", "upper_trunk", "upper_arm_left", "forearm_left")
+    numbers = [MODEL.segment_names.index(name) for name in worn]
+    q = configuration(seed)
+    noise = so3.quat_to_matrix(so3.exp(np.radians(3.0) * rng.normal(size=(4, 3))))
+    rotations = MODEL.forward(q, LENGTHS).rotations[numbers] @ noise
+    found, covariance = OrientationKinematics(MODEL, worn).solve(rotations, sharp(4, 3.0))
+    names = MODEL.coordinate_names
+    seen = [names.index("elbow_flexion_left"), names.index("forearm_pronation_left"), 3, 4, 5]
+    off = MODEL.difference(found, q)[seen]
+    assert (np.abs(off) < 4.5 * np.sqrt(covariance[seen, seen])).all()
+    assert np.sqrt(covariance[seen, seen]).max() < np.radians(6.0)
+    unseen = names.index("elbow_flexion_right")
+    assert np.sqrt(covariance[unseen, unseen]) > np.radians(20.0)
+
+
+def test_angles_of_the_estimate_are_those_of_the_body() -> None:
+    q = configuration(5)
+    kinematics = OrientationKinematics(MODEL, MODEL.segment_names)
+    rotations = MODEL.forward(q, LENGTHS).rotations
+    estimate = kinematics.estimate(1, rotations, sharp(12, 0.5), LENGTHS)
+    angles = angles_of(estimate, MODEL, "isb")
+    column = angles.names.index("elbow_flexion_left")
+    names = [MODEL.coordinate_names[v] for v in MODEL.scalar_v]
+    bent = float(q[MODEL.scalar_q[names.index("elbow_flexion_left")]])
+    assert angles.position[column] == pytest.approx(bent, abs=0.02)
+    assert angles.position_stddev[column] < np.radians(2.0)
+    assert np.isnan(angles.velocity).any()
+
+
+def test_what_is_no_orientation_is_refused() -> None:
+    with pytest.raises(AlignmentError, match="tail"):
+        OrientationKinematics(MODEL, ("tail",))
+    with pytest.raises(AlignmentError, match="none"):
+        OrientationKinematics(MODEL, ())
+    kinematics = OrientationKinematics(MODEL, ("pelvis",))
+    with pytest.raises(AlignmentError, match="shapes"):
+        kinematics.solve(np.eye(3), np.eye(3))
+    with pytest.raises(AlignmentError, match="finite"):
+        kinematics.solve(np.full((1, 3, 3), np.nan), np.eye(3)[None])
