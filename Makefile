@@ -77,6 +77,8 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	with kinect_pairs benchmarks/real_people.py; \
 	with kinect_pairs benchmarks/simulated_pairs.py; \
 	with plug_in_gait benchmarks/plug_in_gait.py; \
+	with imu benchmarks/imu_pendulum.py; \
+	with imu benchmarks/imu_recordings.py; \
 	run benchmarks/calibrate_simulator.py; \
 	run benchmarks/accuracy.py --seeds 2 --layout-seeds 1 --sensitivity-seeds 1; \
 	with kinect_vs_vicon benchmarks/kinect_vs_vicon.py; \

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from vqf import VQF  # type: ignore[import-untyped]
+from vqf import VQF
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.sensors.imu import STANDARD_GRAVITY, ImuSample
