@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.clock import FINE_RANGE, ClockFit, correlate_clocks
 from body_tracking.calibration.coverage import Coverage
-from body_tracking.calibration.pairwise import PairEstimate, Pairs, estimate, start_from_midline
+from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
 from body_tracking.calibration.result import (
     CalibrationResult,
     ClockModel,
@@ -24,10 +24,11 @@ from body_tracking.calibration.result import (
     SensorQuality,
     level_pose,
 )
-from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
+from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.measurement import joint_stddev
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
+from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
 """Seconds of reference time between remembered pairs: frames closer together err alike."""
@@ -49,6 +50,9 @@ CLOCK_WINDOW_NS = 5 * NANOSECONDS
 
 MOVED_SIGMAS = 5.0
 """A sensor has been moved when its pose is this many standard deviations from the saved one."""
+
+HALF_TURN = 0.5 * np.pi
+"""A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
 CLOCK_STEP = 1.0
 """A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
@@ -420,9 +424,14 @@ class OnlineCalibration:
         still = is_still(own[0], own[1]) and is_still(theirs[0], theirs[1])
         if still:
             try:
-                rotation, translation, residual = still_pose_registration(own[1:], theirs[1:])
+                found = [still_pose_registration(own[1:], theirs[1:])]
+                if self.parameters.method == "robust":
+                    # One of them may see the body turned around.
+                    exchanged = theirs[1][:, MIRROR], theirs[2][:, MIRROR]
+                    found.append(still_pose_registration(own[1:], exchanged))
             except CalibrationError:
                 return
+            rotation, translation, residual = min(found, key=lambda each: each[2])
             pose = "T-pose" if is_t_pose(own[1]) else "still pose"
             self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
             other.started = rotation, translation
@@ -431,18 +440,10 @@ class OnlineCalibration:
                 self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
         elif self.parameters.method == "robust" and other.clock_locked and len(other.pairs) >= 20:
             # Nobody stands still: the movement itself is a start.
-            start = self._plain_start(other.pairs.pairs())
+            start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from movement, no still pose was seen")
                 other.started = start
-
-    @staticmethod
-    def _plain_start(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
-        known = np.isfinite(pairs.variance)
-        try:
-            return rigid_registration(pairs.reference[known], pairs.sensor[known])
-        except CalibrationError:
-            return None
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         assert self._anchor is not None
@@ -557,23 +558,20 @@ class OnlineCalibration:
         return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
 
     def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
-        """The better of going on from the last estimate and starting from the spines, which know no left and right."""
+        """The best from three starts: the last estimate, half a turn from it, the spines, which know no sides."""
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)
         if midline is not None and Rotation.from_matrix(midline[0] @ other.started[0].T).magnitude() > 0.5:
             starts.append(midline)
-        found: list[PairEstimate] = []
-        for rotation, translation in starts:
-            try:
-                found.append(estimate(pairs, rotation, translation))
-            except CalibrationError:
-                continue
-        return min(found, key=lambda each: each.cost) if found else None
+        opposite = half_turn_from(pairs, other.started[0])
+        if opposite is not None:
+            starts.append(opposite)
+        return best_estimate(pairs, starts)
 
     def _aim(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
         other.target = rotation, translation, centre
-        if other.rotation is None:
+        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > HALF_TURN:
             other.rotation, other.translation = rotation, translation
             self._changed = True
 

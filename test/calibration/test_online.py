@@ -166,6 +166,35 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
     assert values["kinect2 clock_from"] == "motion"
 
 
+@pytest.mark.parametrize("turned", ["kinect1", "kinect2"])
+@pytest.mark.parametrize("seconds", [5.0, 60.0])
+def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned: str, seconds: float) -> None:
+    """Neither at first, when one still pose is all there is, nor ever after."""
+    frames = tuple(
+        (name, seen.mirrored() if name == turned and now < seconds * NANOSECONDS else seen, now)
+        for name, seen, now in stream(10.0)
+    )
+    calibration, updates = run(frames)
+    poses = [update.result for update in updates if "kinect2" in update.result.poses]
+    assert poses
+    for result in (*poses, calibration.finish()):
+        assert yaw_error(result) < 10.0
+
+
+def test_a_pose_half_a_turn_off_is_put_right_at_once() -> None:
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    saved = run(stream(15.0))[0].result()
+    pose = saved.poses["kinect2"]
+    saved.poses["kinect2"] = replace(
+        pose, quat_xyzw=(Rotation.from_euler("z", 175, degrees=True) * Rotation.from_quat(pose.quat_xyzw)).as_quat()
+    )
+    calibration.load(saved)
+    for sensor, skeleton, received in stream(15.0):
+        for update in calibration.push(sensor, skeleton, received):
+            assert not 5.0 < yaw_error(update.result) < 170.0
+    assert yaw_error(calibration.current_update().result) < 5.0
+
+
 def test_a_joint_that_nobody_ever_sees_is_no_reason_to_warn() -> None:
     unseen = [Joint.FOOT_LEFT, Joint.FOOT_RIGHT]
 
