@@ -19,6 +19,7 @@ from body_tracking.calibration.online import CalibrationParameters, CalibrationU
 from body_tracking.calibration.result import CalibrationResult
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.sensors.csv_recording import CsvRecording
+from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import about_y, frame, walk
 
@@ -118,6 +119,30 @@ def test_the_thesis_method_keeps_its_still_pose(shared_data: Path) -> None:
     assert len(yaws) == 1
     # DESIGN 4.8: one still pose calibrates wide layouts wrongly.
     assert yaws.pop() > NOMINAL["90deg"] + 5.0
+
+
+# --- simulated sensors, which err like real ones
+
+
+@pytest.mark.parametrize(
+    ("motion", "seed"),
+    [
+        ("shoulder_lifts", 1000),  # the reference sees the body turned around for seven seconds
+        ("hair_combing", 1001),  # and here in the only still pose
+        ("calf_raise", 1005),  # the first movement looks like another one
+        ("arm_raises", 2003),
+    ],
+)
+def test_people_who_stay_on_the_spot_are_enough(motion: str, seed: int) -> None:
+    recording = simulate(Setup(motion, seed=seed))
+    frames = tuple((each.sensor, each.skeletons[0], each.received_ns) for each in recording.frames)
+    result = run(frames)[0].finish()
+    one, two = (sensor.pose for sensor in recording.sensors)
+    turn = between(result)[0] @ (one.rotation.T @ two.rotation).T
+    assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 5.0
+    middle = int(recording.truths[0].stamps_ns[len(recording.truths[0].stamps_ns) // 2])
+    off = result.clocks["kinect2"].to_sensor(middle) - recording.sensors[1].clock.to_sensor(middle)
+    assert abs(off) < 0.05 * NANOSECONDS
 
 
 # --- laws, on a simulated walk
@@ -221,6 +246,20 @@ def test_arrival_times_are_only_a_first_guess() -> None:
     assert_allclose(shaken.poses["kinect2"].translation, orderly.poses["kinect2"].translation, atol=1e-9)
     assert_allclose(shaken.poses["kinect2"].rotation, orderly.poses["kinect2"].rotation, atol=1e-9)
     assert shaken.clocks == orderly.clocks
+
+
+def test_the_times_of_receipt_tell_the_clock_of_somebody_who_does_not_move() -> None:
+    """To half a step of their grid; neither a burst at first nor single late frames matter."""
+    frames = stream(8.0, offset=0.45, still=8.0)
+    since = frames[0][2]
+    for held in (0.0, 1.3):  # kinect2's first frames arrive together
+        burst = tuple(
+            (name, seen, max(now, since + round(held * NANOSECONDS)) if name == "kinect2" else now)
+            for name, seen, now in frames
+        )
+        result = run(tuple(sorted(burst, key=lambda each: each[2])))[0].result()
+        assert result.clocks["kinect2"].offset == pytest.approx(0.45, abs=0.0201)
+        assert result.quality["kinect2"].clock_stddev == 0.05
 
 
 def test_stamps_since_an_epoch_are_as_good_as_small_ones() -> None:
