@@ -59,6 +59,9 @@ CLOCK_WINDOW_NS = 5 * NANOSECONDS
 MOVED_SIGMAS = 5.0
 """A sensor has been moved when its pose is this many standard deviations from the saved one."""
 
+NO_POSE_AFTER = 8.0
+"""Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
+
 HALF_TURN = 0.5 * np.pi
 """A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
@@ -480,12 +483,18 @@ class OnlineCalibration:
             if other.rotation is None or self.parameters.method == "thesis":
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
                 self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
-        elif self.parameters.method == "robust" and other.clock_locked and len(other.pairs) >= 20:
+        elif self.parameters.method == "robust" and self._moved_enough(other, horizon):
             # Nobody stands still: the movement itself is a start.
             start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from movement, no still pose was seen")
                 other.started = start
+
+    @staticmethod
+    def _moved_enough(other: _Sensor, horizon: int) -> bool:
+        """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
+        waited = other.received is not None and horizon - other.received[1] > NO_POSE_AFTER * NANOSECONDS
+        return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         assert self._anchor is not None
