@@ -53,8 +53,10 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking show $(DEMO)/recording --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
 
+# The tests that compute share the cores; those that start processes and wait for them come after, one at a time.
 test: lint ## formatting, lint, types and all tests
-	$(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not processes" --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest -m processes
 
 lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff check .

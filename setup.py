@@ -60,6 +60,7 @@ setup(
         ],
         "test": [
             "pytest>=8",
+            "pytest-xdist>=3.6",
             "hypothesis>=6.100",
             "ruff==0.17.5",
             "mypy==2.4.1",

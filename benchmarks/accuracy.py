@@ -6,7 +6,9 @@ was calibrated with, and most motions are others; nothing here was used to tune 
 
 methods   ``one sensor``: what kinect1 says, in world; ``thesis ...``: the pipeline of Schlagenhauf (2017)
           (``thesis_pipeline``); ``fused``, ``default`` and ``ekf``: this package at its defaults, offline, through the
-          messages of the live graph (calibration, fusion, filter, joint angles).
+          messages of the live graph (calibration, fusion, filter, joint angles). ``offsets alone`` is none: a sensor
+          that is wrong by nothing but where it takes the joints' centres to be, which no method can know. What that
+          leaves after a constant offset of each joint is taken off is what turns with other bones than the anatomist's.
 errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from when all have
           begun: mean 3D error (mm); the same without each joint's constant offset in the body's own frames ("fixed");
           the latter where a joint is hidden from one sensor or more; RMSE of shoulder elevation and elbow flexion
@@ -30,7 +32,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +58,8 @@ from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton,
 
 TEN = Schlagenhauf26().joints
 ONE, FUSED, DEFAULT, OURS = "one sensor", "fused", f"default ({DEFAULT_FILTER})", "ekf"
-METHODS = (ONE, FUSED, LKF1, LKF2, EKF, DEFAULT, OURS)
+ALONE = "offsets alone"
+METHODS = (ALONE, ONE, FUSED, LKF1, LKF2, EKF, DEFAULT, OURS)
 KNOWN = ("two_handed_wave", "slow_down", "torso_twist", "move_along")
 """Motions that the simulator was calibrated with."""
 TWIST = "torso_twist"
@@ -80,11 +83,13 @@ class Run:
     parameter: str = ""
     factor: float = 1.0
 
-    def recording(self) -> SimulatedRecording:
-        """Simulate it."""
+    def recording(self, *, offsets_alone: bool = False) -> SimulatedRecording:
+        """Simulate it, or the same with sensors that are wrong by nothing but where they take the joints to be."""
         errors = KinectErrors()
         if self.parameter:
             errors = errors.scaled(self.factor, (self.parameter,))
+        if offsets_alone:
+            errors = replace(KinectErrors.none(), anatomical=errors.anatomical, offset=errors.offset)
         return simulate(Setup(self.motion, layout(self.layout), seed=self.seed, errors=errors))
 
 
@@ -142,17 +147,22 @@ def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skel
     return collector.fused, collector.filtered
 
 
+def reported(recording: SimulatedRecording) -> list[Skeleton]:
+    """What the first sensor says, in world."""
+    reference = recording.sensors[0].pose
+    return [
+        Skeleton(each.stamp_ns, "world", reference.apply(each.positions), each.states)
+        for frame in recording.frames
+        if frame.sensor == reference.sensor
+        for each in frame.skeletons
+    ]
+
+
 def outputs_of(recording: SimulatedRecording, methods: Sequence[str]) -> dict[str, list[Skeleton]]:
     """What each method makes of a recording, in world and in the reference clock."""
-    reference = recording.sensors[0].pose
     outputs: dict[str, list[Skeleton]] = {}
     if ONE in methods:
-        outputs[ONE] = [
-            Skeleton(each.stamp_ns, "world", reference.apply(each.positions), each.states)
-            for frame in recording.frames
-            if frame.sensor == reference.sensor
-            for each in frame.skeletons
-        ]
+        outputs[ONE] = reported(recording)
     hers = [name for name in (LKF1, LKF2, EKF) if name in methods]
     if hers:
         names = [sensor.pose.sensor for sensor in recording.sensors]
@@ -172,6 +182,8 @@ def figures_of(run: Run, methods: Sequence[str] = METHODS) -> dict[str, Figures]
     zero = int(truth.stamps_ns[0])
     curve = Curve((truth.stamps_ns - zero) / NANOSECONDS, truth.positions)
     outputs = outputs_of(recording, methods)
+    if ALONE in methods:
+        outputs[ALONE] = reported(run.recording(offsets_alone=True))
     silent = Figures(*[float("nan")] * len(fields(Figures)))
     speaking = {name: each for name, each in outputs.items() if len(each) > 30}
     begin = max(each[0].stamp_ns for each in speaking.values())

@@ -1,4 +1,4 @@
-"""What all tests share: the real recordings, where they are present."""
+"""What all tests share: the real recordings, where they are present, and which of them to run alone."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+PROCESSES = ("nodes", "test_cli.py", "test_package.py", "test_up.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that start processes and wait for them: beside others they would be late."""
+    for item in items:
+        if item.path.relative_to(ROOT / "test").parts[0] in PROCESSES:
+            item.add_marker(pytest.mark.processes)
 
 
 @pytest.fixture(scope="session")

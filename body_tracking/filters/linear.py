@@ -8,6 +8,14 @@ A depth sensor's skeleton is wrong by centimetres but trembles by millimetres: m
 joint placed beside the anatomical one, a tilt by the viewing direction). A filter told that all of it were white would
 average it away on paper only. So the measurement covariance ``R`` is split: ``white_noise_share`` of it drives the
 gain, the rest is carried along and added to the covariance that is handed out; gating allows for all of it.
+
+What no sensor shows does not fly on as it last moved: at constant velocity a hand that is hidden in mid-reach would be
+a metre away after half a second. It is carried along by the nearest joint towards the trunk that is seen, and its own
+movement against that one fades (an Ornstein-Uhlenbeck process, whose velocity has the initial deviation for ever).
+
+A limb that is thrust forward is no outlier, and following it with the gain of a quiet one leaves it farther behind with
+every frame until it is taken for one. So each joint's process noise grows with its surprising innovations, and is back
+soon (adjustable level of the process noise, Bar-Shalom, Li and Kirubarajan 2001, section 11.2).
 """
 
 from __future__ import annotations
@@ -24,7 +32,16 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+from body_tracking.skeleton import (
+    BONES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Skeleton,
+    TrackingState,
+)
 
 ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
@@ -35,6 +52,22 @@ _MAX_RANGE = 100.0
 _REFERENCE_DISTANCE = 2.0
 """Metres within which the measurement noise no longer shrinks."""
 _EYE3 = np.eye(3)
+_SURPRISING, _MOST_SURPRISING = 4.0, 10.0
+"""Times its expectation from which a normalised innovation squared raises the process noise, and up to which."""
+_MOST_LEVEL = np.log(200.0)
+"""Of a joint with 50 m/s2, the fastest that people punch, instead of 3."""
+_ALL: IntArray = np.arange(N_JOINTS, dtype=np.intp)
+
+
+def _towards_trunk() -> IntArray:
+    """(25,) the next joint towards the base of the spine, which is its own."""
+    towards = _ALL.copy()
+    for parent, child in BONES:
+        towards[child] = parent
+    return towards
+
+
+_TOWARDS_TRUNK = _towards_trunk()
 
 
 class FilterError(BodyTrackingError):
@@ -143,6 +176,25 @@ class LinearKalmanParameters:
             "max": 1.0,
         },
     )
+    adaptation: float = field(
+        default=0.5,
+        metadata={
+            "doc": "by how much the logarithm of a joint's process noise rises with each normalised innovation squared "
+            "beyond four times its expectation; 0 leaves the noise as it is",
+            "unit": "",
+            "min": 0.0,
+            "max": 10.0,
+        },
+    )
+    adaptation_time: float = field(
+        default=0.1,
+        metadata={
+            "doc": "time constant with which that fades: a thrust lasts that long",
+            "unit": "s",
+            "min": 0.001,
+            "max": 100.0,
+        },
+    )
     initial_velocity_stddev: float = field(
         default=1.0,
         metadata={
@@ -249,6 +301,8 @@ class LinearKalmanFilter:
         # Every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it.
         self._unit_noise: FloatArray = joint_densities(densities)[:, None, None] * unit_step
         self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
+        # an Ornstein-Uhlenbeck velocity of variance s driven by white noise of density q fades in 2 s / q
+        self._fading_time: FloatArray = 2.0 * p.initial_velocity_stddev**2 / joint_densities(densities)
         self._gate = float(chi2.ppf(p.gate_probability, 3))
         self.counters: dict[str, int] = dict.fromkeys(
             (
@@ -279,6 +333,7 @@ class LinearKalmanFilter:
         self._stamp_ns = 0
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
+        self._level: FloatArray = np.zeros(N_JOINTS)
         self._unmeasured: FloatArray = np.zeros(N_JOINTS)
         self._rejected: FloatArray = np.zeros(N_JOINTS)
         self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
@@ -374,10 +429,17 @@ class LinearKalmanFilter:
         """Predict all joints, update the observed ones, take back those beyond the gate; returns (25,) these."""
         kalman = self._kalman
         size = 3 * self._order
-        transition = np.eye(size)  # eq. 5.11, 5.12
-        if self._order == 2:
-            transition[:3, 3:] = step * _EYE3
-        kalman.predict(F=transition, Q=self._unit_noise * step**self._noise_powers)
+        carrier = self._carriers(observed)
+        self._level *= np.exp(-step / self.parameters.adaptation_time)
+        noise_of_step = self._unit_noise * step**self._noise_powers
+        usual = np.exp(self._level)[:, None, None]
+        if (carrier != _ALL).any():
+            self._predict_carried(carrier, usual * noise_of_step, step)
+        else:
+            transition = np.eye(size)  # eq. 5.11, 5.12
+            if self._order == 2:
+                transition[:3, 3:] = step * _EYE3
+            kalman.predict(F=transition, Q=usual * noise_of_step)
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
@@ -387,18 +449,76 @@ class LinearKalmanFilter:
         distances = self._distances()
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
+        surprise = np.clip(distances / 3.0 - _SURPRISING, 0.0, _MOST_SURPRISING - _SURPRISING)
+        level = self._level
+        self._level = np.minimum(level + self.parameters.adaptation * surprise, _MOST_LEVEL)
         if not suspects.any():
+            self._carry(carrier, ~observed)
             return suspects
 
-        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is an outlier.
-        # Once more for these, with all of the noise: a change is then followed without a kick to the velocity.
+        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is thrust
+        # forward, or it is an outlier. Once more for these, with all of the noise of both kinds: a change is then
+        # followed with a small kick to the velocity only.
         kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
+        raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - usual, 0.0) * noise_of_step
+        kalman.P = Stacked.of(np.asarray(kalman.P_prior) + raised)
         noise = np.where(suspects[:, None, None], noise, white)
         kalman.update(measurement, R=Stacked.of(noise), H=Stacked.of(observation))
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
+        self._level[rejected] = level[rejected]  # nobody moves like that
+        self._carry(carrier, ~observed | rejected)
         return rejected
+
+    def _carriers(self, observed: BoolArray) -> IntArray:
+        """(25,) which joint carries each along: itself where it is seen, now and when it was last looked for."""
+        loose = ~observed | (self._unmeasured > 0.0)
+        carrier = _ALL
+        if self._order == 2 and loose.any():
+            for _ in _ALL:  # as far as the longest chain at most
+                further = np.where(loose[carrier], _TOWARDS_TRUNK[carrier], carrier)
+                if (further == carrier).all():
+                    break
+                carrier = further
+        return carrier
+
+    def _predict_carried(self, carrier: IntArray, noise: FloatArray, step: float) -> None:
+        """Predict all joints; those with another carrier (25,) move with it, and less and less against it.
+
+        With ``tau`` the fading time, ``f = exp(-step / tau)``, ``r = tau (1 - f)`` and ``u`` the carrier's velocity,
+        ``x' = x + r v + (step - r) u`` and ``v' = f v + (1 - f) u``; the noise is that of an integrated
+        Ornstein-Uhlenbeck velocity (Gillespie 1996, eq. 2.8-2.9), which for a long ``tau`` is that of eq. 5.12. Where
+        nothing on the way is seen the base of the spine carries, and goes on as it last moved, if that is known.
+        """
+        free = carrier != _ALL
+        carrying = np.where(self._alive[carrier, None, None], self._kalman.x[carrier, 3:], 0.0)
+        tau = np.where(free, self._fading_time, 1.0)
+        fade = np.where(free, np.exp(-step / tau), 1.0)
+        reach = np.where(free, tau * (1.0 - fade), step)
+        transition = np.zeros((N_JOINTS, 6, 6))
+        transition[:] = np.eye(6)
+        transition[:, :3, 3:] = reach[:, None, None] * _EYE3
+        transition[:, 3:, 3:] = fade[:, None, None] * _EYE3
+        control = np.zeros((N_JOINTS, 6, 3))
+        control[:, :3] = (step - reach)[:, None, None] * _EYE3
+        control[:, 3:] = (1.0 - fade)[:, None, None] * _EYE3
+
+        # per unit density: of velocity, of both, of position
+        vv = 0.5 * tau * (1.0 - fade**2)
+        tv = 0.5 * reach**2
+        tt = tau**2 * (step - 2.0 * reach + vv)
+        blocks = np.stack([np.stack([tt, tv], axis=-1), np.stack([tv, vv], axis=-1)], axis=-2)
+        density = self._unit_noise[:, 3, 3]
+        noise = np.where(free[:, None, None], density[:, None, None] * np.kron(blocks, _EYE3), noise)
+        self._kalman.predict(u=Stacked.of(carrying), B=Stacked.of(control), F=Stacked.of(transition), Q=noise)
+
+    def _carry(self, carrier: IntArray, unseen: BoolArray) -> None:
+        """What the measurements corrected of a carrier's motion, its unseen joints (25,) do, too."""
+        if self._order == 2:
+            carried = unseen & (carrier != _ALL)
+            correction = self._kalman.x - self._kalman.x_prior
+            self._kalman.x[carried] += correction[carrier[carried]]
 
     def _distances(self) -> FloatArray:
         """(25,) squared Mahalanobis distances of the last update's innovations; 0 where nothing was observed."""
@@ -425,8 +545,7 @@ class LinearKalmanFilter:
         kalman.P[joints] = np.diag([0.0] * 3 + [self.parameters.initial_velocity_stddev**2] * (3 * self._order - 3))
         kalman.P[joints, :3, :3] = self.parameters.white_noise_share * noise[joints]
         self._alive |= joints
-        self._unmeasured[joints] = 0.0
-        self._rejected[joints] = 0.0
+        self._level[joints] = self._unmeasured[joints] = self._rejected[joints] = 0.0
 
     def _output(self, skeleton: Skeleton, used: BoolArray) -> Skeleton | None:
         alive = self._alive

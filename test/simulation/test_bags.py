@@ -17,6 +17,7 @@ from body_tracking import graph
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.cli import main
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.measurement import left_right_axes
 from body_tracking.messages import (
     IMU,
     JOINT_STATE,
@@ -233,7 +234,10 @@ def poses_and_clocks(folder: Path) -> tuple[dict[str, SensorPose], list[tuple[st
 
 
 def errors_of(folder: Path, sensor: str) -> FloatArray:
-    """Metres by which a sensor's tracked joints are wrong, in ``world`` and in the reference clock."""
+    """Metres by which a sensor's tracked joints are wrong, in ``world`` and in the reference clock.
+
+    Of the frames in which it has not exchanged left and right.
+    """
     poses, clocks = poses_and_clocks(folder)
     truth = [cloud_to_skeletons(message)[0] for message in read(folder, graph.TRUE_SKELETON)]
     true_ns = np.array([skeleton.stamp_ns for skeleton in truth])
@@ -249,7 +253,9 @@ def errors_of(folder: Path, sensor: str) -> FloatArray:
         share = (reference_ns - true_ns[k - 1]) / (true_ns[k] - true_ns[k - 1])
         expected = (1 - share) * true_positions[k - 1] + share * true_positions[k]
         tracked = skeleton.states == TrackingState.TRACKED
-        errors.append(np.linalg.norm(poses[sensor].apply(skeleton.positions) - expected, axis=1)[tracked])
+        found = poses[sensor].apply(skeleton.positions)
+        if ((left_right_axes(found) * left_right_axes(expected)).sum(axis=-1) > 0.0).all():
+            errors.append(np.linalg.norm(found - expected, axis=1)[tracked])
     return np.concatenate(errors)
 
 
@@ -267,8 +273,8 @@ def test_the_shipped_bags_err_as_a_kinect_does(name: str) -> None:
     assert set(poses) == set(SENSORS) and {sensor for sensor, _, _ in clocks} == {"kinect2"}
     for sensor in SENSORS:
         error = errors_of(BAGS / name, sensor)
-        assert 0.02 < np.median(error) < 0.08  # Kinect v2 against markers: 20 mm of elbows to 80 mm of knees and feet
-        assert error.max() < 2.0  # from hand to hand, where left and right are exchanged
+        assert 0.050 < error.mean() < 0.101  # what is reported of one Kinect v2 against markers
+        assert error.max() < 0.6  # a hidden arm that is told beside the body
 
 
 @cache
