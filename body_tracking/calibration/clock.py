@@ -20,6 +20,10 @@ DRIFT_PRIOR = 500e-6
 """Standard deviation of the relative drift of two clocks, 1: the fastest that NTP slews a computer's clock; quartz
 alone has 10-100 ppm."""
 
+RECEIPT_PRIOR = 0.05
+"""Standard deviation of what the times of receipt say of an offset, seconds: sensors deliver after different delays.
+In nine recordings of two Kinects on two computers these are 15 to 40 ms apart."""
+
 DRIFT_STEP = 100e-6
 
 DRIFT_STEPS = 15
@@ -39,8 +43,12 @@ MIN_JOINTS = 8
 _LIMB_JOINTS: IntArray = np.array([0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 12, 13, 16, 17, 20], dtype=np.intp)
 
 
-FAR_FROM_GUESS = 0.1
-"""Correlation that an offset must have more, per square second that it lies away from the guess."""
+INDEPENDENT = 0.5
+"""Joint speeds closer together than this are one observation where offsets far apart are compared, seconds: limbs go to
+and fro about once a second, and a few swings look like a few others."""
+
+UNLIKE = 0.05
+"""Share of the joint speeds' variance in which two sensors differ at least: more than this, no correlation can tell."""
 
 FINE_RANGE = 0.15
 """The fine search looks this far around the offset first found, seconds."""
@@ -61,12 +69,14 @@ class OffsetEstimate:
     Attributes:
         offset: seconds.
         correlation: normalised correlation of the joint speeds at that offset, -1 to 1.
-        margin: by how much it exceeds the best correlation more than 0.3 s away, less what that or it lies farther
-            from the guess.
+        likely: the correlation that would be as likely at the guess itself: the less, the farther it lies from there
+            and the less motion there was.
+        margin: by how much that exceeds the same of every offset more than 0.3 s away.
     """
 
     offset: float
     correlation: float
+    likely: float
     margin: float
 
 
@@ -92,6 +102,12 @@ def _sample(series: tuple[FloatArray, FloatArray, BoolArray], at: FloatArray) ->
     fraction = (at - stamps[index - 1]) / np.maximum(stamps[index] - stamps[index - 1], 1e-6)
     value = values[index - 1] + (values[index] - values[index - 1]) * np.clip(fraction, 0.0, 1.0)[:, None]
     return np.where(known[:, None], value, 0.0), known
+
+
+def _time_of_motion(speeds: FloatArray, known: BoolArray) -> float:
+    """For how long somebody moved, seconds: of the squared deviations e from the mean, (sum e)^2 / sum e^2 samples."""
+    moved = ((speeds - speeds.sum(axis=0) / max(known.sum(), 1)) ** 2).sum(axis=1) * known
+    return STEP * max(float(moved.sum() ** 2 / np.maximum((moved**2).sum(), 1e-12)), 1.0)
 
 
 def correlate_clocks(
@@ -137,14 +153,18 @@ def correlate_clocks(
     score = covariance.sum(axis=1) / np.sqrt(np.maximum(var_a.sum(axis=1) * var_b.sum(axis=1), 1e-12))
     score[n[:, 0] * STEP < 2.0] = -1.0
     lag = STEP * (np.arange(len(score)) - lags)
-    # Someone who waves looks the same a period later: among equals, the one near the guess.
-    likely = score - FAR_FROM_GUESS * lag**2
+    # Someone who waves looks the same a period later, and of little motion much looks alike: a correlation rho of n
+    # independent samples adds n / 2 log(1 / (1 - rho^2)) to the log-likelihood, and the guess a Cauchy prior, for it is
+    # rarely far off, but may be by any burst. Both together are a correlation again.
+    worse = (1.0 + (lag / RECEIPT_PRIOR) ** 2) ** (2.0 * INDEPENDENT / _time_of_motion(a, known_a))
+    unlike = np.maximum(1.0 - score**2, UNLIKE) * worse
+    likely = np.where(score > 0.0, np.sqrt(np.maximum(1.0 - unlike, 0.0)), score)
     best = int(np.argmax(likely))
     far = np.abs(lag - lag[best]) > 0.3
     margin = float(likely[best] - likely[far].max()) if far.any() else 0.0
     # The preference chooses the peak and must not move it.
-    best = int(np.argmax(np.where(np.abs(lag - lag[best]) <= 0.1, score, -np.inf)))
-    return OffsetEstimate(guess + float(lag[best]), float(score[best]), margin)
+    peak = int(np.argmax(np.where(np.abs(lag - lag[best]) <= 0.1, score, -np.inf)))
+    return OffsetEstimate(guess + float(lag[peak]), float(score[peak]), float(likely[best]), margin)
 
 
 class ClockFit:
@@ -152,16 +172,20 @@ class ClockFit:
 
     Every window of motion leaves the correlation rho of the joint speeds for each lag of a grid. The line
     ``offset + drift t`` with the highest likelihood wins: each window of n independent samples adds
-    n / 2 log(1 / (1 - rho^2)) at its lag, and the drift has a prior. No window has to decide alone, and one in which a
-    sensor sees the body turned around, or nothing moves, correlates badly and says little.
+    n / 2 log(1 / (1 - rho^2)) at its lag, the drift has a prior, and so has the offset where the times of receipt are
+    known. No window has to decide alone, and one in which a sensor sees the body turned around, or nothing moves,
+    correlates badly and says little.
     """
 
-    def __init__(self, centre: float) -> None:
+    def __init__(self, centre: float, expected: tuple[float, float] | None = None) -> None:
         """Look around an offset.
 
         Args:
             centre: seconds; rounded to the grid, so that nearly equal centres look at the same lags.
+            expected: offset in seconds that the times of receipt tell, and the time since the anchor at which they do,
+                if any. Not to be believed where it is farther than :data:`FINE_RANGE` from the centre.
         """
+        self._expected = expected if expected is not None and abs(expected[0] - centre) <= FINE_RANGE else None
         first = round((centre - FINE_RANGE) / FINE_STEP)
         self._lags = FINE_STEP * (first + np.arange(round(2 * FINE_RANGE / FINE_STEP) + 1))
         self._elapsed: list[float] = []
@@ -234,11 +258,16 @@ class ClockFit:
             at: FloatArray = values[rows, left] + (place - left) * (values[rows, left + 1] - values[rows, left])
             return at
 
+        # The prior of the offset: 1 / variance, the offset, and its time from the middle.
+        trust, expected, at = 0.0, 0.0, 0.0
+        if self._expected is not None:
+            trust, expected, at = RECEIPT_PRIOR**-2, self._expected[0], self._expected[1] - middle
         drifts = DRIFT_STEP * np.arange(-DRIFT_STEPS, DRIFT_STEPS + 1)
         # On the coarse grid each window is shifted by whole lags.
         shifts = np.rint(drifts[:, None] * elapsed / FINE_STEP).astype(np.intp)
         places = np.clip(np.arange(last + 1) + shifts[..., None], 0, last)
         total = likelihood[rows[None, :, None], places].sum(axis=1) - 0.5 * (drifts[:, None] / DRIFT_PRIOR) ** 2
+        total -= 0.5 * trust * (self._lags + drifts[:, None] * at - expected) ** 2
         best = np.unravel_index(int(np.argmax(total)), total.shape)
         drift, offset = float(drifts[best[0]]), float(self._lags[best[1]])
         # Newton's method on the smoothed likelihood, from the best point of the grid.
@@ -248,8 +277,10 @@ class ClockFit:
         hessian = np.zeros((2, 2))
         for _ in range(20):
             g, h = along(slope, offset, drift), along(bend, offset, drift)
-            gradient = np.array([g.sum(), g @ elapsed - drift / DRIFT_PRIOR**2])
+            off = trust * (offset + drift * at - expected)
+            gradient = np.array([g.sum() - off, g @ elapsed - drift / DRIFT_PRIOR**2 - off * at])
             hessian = np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2 - DRIFT_PRIOR**-2]])
+            hessian -= trust * np.array([[1.0, at], [at, at**2]])
             if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
                 return None
             step = -np.linalg.solve(hessian, gradient)

@@ -7,16 +7,16 @@ arrive a little earlier or later, give the same numbers.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, ClockFit, correlate_clocks
+from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
 from body_tracking.calibration.coverage import Coverage
-from body_tracking.calibration.pairwise import PairEstimate, Pairs, estimate, start_from_midline
+from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
 from body_tracking.calibration.result import (
     CalibrationResult,
     ClockModel,
@@ -24,10 +24,11 @@ from body_tracking.calibration.result import (
     SensorQuality,
     level_pose,
 )
-from body_tracking.calibration.rigid import CalibrationError, rigid_registration
+from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
+from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.measurement import joint_stddev
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
+from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
 """Seconds of reference time between remembered pairs: frames closer together err alike."""
@@ -41,6 +42,14 @@ GUESS_FRAMES = 30
 GUESS_GRID = 0.1
 """The guess is rounded to this, seconds: a few milliseconds of network then make no difference."""
 
+RECEIPT_FRAMES = 90
+"""Frames of a sensor whose median delay of receipt gives its clock until motion tells it better: three seconds ..."""
+
+RECEIPT_GRID = 0.04
+"""... rounded to this, seconds. The medians of a live run and of its recording differ by some tenths of a millisecond,
+so that they seldom part here; the least delays differ by 30 ms and more, because a frame that overtakes the ``/clock``
+of a bag seems to have come early."""
+
 REPAIR_CLOCK = 0.004
 """Interpolate the frames anew when the clock has moved by more than this since they were paired, seconds."""
 
@@ -49,6 +58,12 @@ CLOCK_WINDOW_NS = 5 * NANOSECONDS
 
 MOVED_SIGMAS = 5.0
 """A sensor has been moved when its pose is this many standard deviations from the saved one."""
+
+NO_POSE_AFTER = 8.0
+"""Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
+
+HALF_TURN = 0.5 * np.pi
+"""A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
 CLOCK_STEP = 1.0
 """A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
@@ -178,7 +193,7 @@ class _Track:
         self.stamps: list[int] = []
         self.positions: list[FloatArray] = []
         self.states: list[np.ndarray] = []
-        self.delays: list[int] = []
+        self.delays: list[int] = []  # receipt less stamp
         self.late = 0
 
     def push(self, skeleton: Skeleton, received_ns: int) -> bool:
@@ -190,16 +205,20 @@ class _Track:
         known = skeleton.valid
         self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
         self.states.append(np.where(known, skeleton.states, 0))
-        if len(self.delays) < GUESS_FRAMES:
-            self.delays.append(received_ns - skeleton.stamp_ns)
+        self.delays.append(received_ns - skeleton.stamp_ns)
         return True
 
     def forget_before(self, stamp_ns: int) -> None:
         # In steps, because each deletion moves the whole list.
         old = bisect_right(self.stamps, stamp_ns)
         if old > 256:
-            for values in (self.stamps, self.positions, self.states):
+            for values in (self.stamps, self.positions, self.states, self.delays):
                 del values[:old]
+
+    def delay(self, first_ns: int, last_ns: int) -> float | None:
+        """Median delay of receipt of the frames of a time, nanoseconds; None where there are few."""
+        found = self.delays[bisect_left(self.stamps, first_ns) : bisect_right(self.stamps, last_ns)]
+        return float(np.median(found)) if len(found) >= GUESS_FRAMES else None
 
     def until(self, stamp_ns: int, last: int | None = None) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Stamps (n,) seconds, positions (n, 25, 3), states (n, 25) up to a time of the sensor's clock."""
@@ -244,6 +263,9 @@ class _Sensor:
     def forget(self) -> None:
         """Start estimating anew; what is published stays."""
         self.clock_guessed = False
+        self.clock_saved = False
+        self.clock_received = False
+        self.received: tuple[int, int] | None = None  # offset by the times of receipt, and the reference time of it
         self.clock_locked = False
         self.clock_fit: ClockFit | None = None
         self.clock_base_ns = 0
@@ -350,6 +372,8 @@ class OnlineCalibration:
     def _follow(self, name: str, other: _Sensor, horizon: int) -> None:
         if not other.clock_guessed and not self._guess_clock(name, other):
             return
+        if not other.clock_received:
+            self._receive_clock(other, horizon)
         own_horizon = other.clock.to_sensor(horizon)
         other.track.forget_before(own_horizon - round(self.parameters.history * NANOSECONDS))
         if not other.track.stamps or other.track.stamps[-1] < own_horizon - 2 * NANOSECONDS:
@@ -364,7 +388,7 @@ class OnlineCalibration:
         if other.started is None:
             self._start(name, other, horizon)
         if self.parameters.method == "robust":
-            if not other.clock_locked:
+            if other.clock_received and not other.clock_locked:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
                 self._follow_clock(other, horizon)
@@ -373,7 +397,8 @@ class OnlineCalibration:
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
         if min(len(self._track.delays), len(other.track.delays)) < GUESS_FRAMES:
             return False
-        guess = float(np.median(self._track.delays) - np.median(other.track.delays)) / NANOSECONDS
+        own, theirs = (np.median(track.delays[:GUESS_FRAMES]) for track in (self._track, other.track))
+        guess = float(own - theirs) / NANOSECONDS
         assert self._anchor is not None
         if other.rotation is None or abs(other.clock.offset - guess) > CLOCK_STEP:
             if other.rotation is not None:
@@ -385,8 +410,32 @@ class OnlineCalibration:
             other.clock = ClockModel(
                 other.clock.to_sensor(self._anchor) - self._anchor, other.clock.drift_ppm, self._anchor
             )
+            other.clock_saved = True
         other.clock_guessed = True
         return True
+
+    def _receive_clock(self, other: _Sensor, horizon: int) -> None:
+        """Better than the guess: the delays over some seconds, of the frames that both sensors took in them."""
+        stamps = other.track.stamps
+        start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
+        stop = start + RECEIPT_FRAMES - 1
+        # Only what was captured long enough ago, or another order of arrival would make this happen a frame later.
+        if stop >= len(stamps) or other.clock.to_sensor(horizon) < stamps[stop]:
+            return
+        first, last = stamps[start], stamps[stop]
+        own = self._track.delay(other.clock.to_reference(first), other.clock.to_reference(last))
+        theirs = other.track.delay(first, last)
+        if own is None or theirs is None:
+            return
+        other.clock_received = True
+        offset = round(RECEIPT_GRID * round((own - theirs) / NANOSECONDS / RECEIPT_GRID) * NANOSECONDS)
+        other.received = offset, (first + last) // 2 - offset
+        other.clock_stddev = RECEIPT_PRIOR
+        if other.clock_saved and abs(first - other.clock.to_reference(first) - offset) < FINE_RANGE * NANOSECONDS:
+            return  # a clock that was calibrated is better, where it has not drifted away since
+        other.clock = ClockModel(offset, 0.0, other.clock.anchor_ns)
+        self._pair_anew(other, horizon)
+        self._changed = True
 
     def _pair(self, other: _Sensor, horizon: int) -> None:
         """Remember pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
@@ -420,29 +469,32 @@ class OnlineCalibration:
         still = is_still(own[0], own[1]) and is_still(theirs[0], theirs[1])
         if still:
             try:
-                rotation, translation, residual = still_pose_registration(own[1:], theirs[1:])
+                found = [still_pose_registration(own[1:], theirs[1:])]
+                if self.parameters.method == "robust":
+                    # One of them may see the body turned around.
+                    exchanged = theirs[1][:, MIRROR], theirs[2][:, MIRROR]
+                    found.append(still_pose_registration(own[1:], exchanged))
             except CalibrationError:
                 return
+            rotation, translation, residual = min(found, key=lambda each: each[2])
             pose = "T-pose" if is_t_pose(own[1]) else "still pose"
             self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
                 self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
-        elif self.parameters.method == "robust" and other.clock_locked and len(other.pairs) >= 20:
+        elif self.parameters.method == "robust" and self._moved_enough(other, horizon):
             # Nobody stands still: the movement itself is a start.
-            start = self._plain_start(other.pairs.pairs())
+            start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from movement, no still pose was seen")
                 other.started = start
 
     @staticmethod
-    def _plain_start(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
-        known = np.isfinite(pairs.variance)
-        try:
-            return rigid_registration(pairs.reference[known], pairs.sensor[known])
-        except CalibrationError:
-            return None
+    def _moved_enough(other: _Sensor, horizon: int) -> bool:
+        """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
+        waited = other.received is not None and horizon - other.received[1] > NO_POSE_AFTER * NANOSECONDS
+        return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         assert self._anchor is not None
@@ -451,7 +503,7 @@ class OnlineCalibration:
         found = correlate_clocks(own, theirs, 0.0, self.parameters.clock_window)
         if (
             found is None
-            or found.correlation < self.parameters.clock_correlation
+            or found.likely < self.parameters.clock_correlation
             or found.margin < self.parameters.clock_margin
         ):
             return
@@ -478,6 +530,14 @@ class OnlineCalibration:
         stamps = np.array([stamp - self._anchor - offset_ns for stamp in track.stamps[first:last]]) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
+    def _expected(self, other: _Sensor) -> tuple[float, float] | None:
+        """What the times of receipt say of the offset against the base of the fit, and when; seconds."""
+        if other.received is None:
+            return None
+        offset, at = other.received
+        assert self._anchor is not None
+        return (offset - other.clock_base_ns) / NANOSECONDS, (at - self._anchor) / NANOSECONDS
+
     def _follow_clock(self, other: _Sensor, horizon: int) -> None:
         """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
@@ -487,7 +547,8 @@ class OnlineCalibration:
             start, stop = other.clock_window_end, other.clock_window_end + CLOCK_WINDOW_NS
             other.clock_window_end = stop
             if other.clock_fit is None:
-                other.clock_base_ns, other.clock_fit = other.clock.offset_ns, ClockFit(0.0)
+                other.clock_base_ns = other.clock.offset_ns
+                other.clock_fit = ClockFit(0.0, self._expected(other))
             measured |= other.clock_fit.add(
                 (start + CLOCK_WINDOW_NS // 2 - self._anchor) / NANOSECONDS,
                 self._since_anchor(self._track, 0, start, stop),
@@ -557,23 +618,20 @@ class OnlineCalibration:
         return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
 
     def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
-        """The better of going on from the last estimate and starting from the spines, which know no left and right."""
+        """The best from three starts: the last estimate, half a turn from it, the spines, which know no sides."""
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)
         if midline is not None and Rotation.from_matrix(midline[0] @ other.started[0].T).magnitude() > 0.5:
             starts.append(midline)
-        found: list[PairEstimate] = []
-        for rotation, translation in starts:
-            try:
-                found.append(estimate(pairs, rotation, translation))
-            except CalibrationError:
-                continue
-        return min(found, key=lambda each: each.cost) if found else None
+        opposite = half_turn_from(pairs, other.started[0])
+        if opposite is not None:
+            starts.append(opposite)
+        return best_estimate(pairs, starts)
 
     def _aim(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
         other.target = rotation, translation, centre
-        if other.rotation is None:
+        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > HALF_TURN:
             other.rotation, other.translation = rotation, translation
             self._changed = True
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, ClockFit, correlate_clocks
+from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
 from body_tracking.skeleton import FloatArray
 from walkers import walk
 
@@ -51,6 +51,22 @@ def test_a_periodic_motion_is_placed_next_to_the_guess() -> None:
     assert found.offset == pytest.approx(1.2, abs=0.02)
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.4, 2.0])
+def test_a_likely_correlation_is_no_more_than_the_correlation(offset: float) -> None:
+    """The same at the guess; far from it less, and the less motion there was the lesser."""
+    long, short = (
+        correlate_clocks(seen(0.0, 0.0, seconds, 1), seen(offset, 0.0, seconds, 2), 0.0, 3.0)
+        for seconds in (24.0, 12.0)
+    )
+    assert long is not None
+    assert short is not None
+    assert short.likely <= short.correlation
+    if offset == 0.0:
+        assert short.likely > short.correlation - 0.02
+    else:
+        assert short.correlation - short.likely > long.correlation - long.likely > 0.0
+
+
 def test_too_little_overlap_is_no_answer() -> None:
     a, b = seen(0.0, 0.0, 12.0, 1), seen(0.0, 0.0, 12.0, 2)
     assert correlate_clocks((a[0][:5], a[1][:5]), b, 0.0, 3.0) is None
@@ -83,6 +99,28 @@ def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
     for at, within in ((0.0, 0.008), (30.0, 0.005), (60.0, 0.008)):
         difference = (shifted[0] - plain[0]) + (shifted[1] - plain[1]) * at
         assert difference == pytest.approx(0.05 + 100e-6 * at, abs=within)
+
+
+def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
+    """The estimate is drawn to what they say, the less the more motion there was; to what cannot be, not at all."""
+    own, theirs = seen(0.0, 0.0, 60.0, 4), seen(0.02, 0.0, 60.0, 5)
+
+    def off(expected: float | None, windows: int) -> tuple[float, float]:
+        fit = ClockFit(0.0, None if expected is None else (expected, 2.0))
+        for start in 5.0 * np.arange(windows):
+            window = (own[0] > start) & (own[0] <= start + 5.0)
+            around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
+            fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
+        found = fit.solve()
+        assert found is not None
+        return found[0], found[2]
+
+    for windows in (3, 11):
+        plain, stddev = off(None, windows)
+        drawn, _ = off(-0.05, windows)
+        share = (stddev / RECEIPT_PRIOR) ** 2
+        assert 0.0 < plain - drawn < 2.0 * share * (plain + 0.05)
+        assert off(0.5, windows) == (plain, stddev)
 
 
 def test_an_offset_beyond_the_grid_is_no_answer() -> None:

@@ -19,6 +19,7 @@ from body_tracking.calibration.online import CalibrationParameters, CalibrationU
 from body_tracking.calibration.result import CalibrationResult
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.sensors.csv_recording import CsvRecording
+from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import about_y, frame, walk
 
@@ -120,6 +121,31 @@ def test_the_thesis_method_keeps_its_still_pose(shared_data: Path) -> None:
     assert yaws.pop() > NOMINAL["90deg"] + 5.0
 
 
+# --- simulated sensors, which err like real ones
+
+
+@pytest.mark.parametrize(
+    ("motion", "seed"),
+    [
+        ("shoulder_lifts", 1000),  # the reference sees the body turned around for seven seconds
+        ("hair_combing", 1001),  # and here in the only still pose
+        ("calf_raise", 1004),  # neither a still pose nor much that correlates
+        ("calf_raise", 1005),  # the first movement looks like another one
+        ("arm_raises", 2003),
+    ],
+)
+def test_people_who_stay_on_the_spot_are_enough(motion: str, seed: int) -> None:
+    recording = simulate(Setup(motion, seed=seed))
+    frames = tuple((each.sensor, each.skeletons[0], each.received_ns) for each in recording.frames)
+    result = run(frames)[0].finish()
+    one, two = (sensor.pose for sensor in recording.sensors)
+    turn = between(result)[0] @ (one.rotation.T @ two.rotation).T
+    assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 5.0
+    middle = int(recording.truths[0].stamps_ns[len(recording.truths[0].stamps_ns) // 2])
+    off = result.clocks["kinect2"].to_sensor(middle) - recording.sensors[1].clock.to_sensor(middle)
+    assert abs(off) < 0.05 * NANOSECONDS
+
+
 # --- laws, on a simulated walk
 
 ROTATION, TRANSLATION = about_y(-60.0), np.array([2.0, 0.0, 1.4])
@@ -166,6 +192,35 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
     assert values["kinect2 clock_from"] == "motion"
 
 
+@pytest.mark.parametrize("turned", ["kinect1", "kinect2"])
+@pytest.mark.parametrize("seconds", [5.0, 60.0])
+def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned: str, seconds: float) -> None:
+    """Neither at first, when one still pose is all there is, nor ever after."""
+    frames = tuple(
+        (name, seen.mirrored() if name == turned and now < seconds * NANOSECONDS else seen, now)
+        for name, seen, now in stream(10.0)
+    )
+    calibration, updates = run(frames)
+    poses = [update.result for update in updates if "kinect2" in update.result.poses]
+    assert poses
+    for result in (*poses, calibration.finish()):
+        assert yaw_error(result) < 10.0
+
+
+def test_a_pose_half_a_turn_off_is_put_right_at_once() -> None:
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    saved = run(stream(15.0))[0].result()
+    pose = saved.poses["kinect2"]
+    saved.poses["kinect2"] = replace(
+        pose, quat_xyzw=(Rotation.from_euler("z", 175, degrees=True) * Rotation.from_quat(pose.quat_xyzw)).as_quat()
+    )
+    calibration.load(saved)
+    for sensor, skeleton, received in stream(15.0):
+        for update in calibration.push(sensor, skeleton, received):
+            assert not 5.0 < yaw_error(update.result) < 170.0
+    assert yaw_error(calibration.current_update().result) < 5.0
+
+
 def test_a_joint_that_nobody_ever_sees_is_no_reason_to_warn() -> None:
     unseen = [Joint.FOOT_LEFT, Joint.FOOT_RIGHT]
 
@@ -192,6 +247,27 @@ def test_arrival_times_are_only_a_first_guess() -> None:
     assert_allclose(shaken.poses["kinect2"].translation, orderly.poses["kinect2"].translation, atol=1e-9)
     assert_allclose(shaken.poses["kinect2"].rotation, orderly.poses["kinect2"].rotation, atol=1e-9)
     assert shaken.clocks == orderly.clocks
+
+
+def test_the_times_of_receipt_tell_the_clock_of_somebody_who_does_not_move() -> None:
+    """To half a step of their grid; neither a burst at first nor single late frames matter."""
+    frames = stream(8.0, offset=0.45, still=8.0)
+    since = frames[0][2]
+    for held in (0.0, 1.3):  # kinect2's first frames arrive together
+        burst = tuple(
+            (name, seen, max(now, since + round(held * NANOSECONDS)) if name == "kinect2" else now)
+            for name, seen, now in frames
+        )
+        result = run(tuple(sorted(burst, key=lambda each: each[2])))[0].result()
+        assert result.clocks["kinect2"].offset == pytest.approx(0.45, abs=0.0201)
+        assert result.quality["kinect2"].clock_stddev == 0.05
+
+
+def test_neither_a_still_pose_nor_motion_that_tells_the_clock_is_needed() -> None:
+    """Noise hides both; half a minute of a walk still says where the sensor stands, if roughly."""
+    calibration, _ = run(stream(20.0, still=-5.0, noise=0.12))
+    assert calibration.status()[2]["kinect2 clock_from"] == "receipt"
+    assert yaw_error(calibration.result()) < 6.0
 
 
 def test_stamps_since_an_epoch_are_as_good_as_small_ones() -> None:
