@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
 from body_tracking.filters import orientation
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf import _HELD_STDDEV, _LIMIT_STDDEV, EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.orientation import PER_SOURCE, Sources
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import Ranges
@@ -290,6 +290,26 @@ def test_what_nothing_tells_keeps_its_deviation() -> None:
     stddev = np.sqrt(covariance.diagonal()[:3])
     assert (stddev[:2] < 0.5 * p.misalignment_stddev).all()
     assert stddev[2] > 0.7 * p.misalignment_stddev
+
+
+def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None:
+    """Else the next orientation would find the segment turned, and correct the source by a part of it, each time."""
+    person = somebody(13, 2.0, 0.01, HANDS)
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, in_order(person.skeletons, Source("forearm_left", stated=0.01).measure(person)))
+    held = estimator._state
+    assert held is not None
+    loose = held.but(sources=Sources.none(), covariance=held.covariance[:BODY, :BODY], crosses=held.crosses[:BODY])
+    row = np.eye(MODEL.nv)[PRONATION[:1]]
+    turned = []
+    for state in (held, loose):
+        pushed = estimator._pushed_back(state, row, np.array([0.5]))
+        before, after = (MODEL.turning(each.q, SEGMENT_NUMBER["forearm_left"])[0] for each in (state, pushed))
+        turned.append(np.linalg.norm(so3.log(so3.matrix_to_quat(after @ before.T))))
+        assert_allclose(pushed.sources.misalignment, state.sources.misalignment, rtol=0.0, atol=1e-12)
+    # about one axis the gain of a push is v / (v + limit^2), and held by a source v is less than held^2
+    limit, hold = np.radians(_LIMIT_STDDEV) ** 2, _HELD_STDDEV**2
+    assert turned[0] < 0.5 * hold / (hold + limit) < 0.5 * turned[1]
 
 
 @pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, 0.35)])
