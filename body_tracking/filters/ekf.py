@@ -125,6 +125,11 @@ _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
 _REST_NS = NANOSECONDS // 4
 """At least so long from one search for another pose to the next."""
+_MOST_ATTEMPTS = 4
+"""Times that the rest doubles where the strain is back soon after another pose was looked for: sensors that contradict
+each other are the cause then, and no pose is right for all of them."""
+_SOON = 4
+"""Rests after which it is another matter."""
 _LOOK_NS = NANOSECONDS // 2
 """The same where only a hand is suspected, which much noise makes it be time and again, and lengths stay as they are:
 these do not give way to a wrong hand, and its strain remains."""
@@ -372,6 +377,7 @@ class _State(_Changeable):
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
         attempted_ns: when another pose was looked for last.
+        attempts: how often that was, each time soon after the last.
         sources: of orientations.
         oriented_ns: stamp of the last accepted orientation.
         unplaced: started by orientations: nothing tells where the base is.
@@ -401,6 +407,7 @@ class _State(_Changeable):
     measured_at: float = 0.0
     fresh: bool = False
     attempted_ns: int = 0
+    attempts: int = 0
     sources: Sources = _NOBODY
     oriented_ns: int = 0
     unplaced: bool = False
@@ -1047,11 +1054,17 @@ class ExtendedKalmanFilter:
             elif back.any() and self._astray(state, measurement, back):
                 points, stddev = self._as_fitted(measurement, state)
                 state = self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
-            elif state.strain > _STRAINED or (
-                state.strain > _SUSPICIOUS and (not state.settled or state.stamp_ns - state.attempted_ns > _LOOK_NS)
-            ):
-                state = self._straightened(state, measurement).but(attempted_ns=state.stamp_ns)
+            elif state.strain > _SUSPICIOUS:
+                state = self._looked_anew(state, measurement)
         return self._within(self._bounded(self._measured(state, measurement)))
+
+    def _looked_anew(self, state: _State, measurement: _Measurement) -> _State:
+        """Look for another pose that fits better, the more seldom the more often that was of no use."""
+        elapsed, rest = state.stamp_ns - state.attempted_ns, _REST_NS << min(state.attempts, _MOST_ATTEMPTS)
+        if elapsed < rest or (state.strain < _STRAINED and state.settled and elapsed < _LOOK_NS):
+            return state
+        attempts = state.attempts + 1 if elapsed < _SOON * rest else 0
+        return self._straightened(state, measurement).but(attempted_ns=state.stamp_ns, attempts=attempts)
 
     def _predicted(self, state: _State, stamp_ns: int) -> _State:
         """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""

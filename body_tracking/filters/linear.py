@@ -52,6 +52,8 @@ _MAX_RANGE = 100.0
 _REFERENCE_DISTANCE = 2.0
 """Metres within which the measurement noise no longer shrinks."""
 _EYE3 = np.eye(3)
+_LEAST_VARIANCE = 1e-12
+"""Square metres: a covariance that claims less in any direction, a micrometre, is damaged, and cannot be inverted."""
 _SURPRISING, _MOST_SURPRISING = 4.0, 10.0
 """Times its expectation from which a normalised innovation squared raises the process noise, and up to which."""
 _MOST_LEVEL = np.log(200.0)
@@ -408,12 +410,12 @@ class LinearKalmanFilter:
         noise = np.where(measured[:, None, None], skeleton.covariances, _EYE3)
         try:
             sound_all = noise.max() < _MAX_RANGE**2  # False for NaN and infinity too
-            np.linalg.cholesky(noise)
+            np.linalg.cholesky(noise - _LEAST_VARIANCE * _EYE3)
         except np.linalg.LinAlgError:
             sound_all = False
         if not sound_all:
             noise[~(np.abs(noise) < _MAX_RANGE**2).all(axis=(1, 2))] = 0.0
-            sound = np.linalg.eigvalsh(noise)[:, 0] > 0.0
+            sound = np.linalg.eigvalsh(noise)[:, 0] > _LEAST_VARIANCE
             self.counters["damaged"] += int((~sound).sum())
             noise = np.where(sound[:, None, None], noise, self._modelled_noise(skeleton, positions, measured))
         return noise

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
@@ -347,6 +347,7 @@ def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
     states=arrays(np.uint8, (N_JOINTS,), elements=st.integers(0, 2)),
     covariance=arrays(np.float64, (3, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
 )
+@example(np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.uint8), np.full((3, 3), 1.28326561e-16))
 @settings(max_examples=60, deadline=None)
 def test_no_number_whatever_gets_into_the_state(
     model: str, positions: FloatArray, states: np.ndarray, covariance: FloatArray
