@@ -262,7 +262,7 @@ def main() -> int:
 
 
 def show(part: str, results: list[dict[str, Figures]]) -> dict[str, float]:
-    """Print the figures of some runs; the percent that errors are lower by with wrist sensors, and the turn with them."""
+    """Print the figures of some runs: how much lower errors are with wrist sensors (percent), and the turn then."""
     sums = {way: summary([each[way] for each in results]) for way in results[0]}
     print(f"{part}")
     for way, figures in sums.items():
