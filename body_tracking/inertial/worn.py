@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.kinematics import so3
 from body_tracking.sensors.imu import ImuSample, ImuWatch
@@ -24,6 +25,8 @@ NEAR_NS: Final = NANOSECONDS // 20
 """How far from a reading its rate tells the orientation."""
 UNKNOWN_HEADING: Final = np.pi**2 / 3.0
 """rad2: any heading."""
+_OTHER_FRAME = 50
+"""Readings of another frame in a row from which on it is the sensor's."""
 _SPACING_NS = NANOSECONDS // 55
 """Between readings that are kept: 50 of a second are enough for what they are kept for."""
 _DELAY_S = 15.0
@@ -41,6 +44,10 @@ _ELSEWHERE_S = 60.0
 """After so long the field is no disturbed one, but that of another place."""
 _TURNED, _TURNED_S = float(np.radians(60.0)) ** 2, 10.0
 """rad2 by which a disturbed field may turn the heading of a driver that is believed to follow it, and within what."""
+
+
+class WornSensorError(BodyTrackingError):
+    """A reading that cannot be of this sensor."""
 
 
 class ReceiptClock:
@@ -121,6 +128,8 @@ class WornSensor:
         self.received_ns: int | None = None
         self._magnetometer = magnetometer
         self._watch = ImuWatch()
+        self._frame: str | None = None
+        self._strange = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -155,14 +164,18 @@ class WornSensor:
     def reset(self) -> None:
         """Forget all readings, because time began anew."""
         self._begin()
+        self._watch = ImuWatch()
+        self._frame, self._strange = None, 0
         self.received_ns = None
 
     def take(self, sample: ImuSample, received_ns: int) -> Felt | None:
         """The orientation at a reading; None where there is none, or the reading is of no use.
 
         Raises:
+            WornSensorError: of another frame than those before; after many of these it is the sensor's.
             ImuOrientationError: neither orientation nor rate and acceleration.
         """
+        self._check_frame(sample.frame_id)
         self.counters["readings"] += 1
         if sample.orientation is None and self._oriented_ns is not None:
             if sample.stamp_ns - self._oriented_ns < OUTAGE_S * NANOSECONDS:
@@ -221,6 +234,20 @@ class WornSensor:
         return turned
 
     # --- one reading
+
+    def _check_frame(self, frame: str) -> None:
+        if frame == self._frame:
+            self._strange = 0
+            return
+        self._strange += 1
+        if self._frame is not None and self._strange < _OTHER_FRAME:
+            raise WornSensorError(f"{self.segment}: a reading of frame {frame!r}, expected {self._frame!r}")
+        if self._frame is not None:
+            self.counters["frame changes"] += 1
+            self._watch = ImuWatch()
+            self._begin()
+            self.growth = UNKNOWN_HEADING
+        self._frame, self._strange = frame, 0
 
     def _receive(self, sample: ImuSample, received_ns: int) -> None:
         """Look at the clock, and for how long nothing came."""
