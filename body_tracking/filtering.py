@@ -33,6 +33,7 @@ from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.skeleton import Skeleton
 
@@ -248,6 +249,22 @@ class FilterStage:
     def _waiting_ns(self, now_ns: int) -> int:
         """The time in the clock by which frames wait."""
         return now_ns if self._steady is None else self._steady()
+
+    def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
+        """The orientation of one segment, in ``world`` and in the reference's clock, as inertial sensors have it.
+
+        What it changes is published with the next frame; while none comes, with the predicted ones. Filters without a
+        model of the body have no use for it.
+
+        Args:
+            measurement: how it is turned.
+            now_ns: as above.
+        """
+        if self._model_filter is None:
+            return
+        self.poll(now_ns)
+        if self._model_filter.take_orientation(measurement) and self._prediction.due_ns is None:
+            self._prediction.arrived(measurement.stamp_ns, now_ns)
 
     def poll(self, now_ns: int) -> None:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""

@@ -12,7 +12,11 @@ from body_tracking import graph
 from body_tracking.calibration.result import level_pose
 from body_tracking.cdr import decode_skeletons
 from body_tracking.filtering import FilterSettings, FilterStage
+from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.simulation.random_people import (
+    MODEL,
+    START_NS,
     MeasurementErrors,
     RandomMotion,
     RandomPerson,
@@ -141,3 +145,26 @@ def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event
         _, published, _ = staged(kept, **settings)
         stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.FILTERED]
         assert len(stamps) > 50 and stamps == sorted(stamps)
+
+
+def test_orientations_alone_are_published_at_the_rate_of_predicted_frames() -> None:
+    rng = np.random.default_rng(4)
+    person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
+    times = np.arange(0.0, 3.0, 0.02)
+    rotations = MODEL.forward(motion.configuration(times), person.lengths).rotations
+    published: list[tuple[str, int]] = []
+    stage = FilterStage(
+        FilterSettings("ekf", sensors=SENSORS), lambda topic, cdr, stamp_ns: published.append((topic, stamp_ns))
+    )
+    linear = FilterStage(FilterSettings("lkf_constant_velocity"), lambda topic, cdr, stamp_ns: None)
+    for time, posture in zip(times, rotations, strict=True):
+        stamp_ns = START_NS + round(time * NANOSECONDS)
+        for number, name in enumerate(("pelvis", "upper_trunk", "forearm_left")):
+            rotation = posture[SEGMENTS.index(name)]
+            measurement = SegmentOrientation(stamp_ns + number, name, name, rotation, 1e-4 * np.eye(3))
+            stage.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
+            linear.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
+    stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
+    assert len(stamps) > 40 and stamps == sorted(stamps)  # 30 Hz of the 1.9 s after the start
+    assert stage.counters["orientations_used"] > 200
+    assert "orientations_used" not in linear.counters

@@ -12,6 +12,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.skeleton import Skeleton
 
 DEFAULT_FILTER = "lkf_constant_velocity"
@@ -53,6 +54,9 @@ class ModelFilter(SkeletonFilter, Protocol):
 
     def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """The same without making the filtered skeleton; whether there is something to say of its time."""
+
+    def take_orientation(self, measurement: SegmentOrientation) -> bool:
+        """Take the orientation of one segment; whether there is something to say of its time."""
 
     @property
     def filtered(self) -> Skeleton | None:

@@ -17,6 +17,8 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 - Ranges of motion bound what nothing observes. They enter as rarely as they would be new information.
 - Where a sensor takes the centres of the joints to be, beside the anatomical ones, never changes, is the same for all
   sensors of a kind, and so shows in no innovation. What it does to the pose is added to what is handed out.
+- Orientations of segments by inertial sensors come at their own times, and what their sources err by is estimated
+  behind the state of the body (``orientation``); without any of them nothing is there, and nothing is different.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -32,7 +34,9 @@ from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 from scipy.stats import chi2
 
-from body_tracking.filters.linear import check_fields
+from body_tracking.filters import orientation
+from body_tracking.filters.linear import FilterError
+from body_tracking.filters.orientation import PER_SOURCE, OrientationParameters, Sources
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import InverseKinematics
@@ -41,7 +45,8 @@ from body_tracking.kinematics.model import Linearisation, ModelError
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
-from body_tracking.parameters import number_field
+from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     BONES,
     N_JOINTS,
@@ -137,6 +142,8 @@ _FAR, _CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
+_SUDDEN_TURN = 60.0
+"""rad/s2, the same of a segment."""
 _DRAWING = 3.0
 """Squared Mahalanobis distance that a point is taken for which has been rejected for long."""
 _MOST_GROWN = 100.0
@@ -159,12 +166,29 @@ _ENOUGH_BLOCKS = 5
 """Seconds of frames from which on the lengths are what these say."""
 _LENGTHS_PERIOD = 0.75
 """Seconds that they are left alone for: several sensors' blocks of a second are brought in together."""
+_AHEAD_OF = 0.9
+"""Share of the period of the greatest rate from which on the next orientation counts: clocks jitter."""
+_TOGETHER_NS = NANOSECONDS // 125
+"""An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
+the motion model adds in the meantime (1 mrad) comes with the next one."""
+_HELD_STDDEV = 0.02
+"""Radians by which what moves a pose without any measurement may turn a segment whose orientation is measured."""
+_CONTRADICTION = 0.8
+"""Radians by which no other pose that points suggest may turn such a segment at once."""
+_LONGEST_WAIT_NS = NANOSECONDS // 10
+"""Orientations that nobody asks for wait no longer than this."""
+_SLIP_TIME = 0.5
+"""Seconds over which innovations of orientations are summed, to see them lean."""
+_SLIPPED = 30.0
+"""Squared normalised sum that a source which fits does not come to (chi-square with 3 degrees of freedom)."""
+_UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
+"""Metres and radians: of the base where orientations alone start the body."""
 _ANOTHER_SIZE = 1.2
 """Times that a person is larger or smaller than the one before, who must be another one."""
 
 
 @dataclass(frozen=True, slots=True)
-class EkfParameters:
+class EkfParameters(OrientationParameters):
     """The settings of the extended filter; each field's metadata says what it is, its unit and its range.
 
     Raises:
@@ -242,7 +266,7 @@ class EkfParameters:
     )
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_fields(self, "extended filter", FilterError)
 
 
 class _Changeable:
@@ -323,6 +347,9 @@ class _SensorState(_Changeable):
     stated: bool
 
 
+_NOBODY = Sources.none()
+
+
 @dataclass(frozen=True, eq=False)
 class _State(_Changeable):
     """Everything that changes; never written into, so that an earlier one can be gone on from.
@@ -330,13 +357,13 @@ class _State(_Changeable):
     Attributes:
         stamp_ns: of the state.
         q, lengths, velocity: the estimate.
-        covariance: (85, 85) of the tangent, the lengths and the velocities.
+        covariance: (85, 85) of the tangent, the lengths and the velocities; m more of m / 7 sources of orientations.
         log_density: (groups,) log of the spectral density of each group of coordinates.
         moved: (32,) faded sum of the corrections of the velocities.
         moved_variance: (32,) its variance, if all is right.
         sensors: what is known of each.
         slow_names: (n,) those with whose slow errors the state is correlated.
-        crosses: (85, 61 n) covariance of the state with the slow errors of these, in units of their deviation.
+        crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation.
         rejected_for: (19,) seconds.
         lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
         leaning: (19,) how many innovations it is worth.
@@ -351,6 +378,9 @@ class _State(_Changeable):
         fresh: started from a frame, without any after it.
         attempted_ns: when another pose was looked for last.
         attempts: how often that was, each time soon after the last.
+        sources: of orientations.
+        oriented_ns: stamp of the last accepted orientation.
+        unplaced: started by orientations: nothing tells where the base is.
     """
 
     stamp_ns: int
@@ -378,6 +408,9 @@ class _State(_Changeable):
     fresh: bool = False
     attempted_ns: int = 0
     attempts: int = 0
+    sources: Sources = _NOBODY
+    oriented_ns: int = 0
+    unplaced: bool = False
 
     def cross(self, name: str) -> FloatArray | None:
         """(85, 61) of ``crosses``, those of one sensor; None for zero."""
@@ -442,10 +475,11 @@ class ExtendedKalmanFilter:
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self._limb_points = self._limb_table()
         self._slow_size = 3 * self._points + len(self._limbs)
+        self._thumbs, self._by_thumbs = self._thumb_tables()
         # of the flat covariance the diagonals of its blocks: tangent, velocities, and between these
         t, v = self._tangent.start, self._velocities.start
-        starts = np.array([row * self._size + column for row, column in ((t, t), (v, v), (t, v), (v, t))])
-        self._diagonals: IntArray = starts[:, None] + (self._size + 1) * np.arange(self._nv)
+        self._diagonal_blocks = np.array([(t, t), (v, v), (t, v), (v, t)])
+        self._diagonals: dict[int, IntArray] = {}  # by the size of the covariance
         # of the points' covariance the blocks of each one alone, flat
         first = 3 * np.arange(self._points)[:, None] + np.arange(3)
         self._own: IntArray = (3 * self._points * first[:, :, None] + first[:, None, :]).astype(np.intp)
@@ -468,6 +502,12 @@ class ExtendedKalmanFilter:
                 "frame_changes",
                 "no_trunk",
                 "broken_covariances",
+                "orientations",
+                "orientations_used",
+                "orientations_rejected",
+                "orientations_late",
+                "orientations_refused",
+                "slips",
             ),
             0,
         )
@@ -478,11 +518,14 @@ class ExtendedKalmanFilter:
     def reset(self) -> None:
         """Forget the person; the counters stay."""
         self._last: _State | None = None
-        self._late: list[_Measurement] = []
+        self._late: list[_Measurement | SegmentOrientation] = []
         self._frame_id = ""
         self._newest: Skeleton | None = None
-        self._history: deque[tuple[_State, _Measurement]] = deque()
+        self._history: deque[tuple[_State, _Measurement | SegmentOrientation]] = deque()
         self._waiting: list[_Measurement] = []
+        self._turned_only: dict[str, SegmentOrientation] = {}
+        self._turned_since: int | None = None
+        self._newest_of: dict[str, int] = {}
         self._started_by: tuple[str, int] | None = None
         self._last_handed_out: tuple[_State, Linearisation, FloatArray] | None = None
         self._last_displaced: tuple[int, FloatArray] | None = None
@@ -527,16 +570,23 @@ class ExtendedKalmanFilter:
         """
         measurement = self._measurement(skeleton, sensor)
         state = self._last
-        if state is not None and measurement.stamp_ns >= state.stamp_ns:
+        if state is not None and measurement.stamp_ns >= state.stamp_ns and not self._is_awaited(measurement):
             state = self._state
         if state is not None and not self._in_time(measurement, state):
             return False
         state = self._last  # a jump of time may have reset it
         self.counters["frames"] += 1
-        if state is not None and measurement.stamp_ns < state.stamp_ns:
-            self.counters["late_frames"] += 1
+        if state is not None and state.unplaced:
+            return self._placed(measurement)
+        if state is not None and (self._is_awaited(measurement) or self._is_late(measurement, state)):
+            # orientations come sooner than frames of the same time, which are the newest of their kind all the same
+            overtaken = self._is_awaited(measurement) or bool((state.sources.stamps >= measurement.stamp_ns).any())
+            late = not overtaken or self._newest is None or measurement.stamp_ns < self._newest.stamp_ns
+            self.counters["late_frames"] += late
             self._late.append(measurement)
-            return False
+            if not late:
+                self._newest = skeleton
+            return not late
         self._newest = skeleton
         if state is None:
             self._frame_id = skeleton.frame_id
@@ -546,13 +596,46 @@ class ExtendedKalmanFilter:
             self._state = self._remember(state, measurement)  # else it was started from this frame, after a gap
         return True
 
+    def take_orientation(self, measurement: SegmentOrientation) -> bool:
+        """Take the orientation of one segment, at its own time among frames and others.
+
+        Where there are no skeletons, the body is started after ``start_after`` by orientations alone, its base at the
+        origin with a deviation that says that nothing tells where it is. The first skeletons then start it anew.
+
+        Returns:
+            Whether there is an estimate of about its time now: not where it is a repetition or came late.
+        """
+        self.counters["orientations"] += 1
+        state = self._last
+        if state is None:
+            return self._begun_turned(measurement)
+        if not self._orientation_in_time(measurement, state):
+            return False
+        state = self._last
+        if state is None:
+            return self._begun_turned(measurement)
+        late = self._is_late(measurement, state)
+        self.counters["orientations_late"] += late
+        # It waits until somebody asks: a camera's frame of an earlier time may still be to come before.
+        self._late.append(measurement)
+        if measurement.stamp_ns - state.stamp_ns > _LONGEST_WAIT_NS:
+            self._last = self._replay(state)
+        return not late
+
     @property
     def filtered(self) -> Skeleton | None:
         """The modelled joints after the last frame in its order, with covariances and velocities; None before a first.
 
         INFERRED where predicted, NOT_TRACKED where not modelled.
         """
-        return None if self._state is None or self._newest is None else self._output(self._state, self._newest)
+        if self._state is None:
+            return None
+        newest = self._newest
+        if newest is None:
+            if not self._state.unplaced:
+                return None
+            newest = self._empty(self._state.stamp_ns)
+        return self._output(self._state, newest)
 
     @property
     def estimate(self) -> ModelEstimate | None:
@@ -562,13 +645,13 @@ class ExtendedKalmanFilter:
     def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
         """What is to be expected at a later time, without any change of the filter; None where the person is lost."""
         state = self._state
-        if state is None or stamp_ns - int(state.used_ns.max()) > self.parameters.predict_for * NANOSECONDS:
+        if state is None:
+            return None
+        last_ns = max(int(state.used_ns.max()), state.oriented_ns)
+        if stamp_ns - last_ns > self.parameters.predict_for * NANOSECONDS:
             return None
         state = self._within(self._predicted(state, stamp_ns))
-        empty = Skeleton(
-            stamp_ns, self._frame_id, np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8), self._body()
-        )
-        return self._output(state, empty), self._estimate(state)
+        return self._output(state, self._empty(stamp_ns)), self._estimate(state)
 
     # --- input
 
@@ -598,6 +681,7 @@ class ExtendedKalmanFilter:
         elif elapsed > p.predict_for:
             self.counters["gaps"] += 1
             self._history.clear()
+            self._late.clear()
             started = self._first_state(measurement, state)
             if started is None:
                 return False  # what is known of person and sensors stays for the first frame that shows a trunk
@@ -621,7 +705,261 @@ class ExtendedKalmanFilter:
             return True
         own = measurement.sensor, measurement.stamp_ns
         taken = (*self._late, *(each for _, each in self._history))
-        return own == self._started_by or any((each.sensor, each.stamp_ns) == own for each in taken)
+        return own == self._started_by or any(
+            (each.sensor, each.stamp_ns) == own for each in taken if isinstance(each, _Measurement)
+        )
+
+    # --- orientations
+
+    def _orientation_in_time(self, measurement: SegmentOrientation, state: _State) -> bool:
+        """Whether to take an orientation. What one source says of the time resets nothing that cameras see."""
+        p = self.parameters
+        elapsed = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        alone = state.unplaced and (elapsed > p.predict_for or elapsed < -max(1.0, 2.0 * p.late_window))
+        if measurement.frame_id != self._frame_id or (elapsed > p.predict_for and not alone):
+            self.counters["orientations_refused"] += 1
+            return False
+        if alone:
+            self.counters["gaps" if elapsed > 0.0 else "backward_jumps"] += 1
+            self.reset()
+            return True
+        known = self._newest_of.get(measurement.source)
+        if known is None or measurement.stamp_ns > known:
+            self._newest_of[measurement.source] = measurement.stamp_ns
+        elif any(
+            each.stamp_ns == measurement.stamp_ns and each.source == measurement.source
+            for each in (*self._late, *(each for _, each in self._history))
+            if isinstance(each, SegmentOrientation)
+        ):
+            self.counters["repeated_stamps"] += 1
+            return False
+        if elapsed < -p.late_window:
+            self.counters["too_late"] += 1
+            return False
+        return True
+
+    def _begun_turned(self, measurement: SegmentOrientation) -> bool:
+        """Start the body by orientations alone, where no skeleton comes for some time."""
+        since, stamp_ns = self._turned_since, measurement.stamp_ns
+        if since is None or abs(stamp_ns - since) > (self.parameters.start_after + 1.0) * NANOSECONDS:
+            self._turned_only, since = {}, stamp_ns
+        self._turned_since = since = min(since, stamp_ns)
+        latest = self._turned_only.get(measurement.source)
+        if latest is None or latest.stamp_ns < stamp_ns:
+            self._turned_only[measurement.source] = measurement
+        seen = self._waiting and abs(self._waiting[-1].stamp_ns - stamp_ns) < self.parameters.start_after * NANOSECONDS
+        if seen or stamp_ns - since < self.parameters.start_after * NANOSECONDS:
+            return False
+        together = [each for each in self._turned_only.values() if each.frame_id == measurement.frame_id]
+        self._frame_id = measurement.frame_id
+        self._turned_only, self._turned_since, self._waiting = {}, None, []
+        q = orientation.pose_of(self.model, self.ranges, together)
+        unseen = np.full(self._points, np.inf)
+        state = self._new_state(measurement.stamp_ns, q, self.model.default_lengths(), unseen, None)
+        covariance = state.covariance.copy()
+        covariance[:3, :3] = _UNPLACED_STDDEV**2 * _EYE3
+        covariance[3:6, 3:6] = _UNTURNED_STDDEV**2 * _EYE3
+        self._state = self._remember(state.but(covariance=covariance, unplaced=True), measurement)
+        return True
+
+    def _placed(self, measurement: _Measurement) -> bool:
+        """Start anew by skeletons what orientations alone had started."""
+        self._history.clear()
+        self._late.clear()
+        began = self._begun(measurement)
+        if began is None:
+            return False
+        self._frame_id, self._newest = measurement.skeleton.frame_id, measurement.skeleton
+        self._state, self._newest_of = began, {}
+        return True
+
+    def _oriented(self, state: _State, measurement: SegmentOrientation) -> _State:
+        """A state corrected by an orientation, at its time; the same state where it comes too soon.
+
+        Raises:
+            LinAlgError: its covariance is none.
+        """
+        p, sources = self.parameters, state.sources
+        number = sources.find(measurement.source)
+        since = math.inf if number is None else (measurement.stamp_ns - int(sources.stamps[number])) / NANOSECONDS
+        if since < _AHEAD_OF / p.orientation_rate:
+            return state
+        before_ns = state.oriented_ns or measurement.stamp_ns
+        if measurement.stamp_ns - state.stamp_ns > _TOGETHER_NS:
+            state = self._predicted(state, measurement.stamp_ns)
+        segment = SEGMENT_NUMBER[measurement.segment]
+        heard = measurement.stamp_ns - sources.stamps <= p.forget_after * NANOSECONDS
+        if number is not None:
+            heard[number] &= segment == sources.segments[number]
+        if not heard.all():
+            state = self._forgotten(state, heard)
+        number = state.sources.find(measurement.source)
+        if number is None:
+            state = self._with_source(state, measurement)
+            number = len(state.sources) - 1
+        sources = state.sources
+        own = slice(self._size + PER_SOURCE * number, self._size + PER_SOURCE * (number + 1))
+        drift = sources.drifted(number, measurement)
+        if drift > 0.0:
+            covariance = state.covariance.copy()
+            covariance[own.start + 3, own.start + 3] += drift
+            state = state.but(covariance=covariance)
+
+        fade = math.exp(-since / _SLIP_TIME)
+        lean, leaning = fade * sources.lean[number], fade * fade * float(sources.leaning[number])
+        corrected, white = self._turned_by(state, measurement, number, own)
+        distance = float(white @ white)
+        if distance > self._gate:
+            # a segment may set off faster than it is expected to
+            sudden = 0.5 * _SUDDEN_TURN * min(since, _SUDDEN_TIME) ** 2
+            _, eased = self._turned_by(state, measurement, number, own, sudden, once=True)
+            near = float(eased @ eased) < self._gate
+        else:
+            near = True
+        lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
+        leaning += 1.0
+        fits = near and float(lean @ lean) < _SLIPPED * leaning
+        unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + min(since, p.slip_after)
+        if unfit_for > p.slip_after:
+            self.counters["slips"] += 1
+            state = state.but(covariance=orientation.slipped(state.covariance, own, p))
+            lean, leaning, unfit_for, near = np.zeros(3), 0.0, 0.0, True
+            corrected, _ = self._turned_by(state, measurement, number, own)
+        if near:
+            before, after = (m.covariance.diagonal()[self._velocities] for m in (state, corrected))
+            moved = state.moved + (corrected.velocity - state.velocity)
+            moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
+            dt = (measurement.stamp_ns - before_ns) / NANOSECONDS
+            state = corrected.but(
+                log_density=self._densities_learnt(state, moved, moved_variance, after, dt),
+                moved=moved,
+                moved_variance=moved_variance,
+                oriented_ns=measurement.stamp_ns,
+            )
+        self.counters["orientations_used" if near else "orientations_rejected"] += 1
+        looked_at = state.sources.looked_at(number, measurement, p, unfit_for, lean, leaning)
+        return self._within(self._bounded(state.but(sources=looked_at)))
+
+    def _turned_by(
+        self,
+        state: _State,
+        measurement: SegmentOrientation,
+        number: int,
+        own: slice,
+        sudden: float = 0.0,
+        *,
+        once: bool = False,
+    ) -> tuple[_State, FloatArray]:
+        """The Kalman update by an orientation, linearised anew until it is close; and (3,) the normalised innovation.
+
+        Args:
+            state: of the orientation's time.
+            measurement: the orientation.
+            number: of its source.
+            own: the rows of what is known of that.
+            sudden: radians that the segment may be ahead of what is expected.
+            once: only the innovation counts.
+        """
+        t, v = self._tangent, self._velocities
+        ahead = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        q = self.model.integrate(state.q, ahead * state.velocity) if ahead > 0.0 else state.q
+        correction, white = np.zeros(len(state.covariance)), np.zeros(3)
+        first: FloatArray | None = None
+        for left in reversed(range(_LINEARISATIONS)):
+            seen = orientation.expect(
+                self.model,
+                q,
+                state.sources,
+                number,
+                measurement.rotation,
+                None if first is None else correction[own],
+            )
+            by_tangent, by_source, innovation = seen.by_tangent, seen.by_source, seen.innovation
+            if first is not None:
+                for ball in self.model.ball_v:  # in the tangent of the state
+                    by_tangent[:, ball] = by_tangent[:, ball] @ so3.right_jacobian(correction[ball])
+                step = correction[t] + ahead * correction[v]
+                innovation = innovation + by_tangent @ step + by_source @ correction[own]
+            cross = by_tangent @ state.covariance[t] + by_source @ state.covariance[own]
+            if ahead > 0.0:
+                cross += by_tangent @ (ahead * state.covariance[v])
+            s = (cross[:, t] + ahead * cross[:, v]) @ by_tangent.T + cross[:, own] @ by_source.T
+            s.reshape(-1)[::4] += self.parameters.orientation_noise**2 + sudden**2
+            whitening = _whitening(s)
+            white = whitening @ innovation
+            first = white if first is None else first
+            if once:
+                break
+            gain = whitening @ cross
+            before, correction = correction, white @ gain
+            turned = float(np.abs(correction[3 : self._nv]).max())
+            if not left or turned < _FAR or np.abs(correction - before)[3 : self._nv].max() < _CLOSE:
+                break
+            step = correction[t] + ahead * (state.velocity + correction[v])
+            q = self.model.integrate(state.q, step)
+        assert first is not None
+        if once:
+            return state, first
+        covariance = state.covariance - gain.T @ gain
+        kalman = gain.T @ whitening
+        if state.settled:
+            correction[self._lengths] = 0.0
+            kalman[self._lengths] = 0.0
+            covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
+        if len(state.null):
+            for part in (correction[t], correction[self._velocities]):
+                part -= (state.null @ part) @ state.null
+        crosses = state.crosses
+        if crosses.shape[1]:
+            crosses = crosses - kalman @ (by_tangent @ (crosses[t] + ahead * crosses[v]) + by_source @ crosses[own])
+        if turned >= _FAR:
+            for ball in self.model.ball_v:
+                turn = so3.right_jacobian(correction[ball])
+                covariance[ball] = turn @ covariance[ball]
+                covariance[:, ball] = covariance[:, ball] @ turn.T
+                crosses[ball] = turn @ crosses[ball]
+        return self._moved(state.but(covariance=covariance, crosses=crosses), correction), first
+
+    def _with_source(self, state: _State, measurement: SegmentOrientation) -> _State:
+        """A state with one more source of orientations."""
+        sources, added = state.sources.with_new(measurement, self.parameters)
+        old = len(state.covariance)
+        covariance = np.zeros((old + PER_SOURCE, old + PER_SOURCE))
+        covariance[:old, :old] = state.covariance
+        covariance[old:, old:] = added
+        crosses = np.concatenate([state.crosses, np.zeros((PER_SOURCE, state.crosses.shape[1]))])
+        # what thumbs have said so far was said with too much confidence
+        doubtful = self._by_thumbs[sources.segments[-1]]
+        covariance[doubtful, doubtful] += self.ranges.stddev[doubtful - 6] ** 2
+        # what was unobserved may be so no longer
+        null = np.empty((0, self._nv))
+        return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
+
+    def _without_thumbs(self, state: _State, measurement: _Measurement) -> _Measurement:
+        """A frame without the thumbs of forearms or hands whose orientation is measured.
+
+        A thumb is all that tells a camera how a forearm is turned about itself, and it is off for as long as it looks
+        the same: by 50 degrees with a Kinect v2. Any alignment of an inertial sensor is better than what it would be
+        corrected to.
+        """
+        unseen = self._thumbs[state.sources.segments].any(axis=0)
+        return replace(measurement, measured=measurement.measured & ~unseen)
+
+    def _contradicts(self, state: _State, q: FloatArray) -> bool:
+        """Whether another pose turns a segment far from where a source that fits has it."""
+        segments = state.sources.segments[state.sources.unfit_for == 0.0]
+        if not len(segments):
+            return False
+        now, then = (self.model.forward(each, state.lengths).rotations[segments] for each in (state.q, q))
+        apart = so3.log(so3.matrix_to_quat(now @ then.swapaxes(-1, -2)))
+        return bool(((apart * apart).sum(axis=1) > _CONTRADICTION**2).any())
+
+    def _forgotten(self, state: _State, kept: BoolArray) -> _State:
+        """A state with some (n,) of its sources of orientations."""
+        rows = np.concatenate([np.ones(self._size, dtype=np.bool_), np.repeat(kept, PER_SOURCE)])
+        return state.but(
+            sources=state.sources.kept(kept), covariance=state.covariance[rows][:, rows], crosses=state.crosses[rows]
+        )
 
     # --- time
 
@@ -636,7 +974,19 @@ class ExtendedKalmanFilter:
     def _state(self, state: _State | None) -> None:
         self._last = state
 
-    def _remember(self, state: _State, measurement: _Measurement) -> _State:
+    def _is_late(self, measurement: _Measurement | SegmentOrientation, state: _State) -> bool:
+        """Whether it belongs before what was taken already."""
+        if measurement.stamp_ns < state.stamp_ns:
+            return True
+        return bool(self._history) and _order(self._history[-1][1]) > _order(measurement)
+
+    def _is_awaited(self, measurement: _Measurement) -> bool:
+        """Whether orientations of later times wait to be taken, before which it has its place."""
+        return any(
+            isinstance(each, SegmentOrientation) and each.stamp_ns >= measurement.stamp_ns for each in self._late
+        )
+
+    def _remember(self, state: _State, measurement: _Measurement | SegmentOrientation) -> _State:
         """Take a frame in its order, and keep what a later, older one would have to be put before."""
         horizon = measurement.stamp_ns - self.parameters.late_window * NANOSECONDS
         while self._history and self._history[0][1].stamp_ns < horizon:
@@ -655,19 +1005,29 @@ class ExtendedKalmanFilter:
         self._late = []
         if not late:
             return state
-        first_ns = min(each.stamp_ns for each in late)
+        first = min(map(_order, late))
         again = []
-        while self._history and self._history[-1][1].stamp_ns > first_ns:
+        while self._history and _order(self._history[-1][1]) > first:
             state, measurement = self._history.pop()
             again.append(measurement)
         self.counters["taken_again"] += len(again)
         # of frames of one stamp the late ones come last
-        for measurement in sorted(again[::-1] + late, key=lambda each: each.stamp_ns):
+        for measurement in sorted(again[::-1] + late, key=_order):
             state = self._remember(state, measurement)
         return state
 
-    def _step(self, state: _State, measurement: _Measurement) -> _State:
+    def _step(self, state: _State, measurement: _Measurement | SegmentOrientation) -> _State:
+        if isinstance(measurement, SegmentOrientation):
+            try:
+                return self._oriented(state, measurement)
+            except np.linalg.LinAlgError:
+                self.counters["broken_covariances"] += 1
+                unseen = np.full(self._points, np.inf)
+                anew = self._new_state(state.stamp_ns, state.q, state.lengths, unseen, None)
+                return anew.but(sensors=state.sensors, unplaced=state.unplaced)
         state = self._predicted(state, measurement.stamp_ns)
+        if state.sources.names:
+            measurement = self._without_thumbs(state, measurement)
         try:
             return self._taken(state, measurement)
         except np.linalg.LinAlgError:
@@ -726,11 +1086,16 @@ class ExtendedKalmanFilter:
             self._turned_back(part, turns)
             part[t] += reach * part[v]
             part[v] *= fade
+        sources = state.sources
+        if sources.names:
+            share = orientation.advance(p, self._size, sources, dt, self.parameters)
+            crosses.reshape(len(p), -1)[self._size :].reshape(len(sources), PER_SOURCE, -1)[:, 4:] *= share
+            sources = sources.faded(share)
         # covariance of the integrals of white noise over dt
         vv = 0.5 * tau * (1.0 - fade * fade)
         tv = 0.5 * reach * reach
         tt = tau * tau * (dt - 2.0 * reach + vv)
-        p.reshape(-1)[self._diagonals] += np.array([[tt], [vv], [tv], [tv]]) * density
+        p.reshape(-1)[self._diagonals_of(len(p))] += np.array([[tt], [vv], [tv], [tv]]) * density
 
         fading = math.exp(-dt / _WHITENESS_TIME)
         return state.but(
@@ -744,7 +1109,15 @@ class ExtendedKalmanFilter:
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
             fresh=False,
+            sources=sources,
         )
+
+    def _diagonals_of(self, size: int) -> IntArray:
+        """(4, 32) where a flat covariance of this size has the diagonals of its blocks."""
+        if size not in self._diagonals:
+            starts = self._diagonal_blocks @ [size, 1]
+            self._diagonals[size] = starts[:, None] + (size + 1) * np.arange(self._nv)
+        return self._diagonals[size]
 
     def _turned_back(self, errors: FloatArray, turns: FloatArray) -> None:
         """Turn the rows (85, n) of the base's and the shoulders' rotation in place, by (3, 3, 3) for each of these."""
@@ -799,7 +1172,7 @@ class ExtendedKalmanFilter:
                 strain=strain,
             )
 
-        correction = np.zeros(self._size)
+        correction = np.zeros(len(state.covariance))
         for left in reversed(range(_LINEARISATIONS)):
             s = seen.covariance
             s.reshape(-1)[self._own] = grown[:, None, None] * seen.own
@@ -834,7 +1207,7 @@ class ExtendedKalmanFilter:
             names, crosses = _without(names, crosses, measurement.sensor)
         elif measurement.sensor not in names and basis is not None:
             names = (*names, measurement.sensor)
-            crosses = np.concatenate([crosses, np.zeros((self._size, self._slow_size))], axis=1)
+            crosses = np.concatenate([crosses, np.zeros((len(crosses), self._slow_size))], axis=1)
         own_cross = None
         if names:
             # Slow errors are only considered (Schmidt 1966): C - K H C, and - K B of the sensor's own.
@@ -859,7 +1232,7 @@ class ExtendedKalmanFilter:
         predicted_variance = own.reshape(-1, _EYE3.size) @ _MEAN_VARIANCE - sensor.white
         foreseeable = float(predicted_variance[used].max()) < _FORESEEABLE**2
         slow_scale, slow_estimate, information = (
-            self._slow_learnt(sensor, measurement, whitening, white, rows)
+            self._slow_learnt(sensor, measurement, whitening, white, rows, bool(state.sources.names))
             if foreseeable  # elsewhere the linearisation errs by more than the sensor
             else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
         )
@@ -892,6 +1265,7 @@ class ExtendedKalmanFilter:
             lean=lean,
             leaning=leaning,
             strain=strain,
+            sources=state.sources if len(correction) == self._size else state.sources.moved(correction[self._size :]),
         )
 
     def _expected(
@@ -1014,6 +1388,7 @@ class ExtendedKalmanFilter:
         whitening: FloatArray,
         white: FloatArray,
         rows: slice | IntArray,
+        oriented: bool,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance.
 
@@ -1021,6 +1396,8 @@ class ExtendedKalmanFilter:
             (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
         """
         least = self._least_slow(sensor.white, measurement)
+        if oriented and measurement.skeleton.covariances is not None:
+            least[0] = max(least[0], self.parameters.slow_beside_orientations)
         # It changes slowly, and takes a while to compute.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
         # What is white is not known at first, and would be taken for slow.
@@ -1202,7 +1579,11 @@ class ExtendedKalmanFilter:
             if previous is not None and keep_lengths
             else self._lengths_covariance
         )
-        covariance = np.zeros((self._size, self._size))
+        sources = _NOBODY if previous is None else previous.sources
+        size = self._size + PER_SOURCE * len(sources)
+        covariance = np.zeros((size, size))
+        if previous is not None:
+            covariance[self._size :, self._size :] = previous.covariance[self._size :, self._size :]
         t, n, v = self._tangent, self._lengths, self._velocities
         covariance[t, t] = tangent + from_lengths @ lengths_covariance @ from_lengths.T
         covariance[t, n] = from_lengths @ lengths_covariance
@@ -1221,7 +1602,7 @@ class ExtendedKalmanFilter:
             zero,
             {} if previous is None else previous.sensors,
             (),
-            np.empty((self._size, 0)),
+            np.empty((size, 0)),
             np.zeros(self._points),
             np.zeros((self._points, 3)),
             np.zeros(self._points),
@@ -1232,6 +1613,7 @@ class ExtendedKalmanFilter:
             False if previous is None else previous.settled,
             SegmentLengths(self.parameters.slow_time) if previous is None else previous.seen,
             np.empty((0, self._nv)),
+            sources=sources,
         )
 
     def _reacquired(self, state: _State, measurement: _Measurement) -> _State:
@@ -1267,6 +1649,8 @@ class ExtendedKalmanFilter:
             other = not state.settled or not 1.0 / _ANOTHER_SIZE < size < _ANOTHER_SIZE
             fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
         except ModelError:
+            return state
+        if self._contradicts(state, fit.q) or (other and self._contradicts(state, fresh.q)):
             return state
         present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
@@ -1334,7 +1718,7 @@ class ExtendedKalmanFilter:
             off = state.lengths - lengths
             unlikely = 0.5 * float(off @ np.linalg.solve(self._lengths_covariance, off))
         fit = self.inverse.solve(points, stddev, lengths, state.q, tolerance=_CLOSE, alternatives=True)
-        if not self.inverse.is_turned(state.q, fit.q):
+        if not self.inverse.is_turned(state.q, fit.q) or self._contradicts(state, fit.q):
             return state
         stays = self.inverse.solve(points, stddev, state.lengths, state.q, tolerance=_CLOSE)
         if stays.cost + unlikely < fit.cost + _LIKELIER:
@@ -1402,6 +1786,19 @@ class ExtendedKalmanFilter:
             beyond[parts[first + 1 :], column] = 1.0
         return np.array(starts, dtype=np.intp), np.array(ends, dtype=np.intp), beyond
 
+    def _thumb_tables(self) -> tuple[BoolArray, list[IntArray]]:
+        """(12, 19) the thumb at the end of each segment, if any; and the coordinates that rest on it."""
+        thumbs = np.zeros((len(self.model.segment_names), self._points), dtype=np.bool_)
+        coordinates = [np.empty(0, dtype=np.intp) for _ in self.model.segment_names]
+        for number, name in enumerate(self.model.segment_names):
+            if name.startswith(("forearm", "hand")):
+                side = name.rsplit("_", 1)[1]
+                thumbs[number] = self.model.joints == Joint[f"THUMB_{side.upper()}"]
+                resting = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
+                places = [self.model.coordinate_names.index(f"{each}_{side}") for each in resting]
+                coordinates[number] = np.array(places, dtype=np.intp)
+        return thumbs, coordinates
+
     def _pose_prior(self) -> None:
         """What is known of a pose and of velocities without any measurement."""
         self._rest_information = np.full(self._nv, 1e-4)
@@ -1449,7 +1846,7 @@ class ExtendedKalmanFilter:
     def _turned(self, state: _State, q: FloatArray, signs: FloatArray) -> _State:
         """The same state told by another configuration, whose tangent has other signs (32,)."""
         self.counters["branches"] += 1
-        both = np.concatenate([signs, np.ones(self._nl), signs])
+        both = np.concatenate([signs, np.ones(self._nl), signs, np.ones(len(state.covariance) - self._size)])
         return state.but(
             q=q,
             velocity=state.velocity * signs,
@@ -1465,7 +1862,11 @@ class ExtendedKalmanFilter:
         frame to frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is
         brought back to what the ranges of motion say.
         """
-        jacobian = self.model.linearise(state.q, state.lengths).jacobian.reshape(-1, self._nv)
+        lines = self.model.linearise(state.q, state.lengths)
+        jacobian = lines.jacobian.reshape(-1, self._nv)
+        if state.sources.names:
+            turning = lines.rotation_jacobian[state.sources.segments].reshape(-1, self._nv)
+            jacobian = np.concatenate([jacobian, turning])
         _, singular, axes = np.linalg.svd(jacobian, full_matrices=False)
         null = axes[singular < _NULL * singular[0]]
         state = state.but(null=null)
@@ -1485,10 +1886,11 @@ class ExtendedKalmanFilter:
 
         Without this, an angle that nothing observes would wander with the noise of those that are.
         """
-        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+        cross_covariance = self._free(state)[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(stddev**2)
         correction = -cross_covariance @ np.linalg.solve(s, values)
         correction[self._velocities] = 0.0
+        correction[self._size :] = 0.0
         return self._moved(state, correction)
 
     def _within(self, state: _State) -> _State:
@@ -1540,10 +1942,28 @@ class ExtendedKalmanFilter:
 
         The covariance stays: that an angle is within its limits does not tell where.
         """
-        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+        cross_covariance = self._free(state)[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent]
         s[np.arange(len(s)), np.arange(len(s))] += np.radians(stddev) ** 2
-        return self._moved(state, -cross_covariance @ np.linalg.solve(s, excess))
+        correction = -cross_covariance @ np.linalg.solve(s, excess)
+        correction[self._size :] = 0.0  # as the covariance stays, sources would learn this again and again
+        return self._moved(state, correction)
+
+    def _free(self, state: _State) -> FloatArray:
+        """The covariance of all as far as orientations leave a pose free.
+
+        A pose that is moved without any measurement must not turn what a source says the turn of: the source would be
+        corrected instead, each time a little.
+        """
+        if not state.sources.names:
+            return state.covariance
+        turning = self.model.linearise(state.q, state.lengths).rotation_jacobian[state.sources.segments]
+        rows = turning.reshape(-1, self._nv)
+        cross = state.covariance[:, self._tangent] @ rows.T
+        s = rows @ cross[self._tangent]
+        s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
+        free: FloatArray = state.covariance - cross @ np.linalg.solve(s, cross.T)
+        return free
 
     def _moved(self, state: _State, correction: FloatArray) -> _State:
         """The state moved by a correction (85,)."""
@@ -1552,12 +1972,18 @@ class ExtendedKalmanFilter:
             q=self.model.integrate(state.q, correction[self._tangent]),
             lengths=lengths,
             velocity=state.velocity + correction[self._velocities],
+            sources=state.sources if len(correction) == self._size else state.sources.moved(correction[self._size :]),
         )
 
     # --- output
 
     def _body(self) -> int:
         return 0 if self._newest is None else self._newest.body
+
+    def _empty(self, stamp_ns: int) -> Skeleton:
+        """A frame that shows nothing."""
+        nowhere, unseen = np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8)
+        return Skeleton(stamp_ns, self._frame_id, nowhere, unseen, self._body())
 
     def _observation(self, lines: Linearisation) -> FloatArray:
         """(57, 53) derivative of the points by tangent and lengths."""
@@ -1588,12 +2014,25 @@ class ExtendedKalmanFilter:
                 (1.0 / (sensor.white + sensor.slow[0] * self._base_variance) for sensor in state.sensors.values()),
                 np.zeros(self._points),
             )
+            information = self._prior_information
+            if state.sources.names:
+                weights = np.where(self._thumbs[state.sources.segments].any(axis=0), 0.0, weights)
+                information = information + self._held(state, lines)
             weighted = self._observation(lines).T * weights.repeat(_DIMENSIONS)
-            gain = np.linalg.solve(weighted @ self._observation(lines) + self._prior_information, weighted)
+            gain = np.linalg.solve(weighted @ self._observation(lines) + information, weighted)
             offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
             displacement = gain * offsets.repeat(_DIMENSIONS)
             self._last_displaced = period, displacement @ displacement.T
         return self._last_displaced[1]
+
+    def _held(self, state: _State, lines: Linearisation) -> FloatArray:
+        """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""
+        own = state.covariance.diagonal()[self._size :].reshape(-1, PER_SOURCE)
+        variance = own.sum(axis=1) / _DIMENSIONS  # of misalignment, heading and what persists together, per axis
+        turning = lines.rotation_jacobian[state.sources.segments]
+        information = np.zeros((self._observed, self._observed))
+        information[self._tangent, self._tangent] = np.einsum("nij,nik,n->jk", turning, turning, 1.0 / variance)
+        return information
 
     def _estimate(self, state: _State) -> ModelEstimate:
         _, told = self._handed_out(state)
@@ -1627,6 +2066,11 @@ class ExtendedKalmanFilter:
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], _INFERRED)
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)
+
+
+def _order(measurement: _Measurement | SegmentOrientation) -> tuple[int, str]:
+    """Where it belongs among others: by its time; of the same time, frames come before orientations."""
+    return measurement.stamp_ns, measurement.source if isinstance(measurement, SegmentOrientation) else ""
 
 
 def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tuple[str, ...], FloatArray]:

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter, _State
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter, _Measurement, _State
 from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
@@ -463,7 +463,7 @@ class FixedLagSmoother:
         """Take over the states that the filter came to when it went back for a late frame."""
         while self._frames and self._frames[-1].state.stamp_ns > late.stamp_ns:
             self._frames.pop()
-        history = list(self.filter._history)
+        history = [(state, each) for state, each in self.filter._history if isinstance(each, _Measurement)]
         newest = self.filter._state
         assert newest is not None
         # it is not among them where it came late to the start, and was the first one of it

@@ -381,6 +381,24 @@ class UpperBody:
         by_lengths = self._counts[:, None, :] * along[..., None, :, :]
         return Linearisation(posture, jacobian, by_lengths, turning)
 
+    def turning(self, q: FloatArray, segment: int) -> tuple[FloatArray, FloatArray]:
+        """Of one segment alone what :meth:`linearise` says, in half the time.
+
+        Args:
+            q: (..., 35) configurations.
+            segment: its number in ``segment_names``.
+
+        Returns:
+            (..., 3, 3) its rotation to world, and (..., 3, 32) its angular velocity in world per tangent velocity.
+
+        Raises:
+            ModelError: the last dimension of ``q`` is another.
+        """
+        frames = self._frames(q)
+        turning = np.zeros((*frames.shape[:-3], 3, self.nv))
+        np.multiply(_directions(frames, self._axis_columns), self._turns[segment], out=turning[..., 3:])
+        return frames[..., segment, :, :], turning
+
     def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
         """Where the points are on average, beside where they are at the mean of the configuration.
 

@@ -172,6 +172,16 @@ def test_jacobian_of_the_rotations_against_differences() -> None:
     np.testing.assert_allclose(analytic, np.moveaxis(turned, 1, -1), rtol=0, atol=1e-7)
 
 
+def test_one_segment_turns_as_it_does_among_all() -> None:
+    q = _poses(10)
+    lines = MODEL.linearise(q, LENGTHS)
+    for segment in range(len(SEGMENTS)):
+        rotation, turning = MODEL.turning(q, segment)
+        np.testing.assert_array_equal(rotation, lines.posture.rotations[:, segment])
+        np.testing.assert_array_equal(turning, lines.rotation_jacobian[:, segment])
+        np.testing.assert_allclose(MODEL.turning(q[3], segment)[1], turning[3], rtol=0, atol=1e-14)
+
+
 def test_positions_are_linear_in_the_lengths() -> None:
     q, lengths = _poses(20), _lengths(20)
     linear = MODEL.linearise(q, lengths)

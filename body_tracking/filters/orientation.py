@@ -1,0 +1,399 @@
+"""Orientations of segments as measurements of the model's state: what is expected, and what their sources err by.
+
+A source says of its segment's rotation R to world
+
+    R_m = Exp(n) Exp(h z) Exp(g) R M,    M = Exp(m) M_0                                                   (1)
+
+with white noise n, an error h of its heading, an error g that persists for some seconds (of the filter in the source,
+of tissue), and a misalignment m with the segment. Heading and misalignment walk at random, g is a Gauss-Markov process
+whose variance is what the source states and what tissue adds. All seven numbers are estimated with the body; what they
+share with the pose (a forearm's misalignment about itself with its pronation) keeps its deviation, as nothing tells
+them apart. That holds as long as the linearisation has one direction for both whatever is found: the error m of the
+misalignment is told in the segment's frame, not in the sensor's, which turns with what is found (Huang, Mourikis and
+Roumeliotis 2010 on such false information). Errors of rotations are rotation vectors (Sola, Deray and Atchuthan 2018).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.parameters import number_field
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+
+PER_SOURCE: Final = 7
+"""Numbers of the state for each source: misalignment (3), heading, error that persists (3)."""
+_MISALIGNMENT, _HEADING, _SLOW = slice(0, 3), 3, slice(4, 7)
+_EYE3 = np.eye(3)
+_Z = np.array([0.0, 0.0, 1.0])
+_SMALL = 1e-4
+"""Radians below which the first terms of a series are exact."""
+
+_WALKS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+_HEADINGS = 8
+"""Headings of the base from which a pose is looked for."""
+_STEPS = 20
+_FARTHEST = 0.5
+"""Radians: no step of the search is longer."""
+_CONVERGED = 1e-4
+_FIT_STDDEV = 0.1
+"""Radians of an orientation, where a pose is looked for that fits several."""
+_UPRIGHT = 0.3
+"""Radians by which people's pelvises tilt."""
+
+
+@dataclass(frozen=True, slots=True)
+class OrientationParameters:
+    """How segment orientations are taken; each field's metadata says what it is, its unit and its range."""
+
+    misalignment_stddev: float = number_field(
+        0.06, "orientations: misalignment of a source with its segment per axis, before it is learnt", "rad", 1e-4, 3.0
+    )
+    misalignment_density: float = number_field(
+        3e-5, "orientations: spectral density of the random walk of the misalignment", "rad2/s", 0.0, 1.0
+    )
+    heading_stddev: float = number_field(
+        0.09,
+        "orientations: error of a source's heading, before it is learnt, where the source states no more",
+        "rad",
+        1e-4,
+        3.2,
+    )
+    heading_density: float = number_field(
+        3e-5,
+        "orientations: spectral density of the random walk of the heading, besides the growth that the source states",
+        "rad2/s",
+        0.0,
+        1.0,
+    )
+    tissue_stddev: float = number_field(
+        0.05, "orientations: what moving tissue adds to the stated errors, per axis", "rad", 0.0, 1.0
+    )
+    tissue_time: float = number_field(
+        2.0, "orientations: time for which stated errors and those of tissue persist", "s", 0.01, 1000.0
+    )
+    orientation_noise: float = number_field(
+        0.01, "orientations: white noise of each that is used, per axis", "rad", 1e-5, 1.0
+    )
+    orientation_rate: float = number_field(
+        50.0, "orientations: of a source that is faster no more than so many are used", "Hz", 1.0, 1000.0
+    )
+    slip_stddev: float = number_field(
+        0.35, "orientations: how far a sensor may have slipped whose orientations do not fit any more", "rad", 0.0, 3.2
+    )
+    slip_after: float = number_field(
+        0.4, "orientations: time for which they do not fit before the sensor has slipped", "s", 0.0, 60.0
+    )
+    forget_after: float = number_field(
+        30.0, "orientations: a source that is silent for longer is forgotten", "s", 0.1, 1e5
+    )
+    slow_beside_orientations: float = number_field(
+        1.0,
+        "orientations: beside them the variance of the slow errors of cameras is at least this share of what these "
+        "state: what a camera is always wrong by alike passes for a body of other proportions as long as nothing but "
+        "cameras sees it",
+        "1",
+        0.0,
+        9.0,
+    )
+    start_after: float = number_field(
+        1.0, "orientations: without a skeleton for so long the body is started by orientations alone", "s", 0.0, 60.0
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sources:
+    """What is known of n sources of orientations; never written into.
+
+    Attributes:
+        names: who.
+        segments: (n,) numbers of the segments that they sit on.
+        misalignment: (n, 3, 3) M.
+        heading: (n,) radians h.
+        slow: (n, 3) radians g.
+        slow_variance: (n, 3, 3) rad2, stationary, of g.
+        stated: (n,) rad2, the variance of the heading as it was stated last.
+        level: (n,) rad2, the least that it was stated.
+        stamps: (n,) nanoseconds, of the last orientation that was looked at.
+        unfit_for: (n,) seconds for which the orientations have not fit without a break.
+        lean: (n, 3) faded sum of the normalised innovations, whose covariance is the unit matrix times
+        leaning: (n,) this, if all is right.
+    """
+
+    names: tuple[str, ...]
+    segments: IntArray
+    misalignment: FloatArray
+    heading: FloatArray
+    slow: FloatArray
+    slow_variance: FloatArray
+    stated: FloatArray
+    level: FloatArray
+    stamps: NDArray[np.int64]
+    unfit_for: FloatArray
+    lean: FloatArray
+    leaning: FloatArray
+
+    @classmethod
+    def none(cls) -> Self:
+        """Nobody."""
+        zero, whole = np.zeros(0), np.zeros(0, dtype=np.intp)
+        cube = np.zeros((0, 3, 3))
+        return cls((), whole, cube, zero, np.zeros((0, 3)), cube, zero, zero, whole, zero, np.zeros((0, 3)), zero)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def find(self, name: str) -> int | None:
+        """Which one is of this name; None where nobody is."""
+        return self.names.index(name) if name in self.names else None
+
+    def _but(self, **changes: Any) -> Self:
+        return type(self)(**{name: getattr(self, name) for name in self.__slots__} | changes)
+
+    def moved(self, correction: FloatArray) -> Self:
+        """Corrected by (7 n,)."""
+        parts = correction.reshape(-1, PER_SOURCE)
+        turned = so3.quat_to_matrix(so3.exp(parts[:, _MISALIGNMENT])) @ self.misalignment
+        return self._but(
+            misalignment=turned, heading=self.heading + parts[:, _HEADING], slow=self.slow + parts[:, _SLOW]
+        )
+
+    def faded(self, share: float) -> Self:
+        """After a time in which what persists has faded to this share."""
+        return self._but(slow=share * self.slow)
+
+    def kept(self, which: BoolArray) -> Self:
+        """Some (n,) of them."""
+        names = tuple(name for name, kept in zip(self.names, which, strict=True) if kept)
+        return self._but(
+            names=names, **{each: getattr(self, each)[which] for each in self.__slots__ if each != "names"}
+        )
+
+    def with_new(self, measurement: SegmentOrientation, parameters: OrientationParameters) -> tuple[Self, FloatArray]:
+        """With one more, the last, and (7, 7) the covariance of what is known of it."""
+        slow_variance = _slow_variance(measurement.covariance, float(measurement.covariance[2, 2]), parameters)
+        stated = float(measurement.covariance[2, 2])
+        covariance = np.zeros((PER_SOURCE, PER_SOURCE))
+        covariance[_MISALIGNMENT, _MISALIGNMENT] = parameters.misalignment_stddev**2 * _EYE3
+        covariance[_HEADING, _HEADING] = max(parameters.heading_stddev**2, stated)
+        covariance[_SLOW, _SLOW] = slow_variance
+        never = measurement.stamp_ns - 3600 * NANOSECONDS
+        new = {
+            "segments": SEGMENT_NUMBER[measurement.segment],
+            "misalignment": _EYE3,
+            "heading": 0.0,
+            "slow": np.zeros(3),
+            "slow_variance": slow_variance,
+            "stated": stated,
+            "level": stated,
+            "stamps": never,
+            "unfit_for": 0.0,
+            "lean": np.zeros(3),
+            "leaning": 0.0,
+        }
+        grown = {name: np.append(getattr(self, name), [value], axis=0) for name, value in new.items()}
+        return self._but(names=(*self.names, measurement.source), **grown), covariance
+
+    def looked_at(
+        self,
+        number: int,
+        measurement: SegmentOrientation,
+        parameters: OrientationParameters,
+        unfit_for: float,
+        lean: FloatArray,
+        leaning: float,
+    ) -> Self:
+        """After one more orientation by one of them."""
+        stated = float(measurement.covariance[2, 2])
+        level = min(stated, float(self.level[number]))
+        new = {
+            "slow_variance": _slow_variance(measurement.covariance, level, parameters),
+            "stated": stated,
+            "level": level,
+            "stamps": measurement.stamp_ns,
+            "unfit_for": unfit_for,
+            "lean": lean,
+            "leaning": leaning,
+        }
+        changed = {name: getattr(self, name).copy() for name in new}
+        for name, value in new.items():
+            changed[name][number] = value
+        return self._but(**changed)
+
+    def drifted(self, number: int, measurement: SegmentOrientation) -> float:
+        """rad2 by which the heading has become less sure since the last orientation, as the source has it."""
+        return max(0.0, float(measurement.covariance[2, 2]) - float(self.stated[number]))
+
+
+def _slow_variance(covariance: FloatArray, level: float, parameters: OrientationParameters) -> FloatArray:
+    """(3, 3) rad2 of what persists for some seconds.
+
+    A heading without magnetometer is stated to grow less sure for ever. That is the heading's drift, which has a state
+    of its own; what the variance was at its least (``level``) is what comes and goes.
+    """
+    slow = covariance + parameters.tissue_stddev**2 * _EYE3
+    shrink = math.sqrt((level + parameters.tissue_stddev**2) / float(slow[2, 2]))
+    slow[2] *= shrink
+    slow[:, 2] *= shrink
+    return slow
+
+
+def advance(
+    covariance: FloatArray, first: int, sources: Sources, dt: float, parameters: OrientationParameters
+) -> float:
+    """Let time pass over the covariance (first + 7 n, ...) of all, in place; the share to which what persists fades."""
+    share = math.exp(-dt / parameters.tissue_time)
+    fades = np.ones((len(sources), PER_SOURCE))
+    fades[:, _SLOW] = share
+    covariance[first:] *= fades.reshape(-1, 1)
+    covariance[:, first:] *= fades.reshape(-1)
+    added = np.zeros((len(sources), PER_SOURCE, PER_SOURCE))
+    added[:, _SLOW, _SLOW] = (1.0 - share * share) * sources.slow_variance
+    added[:] += _WALKS[0] * (dt * parameters.misalignment_density) + _WALKS[1] * (dt * parameters.heading_density)
+    own = covariance[first:, first:]
+    for number, block in enumerate(added):
+        place = slice(PER_SOURCE * number, PER_SOURCE * (number + 1))
+        own[place, place] += block
+    return share
+
+
+def slipped(covariance: FloatArray, own: slice, parameters: OrientationParameters) -> FloatArray:
+    """The covariance of all after a source (its ``own`` rows) has slipped, or was switched off and on."""
+    covariance = covariance.copy()
+    variance = np.array([parameters.slip_stddev**2] * 3 + [parameters.heading_stddev**2] + [0.0] * 3)
+    covariance[own, own] += np.diag(variance)
+    return covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """An orientation against what was expected of it.
+
+    Attributes:
+        innovation: (3,) radians about the axes of world, Log(R_m R_p^T).
+        by_tangent: (3, 32) what a change of the configuration's tangent takes from it.
+        by_source: (3, 7) what a change of the source's numbers takes from it.
+    """
+
+    innovation: FloatArray
+    by_tangent: FloatArray
+    by_source: FloatArray
+
+
+def expect(
+    model: UpperBody,
+    q: FloatArray,
+    sources: Sources,
+    number: int,
+    measured: FloatArray,
+    correction: FloatArray | None = None,
+) -> Expected:
+    """What a source is expected to say, equation (1), against what it said.
+
+    Args:
+        model: the body.
+        q: (35,) configuration.
+        sources: known ones.
+        number: which of them.
+        measured: (3, 3) R_m.
+        correction: (7,) of what is known of the source; None for none.
+    """
+    rotation, turning = model.turning(q, int(sources.segments[number]))
+    misalignment, slow, heading = sources.misalignment[number], sources.slow[number], float(sources.heading[number])
+    if correction is not None:
+        turn, by_turn = _exp(correction[_MISALIGNMENT])
+        misalignment, slow = turn @ misalignment, slow + correction[_SLOW]
+        heading += float(correction[_HEADING])
+    cosine, sine = math.cos(heading), math.sin(heading)
+    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    persisting, by_persisting = _exp(slow)
+    before = level @ persisting
+    by_turning = before @ rotation
+    predicted = by_turning @ misalignment
+    innovation = so3.log(so3.matrix_to_quat(measured @ predicted.T))
+    # R_p changes to Exp(d) R_p, and the innovation by -J_r^-1 d
+    by_source = np.empty((3, PER_SOURCE))
+    by_source[:, _MISALIGNMENT] = by_turning if correction is None else by_turning @ by_turn
+    by_source[:, _HEADING] = _Z
+    by_source[:, _SLOW] = level @ by_persisting
+    inverse = so3.right_jacobian_inverse(innovation)
+    return Expected(innovation, inverse @ before @ turning, inverse @ by_source)
+
+
+def _exp(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) rotation of a rotation vector, and its left Jacobian (Sola eq. 134 and 145); both share their parts."""
+    cross = so3.skew(vector)
+    squared = cross @ cross
+    angle = math.sqrt(float(vector @ vector))
+    if angle < _SMALL:
+        first, second, third = 1.0, 0.5, 1.0 / 6.0
+    else:
+        first = math.sin(angle) / angle
+        second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        third = (1.0 - first) / angle**2
+    return _EYE3 + first * cross + second * squared, _EYE3 + second * cross + third * squared
+
+
+def pose_of(model: UpperBody, ranges: Ranges, measurements: Sequence[SegmentOrientation]) -> FloatArray:
+    """(35,) the likeliest pose, with the base at the origin, of a body whose segments are turned so.
+
+    Maximum a posteriori by Gauss-Newton steps from several headings of the base: what no orientation tells is in the
+    middle of its range, and the pelvis upright.
+    """
+    segments = np.array([SEGMENT_NUMBER[each.segment] for each in measurements], dtype=np.intp)
+    measured = np.stack([each.rotation for each in measurements])
+    lengths = model.default_lengths()
+    fits = []
+    for heading in 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS:
+        q = model.neutral()
+        q[model.quaternion_of("pelvis")] = so3.exp(heading * _Z)
+        fits.append(_fitted(model, ranges, q, lengths, segments, measured))
+    return min(fits, key=lambda fit: fit[1])[0]
+
+
+def _fitted(
+    model: UpperBody, ranges: Ranges, q: FloatArray, lengths: FloatArray, segments: IntArray, measured: FloatArray
+) -> tuple[FloatArray, float]:
+    """A configuration found from another one, and its cost."""
+    nv = model.nv
+    for _ in range(_STEPS):
+        lines = model.linearise(q, lengths)
+        rotations = lines.posture.rotations
+        errors = so3.log(so3.matrix_to_quat(measured @ rotations[segments].swapaxes(-1, -2)))
+        soft = ranges.soft_coordinates(q)
+        upright = np.zeros((2, nv))
+        upright[:, :] = so3.skew(-rotations[0, :, 2])[:2] @ lines.rotation_jacobian[0]
+        by_range = np.zeros((nv - 6, nv))
+        by_range[:, 6:] = soft.gradients
+        rows = np.concatenate(
+            [
+                lines.rotation_jacobian[segments].reshape(-1, nv) / _FIT_STDDEV,
+                by_range / ranges.stddev[:, None],
+                upright / _UPRIGHT,
+            ]
+        )
+        residuals = np.concatenate(
+            [
+                errors.reshape(-1) / _FIT_STDDEV,
+                (ranges.centre - soft.values) / ranges.stddev,
+                -rotations[0, :2, 2] / _UPRIGHT,
+            ]
+        )
+        information = rows.T @ rows
+        information[np.arange(nv), np.arange(nv)] += 1e-6
+        step = np.linalg.solve(information, rows.T @ residuals)
+        longest = float(np.abs(step).max())
+        q = model.integrate(q, step * min(1.0, _FARTHEST / max(longest, 1e-12)))
+        if longest < _CONVERGED:
+            break
+    return q, float(residuals @ residuals)

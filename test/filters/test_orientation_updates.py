@@ -1,0 +1,510 @@
+"""Orientations of segments in the extended filter: what they tell, what their sources err by, and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.linalg import expm
+
+from body_tracking.filters import orientation
+from body_tracking.filters.ekf import _HELD_STDDEV, _LIMIT_STDDEV, EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.orientation import PER_SOURCE, Sources
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import SEGMENTS, UNOBSERVED
+from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.simulation.random_people import (
+    MODEL,
+    START_NS,
+    Dropout,
+    MeasurementErrors,
+    RandomMotion,
+    RandomPerson,
+    Truth,
+    capture_times,
+    observe,
+    truth_of,
+)
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+
+NAMES = MODEL.coordinate_names
+PRONATION = [NAMES.index(f"forearm_pronation_{side}") for side in ("left", "right")]
+FOREARMS = ("forearm_left", "forearm_right")
+HANDS = tuple(Joint[f"{part}_{side}"] for part in ("HAND", "HAND_TIP", "THUMB") for side in ("LEFT", "RIGHT"))
+BODY = 85
+"""Numbers of the state without any source."""
+PERFECT = EkfParameters(
+    misalignment_stddev=1e-3,
+    misalignment_density=0.0,
+    heading_stddev=1e-3,
+    heading_density=0.0,
+    tissue_stddev=0.0,
+    orientation_noise=1e-3,
+)
+"""For sources that do not err."""
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody who moves, and what a camera sees of it."""
+
+    body: RandomPerson
+    motion: RandomMotion
+    truth: Truth
+    skeletons: tuple[Skeleton, ...]
+
+    def at(self, stamp_ns: int) -> FloatArray:
+        """(35,) the configuration."""
+        result: FloatArray = self.motion.configuration(np.array([(stamp_ns - START_NS) / NANOSECONDS]))[0]
+        return result
+
+
+def somebody(
+    seed: int, seconds: float, noise: float = 0.015, without: Sequence[Joint] = (), tempo: float = 1.0
+) -> Person:
+    rng = np.random.default_rng([seed, 5])
+    body = RandomPerson.draw(rng)
+    motion = RandomMotion(rng, seconds, tempo)
+    truth = truth_of(body, motion, capture_times(seconds, rng))
+    dropouts = (Dropout(-1.0, seconds, tuple(without)),) if without else ()
+    return Person(body, motion, truth, observe(truth, MeasurementErrors(noise, dropouts=dropouts), rng).skeletons)
+
+
+@dataclass(frozen=True)
+class Source:
+    """How a sensor errs: misalignment, heading, deviation and time of what persists; a slip at some time."""
+
+    segment: str
+    misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    heading: float = 0.0
+    slow: float = 0.0
+    slow_time: float = 2.0
+    slip: tuple[float, tuple[float, float, float]] | None = None
+    stated: float = 0.01
+    rate: float = 50.0
+
+    def measure(self, person: Person, seed: int = 0) -> list[SegmentOrientation]:
+        """Its orientations, by equation (1)."""
+        rng = np.random.default_rng([seed, SEGMENT_NUMBER[self.segment]])
+        seconds = float(person.truth.times[-1])
+        times = np.arange(0.0011 + 0.0007 * SEGMENT_NUMBER[self.segment], seconds, 1.0 / self.rate)
+        rotations = MODEL.forward(person.motion.configuration(times), person.body.lengths).rotations
+        keep = np.exp(-1.0 / (self.rate * self.slow_time))
+        drive = rng.normal(size=(len(times), 3))
+        slow = np.empty_like(drive)
+        slow[0] = drive[0]
+        for k in range(1, len(slow)):
+            slow[k] = keep * slow[k - 1] + np.sqrt(1.0 - keep**2) * drive[k]
+        mounting = np.tile(so3.quat_to_matrix(so3.exp(np.array(self.misalignment))), (len(times), 1, 1))
+        if self.slip is not None:
+            late = times > self.slip[0]
+            mounting[late] = so3.quat_to_matrix(so3.exp(np.array(self.slip[1]))) @ mounting[late]
+        turned = so3.quat_to_matrix(so3.exp(np.array([0.0, 0.0, self.heading])))
+        measured = turned @ so3.quat_to_matrix(so3.exp(self.slow * slow))
+        measured = measured @ rotations[:, SEGMENT_NUMBER[self.segment]] @ mounting
+        stamps = START_NS + np.round(times * NANOSECONDS).astype(np.int64)
+        return [
+            SegmentOrientation(int(stamp), f"imu_{self.segment}", self.segment, each, self.stated**2 * np.eye(3))
+            for stamp, each in zip(stamps, measured, strict=True)
+        ]
+
+
+def in_order(*parts: Iterable[Skeleton | SegmentOrientation]) -> list[Skeleton | SegmentOrientation]:
+    return sorted((each for part in parts for each in part), key=lambda each: each.stamp_ns)
+
+
+def feed(estimator: ExtendedKalmanFilter, events: Iterable[Skeleton | SegmentOrientation]) -> None:
+    for each in events:
+        give(estimator, each)
+
+
+def give(estimator: ExtendedKalmanFilter, event: Skeleton | SegmentOrientation) -> bool:
+    if isinstance(event, SegmentOrientation):
+        return estimator.take_orientation(event)
+    return estimator.take(event)
+
+
+def followed(
+    estimator: ExtendedKalmanFilter,
+    events: Iterable[Skeleton | SegmentOrientation],
+    person: Person,
+    after: float = 2.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (n, 32) and covariances (n, 32, 32) at the frames after so many seconds."""
+    errors, covariances = [], []
+    for each in events:
+        told = give(estimator, each)
+        if told and isinstance(each, Skeleton) and each.stamp_ns > START_NS + after * NANOSECONDS:
+            estimate = estimator.estimate
+            assert estimate is not None
+            errors.append(MODEL.difference(estimate.q, person.at(estimate.stamp_ns)))
+            covariances.append(estimate.covariance[: MODEL.nv, : MODEL.nv])
+    return np.array(errors), np.array(covariances)
+
+
+def rms(errors: FloatArray) -> float:
+    return float(np.degrees(np.sqrt((errors**2).mean())))
+
+
+def learnt(estimator: ExtendedKalmanFilter, source: Source) -> tuple[FloatArray, FloatArray]:
+    """(4,) errors of what is known of misalignment and heading, radians, and (4, 4) their covariance."""
+    state = estimator._state
+    assert state is not None
+    number = state.sources.find(f"imu_{source.segment}")
+    assert number is not None
+    right = so3.quat_to_matrix(so3.exp(np.array(source.misalignment)))
+    off = so3.log(so3.matrix_to_quat(right @ state.sources.misalignment[number].T))
+    begin = BODY + PER_SOURCE * number
+    covariance = state.covariance[begin : begin + 4, begin : begin + 4]
+    return np.append(off, source.heading - state.sources.heading[number]), covariance
+
+
+# --- equations
+
+
+def known_sources(rng: np.random.Generator) -> Sources:
+    sources = Sources.none()
+    for segment in rng.choice(SEGMENTS, 3, replace=False):
+        measurement = SegmentOrientation(0, f"imu_{segment}", str(segment), np.eye(3), 0.01 * np.eye(3))
+        sources, covariance = sources.with_new(measurement, EkfParameters())
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    return sources.moved(0.5 * rng.normal(size=PER_SOURCE * 3))
+
+
+def random_pose(rng: np.random.Generator) -> FloatArray:
+    return MODEL.integrate(MODEL.neutral(), 0.7 * rng.normal(size=MODEL.nv))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.booleans())
+def test_derivatives_of_an_orientation_against_differences(seed: int, corrected: bool) -> None:
+    rng = np.random.default_rng(seed)
+    q, sources, number = random_pose(rng), known_sources(rng), int(rng.integers(3))
+    measured = so3.quat_to_matrix(so3.exp(1.5 * rng.uniform(-1.0, 1.0, 3)))
+    about = 0.4 * rng.normal(size=PER_SOURCE)
+    step = 1e-6
+
+    def innovation(by_tangent: FloatArray, by_source: FloatArray) -> FloatArray:
+        moved = MODEL.integrate(q, by_tangent)
+        return orientation.expect(MODEL, moved, sources, number, measured, about * corrected + by_source).innovation
+
+    lines = orientation.expect(MODEL, q, sources, number, measured, about if corrected else None)
+    if np.linalg.norm(lines.innovation) > 2.8:
+        return  # at half a turn the shortest way jumps
+    for analytic, part in ((lines.by_tangent, 0), (lines.by_source, 1)):
+        for column in range(analytic.shape[1]):
+            change = [np.zeros(MODEL.nv), np.zeros(PER_SOURCE)]
+            change[part][column] = step
+            difference = (innovation(*change) - innovation(*(-each for each in change))) / (2.0 * step)
+            assert_allclose(-analytic[:, column], difference, rtol=0.0, atol=1e-6)
+
+
+def test_what_is_expected_is_the_equation() -> None:
+    rng = np.random.default_rng(1)
+    q, sources = random_pose(rng), known_sources(rng)
+    rotation = MODEL.forward(q, MODEL.default_lengths()).rotations[sources.segments[1]]
+    cross = so3.skew(np.stack([np.array([0.0, 0.0, sources.heading[1]]), sources.slow[1]]))
+    measured = expm(cross[0]) @ expm(cross[1]) @ rotation @ sources.misalignment[1]
+    assert_allclose(orientation.expect(MODEL, q, sources, 1, measured).innovation, 0.0, atol=1e-12)
+    noise = np.array([0.1, -0.2, 0.3])
+    found = orientation.expect(MODEL, q, sources, 1, expm(so3.skew(noise)) @ measured).innovation
+    assert_allclose(found, noise, rtol=0.0, atol=1e-12)
+
+
+def test_time_passes_over_the_covariance_of_sources_as_by_its_equation() -> None:
+    rng = np.random.default_rng(2)
+    sources, p, dt, size = known_sources(rng), EkfParameters(), 0.3, 5 + 3 * PER_SOURCE
+    root = rng.normal(size=(size, size))
+    before = root @ root.T
+    transition, noise = np.eye(size), np.zeros((size, size))
+    for number in range(3):
+        begin = 5 + PER_SOURCE * number
+        slow = slice(begin + 4, begin + 7)
+        transition[slow, slow] *= np.exp(-dt / p.tissue_time)
+        noise[slow, slow] = (1.0 - np.exp(-2.0 * dt / p.tissue_time)) * sources.slow_variance[number]
+        walks = [*[p.misalignment_density] * 3, p.heading_density]
+        noise[range(begin, begin + 4), range(begin, begin + 4)] = dt * np.array(walks)
+    after = before.copy()
+    share = orientation.advance(after, 5, sources, dt, p)
+    assert share == pytest.approx(np.exp(-dt / p.tissue_time))
+    assert_allclose(after, transition @ before @ transition.T + noise, rtol=1e-12, atol=1e-12)
+
+
+def test_a_heading_that_is_stated_to_drift_drifts() -> None:
+    """Its growth goes to the heading's own walk; what comes and goes is as large as it was at its least."""
+    steady = np.diag([1e-3, 1e-3, 4e-3])
+    first = SegmentOrientation(0, "a", "head", np.eye(3), steady)
+    later = replace(first, stamp_ns=NANOSECONDS, covariance=np.diag([1e-3, 1e-3, 0.1]))
+    p = EkfParameters(tissue_stddev=0.0)
+    sources, covariance = Sources.none().with_new(first, p)
+    assert covariance[3, 3] == p.heading_stddev**2
+    assert_allclose(sources.slow_variance[0], steady)
+    assert sources.drifted(0, later) == pytest.approx(0.096)
+    sources = sources.looked_at(0, later, p, 0.0, np.zeros(3), 0.0)
+    assert_allclose(sources.slow_variance[0], steady)
+    assert sources.drifted(0, later) == 0.0
+
+
+# --- in the filter
+
+
+def test_the_forearms_rotation_is_found_where_points_cannot_tell() -> None:
+    person = somebody(1, 4.0, 0.001, HANDS)
+    sources = [Source(segment, stated=1e-3) for segment in FOREARMS]
+    blind, seeing = ExtendedKalmanFilter(PERFECT), ExtendedKalmanFilter(PERFECT)
+    by_points, _ = followed(blind, person.skeletons, person)
+    with_orientations, _ = followed(
+        seeing, in_order(person.skeletons, *(source.measure(person) for source in sources)), person
+    )
+    assert rms(by_points[:, PRONATION]) > 15.0
+    assert rms(with_orientations[:, PRONATION]) < 1.0
+
+
+def test_a_misalignment_is_found_over_movement_and_its_covariance_covers_it() -> None:
+    person = somebody(2, 9.0, 0.01)
+    source = Source("upper_arm_left", (0.15, -0.15, 0.15), 0.1)  # 15 degrees
+    p = EkfParameters(misalignment_stddev=0.14, heading_stddev=0.17)
+    estimator = ExtendedKalmanFilter(p)
+    feed(estimator, in_order(person.skeletons, source.measure(person)))
+    error, covariance = learnt(estimator, source)
+    first = np.array([*[p.misalignment_stddev] * 3, p.heading_stddev])
+    assert np.linalg.norm(error[:3]) < np.radians(5.0) and abs(error[3]) < np.radians(5.0)
+    assert (np.sqrt(covariance.diagonal()) < 0.6 * first).all()
+    assert error @ np.linalg.solve(covariance, error) < 18.5  # chi-square with 4 degrees of freedom, 0.999
+
+
+def test_what_nothing_tells_keeps_its_deviation() -> None:
+    """Without hands, a forearm's misalignment about its own axis cannot be told from its rotation."""
+    person = somebody(3, 6.0, 0.01, HANDS)
+    source = Source("forearm_left", (0.1, 0.05, 0.2))
+    p = EkfParameters(misalignment_stddev=0.14)
+    estimator = ExtendedKalmanFilter(p)
+    feed(estimator, in_order(person.skeletons, source.measure(person)))
+    _, covariance = learnt(estimator, source)
+    stddev = np.sqrt(covariance.diagonal()[:3])
+    assert (stddev[:2] < 0.5 * p.misalignment_stddev).all()
+    assert stddev[2] > 0.7 * p.misalignment_stddev
+
+
+def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None:
+    """Else the next orientation would find the segment turned, and correct the source by a part of it, each time."""
+    person = somebody(13, 2.0, 0.01, HANDS)
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, in_order(person.skeletons, Source("forearm_left", stated=0.01).measure(person)))
+    held = estimator._state
+    assert held is not None
+    loose = held.but(sources=Sources.none(), covariance=held.covariance[:BODY, :BODY], crosses=held.crosses[:BODY])
+    row = np.eye(MODEL.nv)[PRONATION[:1]]
+    turned = []
+    for state in (held, loose):
+        pushed = estimator._pushed_back(state, row, np.array([0.5]))
+        before, after = (MODEL.turning(each.q, SEGMENT_NUMBER["forearm_left"])[0] for each in (state, pushed))
+        turned.append(np.linalg.norm(so3.log(so3.matrix_to_quat(after @ before.T))))
+        assert_allclose(pushed.sources.misalignment, state.sources.misalignment, rtol=0.0, atol=1e-12)
+    # about one axis the gain of a push is v / (v + limit^2), and held by a source v is less than held^2
+    limit, hold = np.radians(_LIMIT_STDDEV) ** 2, _HELD_STDDEV**2
+    assert turned[0] < 0.5 * hold / (hold + limit) < 0.5 * turned[1]
+
+
+@pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, 0.35)])
+def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, float]) -> None:
+    person = somebody(4, 7.0, 0.01)
+    source = Source("upper_arm_right", slip=(3.5, turn))
+    estimator = ExtendedKalmanFilter()
+    errors, covariances = followed(estimator, in_order(person.skeletons, source.measure(person)), person, 3.5)
+    arm = [k for k, name in enumerate(NAMES) if name.endswith("_right") and name.startswith(("shoulder", "elbow"))]
+    size = np.abs(errors[:, arm])
+    stddev = np.sqrt(covariances[:, arm, arm])
+    sound = (size < np.radians(10.0)) | (size < 2.0 * stddev)
+    assert sound.mean() > 0.97
+
+
+def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
+    observed = np.array([k for k, name in enumerate(NAMES) if name not in UNOBSERVED and k >= 6])
+    p, normalised = EkfParameters(), []
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 8])
+        person = somebody(30 + seed, 5.0)
+        sources = [
+            Source(
+                segment,
+                tuple(p.misalignment_stddev * rng.normal(size=3)),
+                p.heading_stddev * rng.normal(),
+                float(np.hypot(p.tissue_stddev, 0.01)),
+                p.tissue_time,
+            )
+            for segment in (*FOREARMS, "upper_trunk")
+        ]
+        events = in_order(person.skeletons, *(source.measure(person, seed) for source in sources))
+        errors, covariances = followed(ExtendedKalmanFilter(), events, person, 1.0)
+        for error, covariance in zip(errors[:, observed], covariances[:, observed][:, :, observed], strict=True):
+            normalised.append(error @ np.linalg.solve(covariance, error))
+    assert 0.5 < np.mean(normalised) / len(observed) < 1.6, np.mean(normalised) / len(observed)
+
+
+# --- time
+
+
+def test_the_order_of_arrival_does_not_matter() -> None:
+    person = somebody(5, 1.6)
+    sources = [Source(segment, (0.05, 0.0, 0.1), 0.1, 0.05) for segment in ("forearm_left", "head")]
+    events = in_order(person.skeletons, *(source.measure(person) for source in sources))
+    rng = np.random.default_rng(6)
+    late = rng.uniform(0.0, 0.15, len(events)) * (rng.random(len(events)) < 0.4)
+    late[:40] = 0.0
+    arrival = [each.stamp_ns + delay * NANOSECONDS for each, delay in zip(events, late, strict=True)]
+    one, other = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    feed(one, events)
+    feed(other, [events[k] for k in np.argsort(arrival, kind="stable")])
+    assert (
+        other.counters["orientations_late"] > 20
+        and other.counters["late_frames"] > 0
+        and other.counters["too_late"] == 0
+    )
+    assert one.estimate is not None and other.estimate is not None
+    for name in ("stamp_ns", "q", "velocity", "covariance", "lengths"):
+        assert_allclose(getattr(one.estimate, name), getattr(other.estimate, name), rtol=0.0, atol=1e-9)
+
+
+def test_orientations_of_one_stamp_count_alike_in_any_order() -> None:
+    person = somebody(6, 1.5)
+    stamps = {each.stamp_ns for each in person.skeletons}
+    rotations = {stamp: MODEL.forward(person.at(stamp), person.body.lengths).rotations for stamp in stamps}
+    sources = ("pelvis", "forearm_left", "hand_right")
+    results = []
+    for order in (1, -1):
+        estimator = ExtendedKalmanFilter()
+        told = 0
+        for skeleton in person.skeletons:
+            measured = [
+                SegmentOrientation(
+                    skeleton.stamp_ns, name, name, rotations[skeleton.stamp_ns][SEGMENT_NUMBER[name]], 1e-4 * np.eye(3)
+                )
+                for name in sources
+            ]
+            if estimator.estimate is None:
+                estimator.take(skeleton)
+                continue
+            told += sum(give(estimator, each) for each in [skeleton, *measured][::order] if isinstance(each, Skeleton))
+            feed(estimator, measured[::order])
+        assert told > 30
+        assert estimator.estimate is not None
+        results.append(estimator.estimate)
+    assert_allclose(results[0].q, results[1].q, rtol=0.0, atol=1e-9)
+    assert_allclose(results[0].covariance, results[1].covariance, rtol=0.0, atol=1e-9)
+
+
+def test_what_comes_in_vain_is_counted() -> None:
+    person = somebody(7, 2.5)
+    events = in_order(person.skeletons, Source("forearm_left").measure(person))
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, events)
+    last = next(each for each in reversed(events) if isinstance(each, SegmentOrientation))
+    before = estimator.estimate
+    assert before is not None
+    used = estimator.counters["orientations_used"]
+    assert not estimator.take_orientation(last)
+    assert estimator.counters["repeated_stamps"] == 1
+    assert not estimator.take_orientation(replace(last, stamp_ns=last.stamp_ns - NANOSECONDS, source="other"))
+    assert estimator.counters["too_late"] == 1
+    assert not estimator.take_orientation(replace(last, stamp_ns=last.stamp_ns + 1, frame_id="elsewhere"))
+    assert not estimator.take_orientation(replace(last, stamp_ns=last.stamp_ns + 100 * NANOSECONDS))
+    assert estimator.counters["orientations_refused"] == 2
+    after = estimator.estimate
+    assert after is not None and after.stamp_ns == before.stamp_ns
+    assert_allclose(after.q, before.q, rtol=0.0, atol=0.0)
+    assert estimator.counters["orientations_used"] == used
+
+
+def test_a_fast_source_counts_no_more_often_than_it_may() -> None:
+    person = somebody(8, 1.6)
+    estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=20.0))
+    feed(estimator, in_order(person.skeletons, Source("head", rate=400.0).measure(person)))
+    assert estimator.counters["orientations"] > 550
+    assert 20 < estimator.counters["orientations_used"] < 40
+
+
+def test_a_source_that_is_silent_for_long_is_forgotten() -> None:
+    person = somebody(9, 3.4)
+    orientations = Source("head").measure(person)
+    early = [each for each in orientations if each.stamp_ns < START_NS + NANOSECONDS]
+    late = [each for each in Source("forearm_left").measure(person) if each.stamp_ns > START_NS + 2 * NANOSECONDS]
+    estimator = ExtendedKalmanFilter(EkfParameters(forget_after=1.0))
+    feed(estimator, in_order(person.skeletons, early, late))
+    state = estimator._state
+    assert state is not None and state.sources.names == ("imu_forearm_left",)
+    assert state.covariance.shape == (BODY + PER_SOURCE, BODY + PER_SOURCE)
+    assert state.crosses.shape[0] == BODY + PER_SOURCE
+
+
+def test_a_source_that_moves_to_another_segment_is_another_one() -> None:
+    person = somebody(9, 2.0)
+    here = [each for each in Source("head").measure(person) if each.stamp_ns < START_NS + NANOSECONDS]
+    there = [each for each in Source("hand_left").measure(person) if each.stamp_ns > START_NS + NANOSECONDS]
+    moved = [replace(each, source="imu_head") for each in there]
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, in_order(person.skeletons, here, moved))
+    state = estimator._state
+    assert state is not None and state.sources.segments.tolist() == [SEGMENT_NUMBER["hand_left"]]
+
+
+# --- without a camera
+
+
+def test_a_pose_is_found_from_orientations() -> None:
+    """But for how it is drawn to the middle of its ranges, and upright."""
+    person = somebody(10, 1.0)
+    posture = MODEL.forward(person.truth.q[0], person.body.lengths)
+    measured = [
+        SegmentOrientation(0, name, name, rotation, 1e-4 * np.eye(3))
+        for name, rotation in zip(SEGMENTS, posture.rotations, strict=True)
+    ]
+    q = orientation.pose_of(MODEL, Ranges(MODEL), measured)
+    found = MODEL.forward(q, person.body.lengths).rotations
+    off = so3.log(so3.matrix_to_quat(found @ posture.rotations.swapaxes(-1, -2)))
+    assert np.degrees(np.linalg.norm(off, axis=-1)).max() < 10.0
+    assert_allclose(q[:3], 0.0, atol=1e-9)
+
+
+def test_orientations_alone_tell_the_angles_and_that_nothing_tells_the_place() -> None:
+    person = somebody(11, 5.0)
+    segments = ("pelvis", "upper_trunk", "head", *FOREARMS, "upper_arm_left", "upper_arm_right")
+    estimator = ExtendedKalmanFilter(PERFECT)
+    events = in_order(*(Source(segment, stated=1e-3).measure(person) for segment in segments))
+    errors = []
+    for each in events:
+        assert isinstance(each, SegmentOrientation)
+        if estimator.take_orientation(each) and each.stamp_ns > START_NS + 3 * NANOSECONDS:
+            estimate = estimator.estimate
+            assert estimate is not None
+            errors.append(MODEL.difference(estimate.q, person.at(estimate.stamp_ns)))
+    arms = [k for k, name in enumerate(NAMES) if name.startswith(("elbow", "forearm"))]
+    assert len(errors) > 300
+    assert rms(np.array(errors)[:, arms]) < 3.0
+    estimate = estimator.estimate
+    assert estimate is not None
+    assert (np.sqrt(estimate.covariance.diagonal()[:3]) > 50.0).all()
+    assert_allclose(estimate.q[:3], 0.0, atol=1e-3)
+    output = estimator.filtered
+    assert output is not None and output.covariances is not None
+    assert (np.linalg.eigvalsh(output.covariances[MODEL.joints])[:, -1] > 50.0**2).all()
+    assert estimator.predict(estimate.stamp_ns + NANOSECONDS) is not None
+
+
+def test_a_camera_that_comes_later_places_the_body() -> None:
+    person = somebody(12, 3.0)
+    frames = [each for each in person.skeletons if each.stamp_ns > START_NS + 1.5 * NANOSECONDS]
+    sources = [Source(segment, stated=0.01) for segment in ("pelvis", *FOREARMS)]
+    estimator = ExtendedKalmanFilter()
+    events = in_order(frames, *(source.measure(person) for source in sources))
+    errors, covariances = followed(estimator, events, person, 2.0)
+    assert len(errors) > 25
+    assert np.abs(errors[:, :3]).max() < 0.1
+    assert np.sqrt(covariances[:, :3, :3].diagonal(axis1=1, axis2=2)).max() < 0.1
+    assert estimator._state is not None and len(estimator._state.sources) == 3
