@@ -263,7 +263,7 @@ class OrientationEstimator:
         after = vqf.state
         up = _up(vqf.getQuat6D())
         self._budget.predict(interval, steps, self._step, up, middle - bias, before, after)
-        hidden = self._stretch.update(sample.stamp_ns / NANOSECONDS, rate)
+        hidden = self._stretch.update(steps * self._step, rate)
         if hidden is not None:
             self._budget.doubt(hidden.doubt**2)
             self._turn_by(hidden.angle)
@@ -336,6 +336,7 @@ class _ClippedRate:
 
     The rate of such an axis is taken for the cubic (Hermite) that has the rates and slopes just outside the stretch:
     with rates a, b, slopes a', b' and duration T it turns by ``T (a + b) / 2 + T^2 (a' - b') / 12``.
+    Slopes want the sensor's own clock, whose steps are even: the jitter of stamps does not average out in them.
     """
 
     def __init__(self, stop: float) -> None:
@@ -344,13 +345,14 @@ class _ClippedRate:
         self._open = False
         self._free = 0
 
-    def update(self, time: float, rate: FloatArray) -> _Hidden | None:
+    def update(self, interval: float, rate: FloatArray) -> _Hidden | None:
         """What was hidden, at the second reading after a stretch; None at all others.
 
         Args:
-            time: seconds.
+            interval: seconds since the reading before, whole steps of the sensor.
             rate: (3,) rad/s.
         """
+        time = (self._readings[-1][0] if self._readings else 0.0) + interval
         self._readings.append((time, rate))
         if self._at_stop(rate).any():
             # without two readings before there is no slope to go on from

@@ -207,9 +207,10 @@ def test_after_lost_readings_the_accelerometer_levels_the_sooner() -> None:
     assert tilt[times > 10.0].max() < 0.2 * tilt[np.searchsorted(times, 8.6)]
 
 
-def test_what_a_clipped_rate_hid_is_made_up_for() -> None:
+@pytest.mark.parametrize("stamp_jitter", [0.0, 0.004])
+def test_what_a_clipped_rate_hid_is_made_up_for(stamp_jitter: float) -> None:
     """Where the range is told: the swings have up to 286 degrees per second."""
-    samples = measured(replace(IDEAL, gyro_range=250.0), 10.0, motion=pivot)
+    samples = measured(replace(IDEAL, gyro_range=250.0, stamp_jitter=stamp_jitter), 10.0, motion=pivot)
     assert (np.abs(samples.angular_velocity) > np.radians(249.9)).any(axis=1).mean() > 0.1
     told, untold = (Run(samples, errors=errors) for errors in (InertialErrors(gyro_range=np.radians(250.0)), None))
     settled = told.times > 1.0
