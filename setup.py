@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 NAME = "body_tracking"
 NODES = [
     "kinect_skeleton",
+    "imu_skeleton",
     "calibration",
     "fusion",
     "skeleton_filter",

@@ -33,7 +33,7 @@ from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
-from body_tracking.orientation import SegmentOrientation
+from body_tracking.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.skeleton import Skeleton
 
@@ -68,6 +68,11 @@ ORDER_WAIT = Parameter(
     min=0.0,
     max=1.0,
     live=True,
+)
+ORIENTATIONS = Parameter(
+    "orientations",
+    (),
+    "ekf: segments whose orientations by inertial sensors it takes, from /imu/<segment>/orientation",
 )
 ANGLES = (
     Parameter(
@@ -115,6 +120,19 @@ class FilterSettings:
     body: str = graph.DEFAULT_BODY
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
+
+
+def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
+    """Of each segment in :data:`ORIENTATIONS` its topic, as segment by topic.
+
+    Raises:
+        OrientationError: the body has no such segment.
+    """
+    unknown = [segment for segment in segments if segment not in SEGMENT_NUMBER]
+    if unknown:
+        known = ", ".join(SEGMENT_NUMBER)
+        raise OrientationError(f"parameter 'orientations': {', '.join(unknown)}: expected some of {known}")
+    return {graph.orientation_topic(segment): segment for segment in segments}
 
 
 def filter_table() -> tuple[Parameter, ...]:

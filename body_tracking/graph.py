@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,7 @@ from body_tracking.messages import (
     CLOCK,
     DIAGNOSTICS,
     IMAGE,
+    IMU,
     JOINT_STATE,
     POINT_CLOUD,
     SEGMENTS,
@@ -45,6 +46,7 @@ FILTERED = "/filtered/skeleton"
 MODEL_STATE = "/filtered/model_state"
 MODEL_STATE_STDDEV = f"{MODEL_STATE}_stddev"
 MODEL_COVARIANCE = "/filtered/model_covariance"
+IMU_SKELETON = "/imu/skeleton"
 TRUE_SKELETON = "/ground_truth/skeleton"
 TRUE_MODEL_STATE = "/ground_truth/model_state"
 TRUE_ANGLES = "/ground_truth/joint_states"
@@ -55,8 +57,11 @@ CLOCK_TOPIC = "/clock"
 TF_STATIC = "/tf_static"
 START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
+ALIGN_SERVICE = "imu_skeleton/align"
 DEFAULT_SENSORS = ("kinect1", "kinect2")
 DEFAULT_BODY = "body1"
+SOME_IMUS = ("forearm_left", "forearm_right")
+"""Segments of which wrist-worn inertial sensors tell."""
 
 
 class GraphError(BodyTrackingError):
@@ -66,6 +71,71 @@ class GraphError(BodyTrackingError):
 def skeleton_topic(sensor: str) -> str:
     """Where a sensor's skeletons are published."""
     return f"/{sensor}{SKELETON_SUFFIX}"
+
+
+def orientation_topic(segment: str) -> str:
+    """Where the orientation of a segment by its inertial sensor is published."""
+    return f"/imu/{segment}/orientation"
+
+
+@dataclass(frozen=True, slots=True)
+class ImuTopics:
+    """Where the driver of a segment's inertial sensor publishes.
+
+    Attributes:
+        segment: on which it is.
+        imu: of ``sensor_msgs/Imu``, with orientation or raw.
+        mag: of ``sensor_msgs/MagneticField``.
+    """
+
+    segment: str
+    imu: tuple[str, ...]
+    mag: str
+
+
+def imu_topics(entries: Iterable[str]) -> tuple[ImuTopics, ...]:
+    """The topics of inertial sensors, as a parameter lists them.
+
+    Args:
+        entries: ``SEGMENT`` for ``/SEGMENT/imu/data``, ``data_raw`` and ``mag`` (REP-145), ``SEGMENT:NAME`` for another
+            name there, or ``SEGMENT:/TOPIC`` for a topic of Imu, with ``mag`` beside it.
+
+    Raises:
+        GraphError: an entry that is none, or a segment twice.
+    """
+    found = []
+    for entry in entries:
+        segment, colon, where = entry.partition(":")
+        if not segment or (colon and not re.fullmatch(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*", where)):
+            raise GraphError(f"inertial sensor {entry!r}: expected SEGMENT, SEGMENT:NAME or SEGMENT:/TOPIC")
+        if where.startswith("/"):
+            found.append(ImuTopics(segment, (where,), f"{where.rpartition('/')[0]}/mag"))
+        else:
+            base = f"/{where or segment}/imu"
+            found.append(ImuTopics(segment, (f"{base}/data", f"{base}/data_raw"), f"{base}/mag"))
+    names = [each.segment for each in found]
+    if len(set(names)) < len(names):
+        raise GraphError(f"a segment comes twice among the inertial sensors {', '.join(names)}")
+    return tuple(found)
+
+
+def played_imu_topics(entries: Iterable[str], there: Collection[str]) -> tuple[str, ...]:
+    """The topics of inertial sensors that a bag has.
+
+    Args:
+        entries: as of :func:`imu_topics`.
+        there: all topics of the bag.
+
+    Raises:
+        GraphError: as above, or a sensor of which the bag has nothing.
+    """
+    found: list[str] = []
+    for each in imu_topics(entries):
+        own = [topic for topic in each.imu if topic in there]
+        if not own:
+            raise GraphError(f"the bag has no topic {' nor '.join(each.imu)} of the inertial sensor on {each.segment}")
+        found += [*own, *([each.mag] if each.mag in there else [])]
+    return tuple(found)
 
 
 def joint_states_topic(body: str) -> str:
@@ -185,6 +255,22 @@ TOPICS: tuple[TopicSpec, ...] = (
         "`x y z` float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` uint16",
     ),
     TopicSpec(
+        IMU_SKELETON,
+        POINT_CLOUD,
+        SKELETON,
+        "imu_skeleton",
+        "the body that fits the orientations of inertial sensors, in `world`, with covariance as `/fused/skeleton`; "
+        "joints that these do not place are inferred",
+    ),
+    TopicSpec(
+        orientation_topic("<segment>"),
+        IMU,
+        SKELETON,
+        "imu_skeleton",
+        "the orientation of a segment in `world` with its covariance there, and its angular velocity about its own "
+        "axes, by an inertial sensor",
+    ),
+    TopicSpec(
         CALIBRATION,
         TRANSFORM,
         LATCHED,
@@ -284,6 +370,7 @@ TOPICS: tuple[TopicSpec, ...] = (
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
     (RESET_SERVICE, "calibration", "forget the calibration"),
+    (ALIGN_SERVICE, "imu_skeleton", "align the inertial sensors anew in the next pose that is held"),
     ("recorder/start", "bag_recorder", "record, into a new file of the same bag"),
     ("recorder/stop", "bag_recorder", "stop recording and close the bag"),
     ("bag_player/pause", "bag_player", "stand still"),
@@ -294,6 +381,7 @@ SERVICES: tuple[tuple[str, str, str], ...] = (
 
 EXECUTABLES: tuple[str, ...] = (
     "kinect_skeleton",
+    "imu_skeleton",
     "calibration",
     "fusion",
     "skeleton_filter",
@@ -356,6 +444,8 @@ class GraphOptions:
         angles_input: likewise: what the angles are made of.
         calibration_file: overrides the parameters file; empty for not.
         reliable: transport every skeleton reliably.
+        imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
+        imu_topics: of the bag, those that are played for these.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -368,6 +458,8 @@ class GraphOptions:
     angles_input: str = ""
     calibration_file: str = ""
     reliable: bool = False
+    imus: tuple[str, ...] = ()
+    imu_topics: tuple[str, ...] = ()
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -390,17 +482,23 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     asked = {"filter": options.filter_name, "input": options.filter_input}
     chosen: dict[str, Value] = {name: value for name, value in asked.items() if value}
     angles: dict[str, Value] = {"convention": role.convention, "input": role.angles_input}
+    worn = imu_topics(options.imus)
+    orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
     specs = [
         NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles}),
-        NodeSpec("skeleton_filter", "skeleton_filter", parameters={**several, **chosen}),
+        NodeSpec("skeleton_filter", "skeleton_filter", defaults=orientations, parameters={**several, **chosen}),
         NodeSpec("fusion", "fusion", parameters=several),
         NodeSpec("calibration", "calibration", parameters={**several, **calibration}),
     ]
+    if worn:
+        specs.append(
+            NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons})
+        )
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
     recorders = int(bool(options.record))
-    # Besides the next node and the recorder nobody is waited for.
-    to_filter = {FUSED: 1} if role.input == FUSED_INPUT else {FUSED: 0}
+    # Besides the next node and the recorder nobody is waited for; inertial sensors take their world from the fusion.
+    to_filter = {FUSED: int(role.input == FUSED_INPUT) + int(bool(worn))}
     to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
@@ -460,6 +558,8 @@ _FROM_FILE: Final = (
     ("angles_input", "joint_angles", "input"),
 )
 """(option, node, parameter) by which the nodes must know of each other, whoever says it."""
+_IMUS_FROM_FILE: Final = ("imus", "imu_skeleton", "segments")
+"""The same, of a list."""
 
 
 def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
@@ -476,12 +576,17 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
             # What is no string at all is refused by whoever checks the parameters.
             if isinstance(value, str) and not getattr(options, option) and matches(pattern, f"/{node}"):
                 found[option] = value
+        option, node, parameter = _IMUS_FROM_FILE
+        listed = values.get(parameter)
+        if isinstance(listed, list) and not getattr(options, option) and matches(pattern, f"/{node}"):
+            found[option] = tuple(entry for entry in listed if isinstance(entry, str) and entry)
     return replace(options, **found)
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag and with a recorder."""
-    variants = [options] + [replace(options, bag=bag, record="recording") for bag in ("", options.bag or "bag")]
+    """The nodes of a graph, and those that it would have live, with a bag, a recorder and inertial sensors."""
+    more = replace(options, record="recording", imus=options.imus or SOME_IMUS)
+    variants = [options] + [replace(more, bag=bag) for bag in ("", options.bag or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 
 
@@ -498,7 +603,7 @@ def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
     sections = {}
     for spec in sorted(all_nodes_for(GraphOptions()), key=lambda spec: EXECUTABLES.index(spec.executable)):
-        shown = {parameter for _, node, parameter in _FROM_FILE if node == spec.name}
+        shown = {parameter for _, node, parameter in (*_FROM_FILE, _IMUS_FROM_FILE) if node == spec.name}
         hidden = spec.parameters.keys() - shown
         sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
     return f"{CONFIG_HEADER}\n{as_yaml(sections)}"
@@ -506,11 +611,16 @@ def config_text() -> str:
 
 def _player(options: GraphOptions, sensors: Sequence[str], listeners: int, after: Mapping[str, int]) -> NodeSpec:
     topics = tuple(skeleton_topic(sensor) for sensor in sensors)
+    # one listener to each of these: the recorder comes later, or not at all
+    inertial = options.imu_topics
     parameters: dict[str, Value] = {
         "bag": options.bag,
         "rate": options.rate,
-        "topics": topics,
-        "wait_for_subscribers": tuple(f"{topic}:{listeners}" for topic in topics),
+        "topics": (*topics, *inertial),
+        "wait_for_subscribers": (
+            *(f"{topic}:{listeners}" for topic in topics),
+            *(f"{topic}:1" for topic in inertial),
+        ),
         "reliable": options.reliable,
     }
     # Every message comes with the clock anyway; each node pays for every tick.

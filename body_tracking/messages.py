@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample, check_magnetic_field
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
@@ -596,6 +598,54 @@ def message_to_magnetic_field(message: Any) -> tuple[int, str, FloatArray]:
 
 def _array(vector: Any) -> FloatArray:
     return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
+
+
+def orientation_to_message(measurement: SegmentOrientation, types: MessageTypes) -> Any:
+    """``sensor_msgs/Imu`` of a segment's orientation: rotation and covariance in a fixed frame, rate in its own.
+
+    The header's frame is that fixed frame, such as ``world``; which segment it is, the topic says.
+    """
+    absent = np.zeros((3, 3))
+    absent[0, 0] = -1.0
+    rate = measurement.angular_velocity
+    return imu_to_message(
+        measurement.stamp_ns,
+        measurement.frame_id,
+        np.zeros(3) if rate is None else rate,
+        np.zeros(3),
+        so3.matrix_to_quat(measurement.rotation),
+        (
+            measurement.covariance,
+            absent if rate is None else measurement.angular_velocity_variance * np.eye(3),
+            absent,
+        ),
+        types,
+    )
+
+
+def message_to_orientation(message: Any, segment: str) -> SegmentOrientation:
+    """The inverse of :func:`orientation_to_message`.
+
+    Raises:
+        MessageError: a covariance that has not nine elements, no orientation or none of its covariance.
+        ImuSampleError: numbers that are not finite, a quaternion that is none, no frame.
+        OrientationError: no orientation of that segment.
+    """
+    sample = message_to_sample(message)
+    if sample.orientation is None or sample.orientation_covariance is None:
+        raise MessageError(f"orientation of {segment}: without orientation, or without its covariance")
+    variance = float(message.angular_velocity_covariance[0])
+    rate = sample.angular_velocity if variance > 0.0 else None
+    return SegmentOrientation(
+        sample.stamp_ns,
+        f"imu_{segment}",
+        segment,
+        so3.quat_to_matrix(sample.orientation),
+        sample.orientation_covariance,
+        rate,
+        variance if rate is not None else 0.0,
+        sample.frame_id,
+    )
 
 
 # --- calibration

@@ -18,7 +18,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -123,6 +123,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already.
     """
     sensors = tuple(name for name in args.sensors.split(",") if name) if args.sensors else ()
+    topics: frozenset[str] = frozenset()
     if args.sensors is not None and not sensors:
         raise UpError("--sensors: no name")
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
@@ -134,6 +135,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         if not 0.01 <= args.rate <= 100.0:
             raise UpError(f"--rate {args.rate:g}: expected 0.01 to 100")
         with BagReader(args.bag) as reader:
+            topics = frozenset(reader.topics)
             there = graph.sensors_among(reader.topics)
         if not there:
             raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
@@ -153,7 +155,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
     )
-    return graph.with_file(options, args.params_file)
+    options = graph.with_file(options, args.params_file)
+    return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
 
 
 def parameters_for(

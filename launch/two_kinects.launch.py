@@ -3,6 +3,7 @@
 ros2 launch body_tracking two_kinects.launch.py bag:=/path/to/bag record:=/path/to/new/bag filter:=ekf
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
@@ -11,8 +12,9 @@ from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for, with_file
+from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for, played_imu_topics, with_file
 from body_tracking.parameters import to_ros
+from body_tracking.recording.rosbag2 import BagReader
 
 ARGUMENTS = {
     "sensors": (",".join(DEFAULT_SENSORS), "names of the sensors, the reference first"),
@@ -57,7 +59,11 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         calibration_file=given["calibration"],
     )
     file = Path(given["params_file"]) if given["params_file"] else None
-    nodes = [action(spec, given["params_file"]) for spec in nodes_for(with_file(options, file))]
+    options = with_file(options, file)
+    if options.bag and options.imus:
+        with BagReader(options.bag) as reader:
+            options = replace(options, imu_topics=played_imu_topics(options.imus, reader.topics))
+    nodes = [action(spec, given["params_file"]) for spec in nodes_for(options)]
     if given["bag"]:  # the player is the last one
         end = OnProcessExit(target_action=nodes[-1], on_exit=[Shutdown(reason="the bag has ended")])
         return [*nodes, RegisterEventHandler(end)]

@@ -2,9 +2,10 @@
 
 ``clock`` finds a clock's offset from motion, ``alignment`` how a sensor is turned against its segment, ``heading``
 keeps that and the heading of every sensor over time, ``detection`` finds exchanged and slipped sensors, ``posture``
-makes a configuration of the body model of segments' orientations. Arrays in, small dataclasses out; it knows
-``skeleton``, ``kinematics`` and the clock fit of ``calibration``, neither files nor ROS. The node ``imu_skeleton`` and
-the filters may import it.
+makes a configuration of the body model of segments' orientations. ``worn`` takes the readings of one sensor,
+``mounting`` says how it is meant to be put on, and ``tracking`` makes a source of all of it. Arrays in, small
+dataclasses out; it knows ``skeleton``, ``orientation``, ``kinematics``, the inertial readings of ``sensors`` and the
+clock fit of ``calibration``, neither files nor ROS. The node ``imu_skeleton`` and the filters may import it.
 
 Frames: *sensor*, that of the chip; *earth*, level with z up and a heading of its own for each sensor; *segment*, that
 of ``UpperBody``; *world*. With the alignment A (segment to sensor) and the heading psi (about z, earth to world)::

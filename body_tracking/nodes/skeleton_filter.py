@@ -1,4 +1,4 @@
-"""``/fused/skeleton``, or every sensor's skeletons, to ``/filtered/skeleton`` and the state of the body's model."""
+"""``/fused/skeleton``, or every sensor's skeletons and orientations, to ``/filtered/skeleton`` and a body's state."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -13,7 +13,7 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, TimeReference
+from sensor_msgs.msg import Image, Imu, JointState, MultiDOFJointState, PointCloud2, TimeReference
 from std_msgs.msg import String
 
 from body_tracking import graph
@@ -22,13 +22,15 @@ from body_tracking.filtering import (
     FILTER,
     INPUT,
     ORDER_WAIT,
+    ORIENTATIONS,
     PREDICT_AFTER,
     FilterSettings,
     FilterStage,
     filter_parameters,
     filter_table,
+    orientation_topics,
 )
-from body_tracking.messages import time_reference_to_clock, transform_to_pose
+from body_tracking.messages import message_to_orientation, time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import (
     BODY,
@@ -54,12 +56,15 @@ PARAMETERS = (
     BODY,
     ORDER_WAIT,
     PREDICT_AFTER,
+    ORIENTATIONS,
     *filter_table(),
     RELIABLE,
 )
 
 _CALIBRATIONS = 1000
 """Poses, and clocks, that may wait while the filter is busy; none is to be lost."""
+_ORIENTATIONS = 32
+"""Orientations of a segment that may wait likewise: half a second of them."""
 
 
 class SkeletonFilterNode(GraphNode):
@@ -79,6 +84,7 @@ class SkeletonFilterNode(GraphNode):
         """A new filter starts from the next frame on."""
         given: dict[str, Any] = dict(values)
         name = given["filter"]
+        orientation_topics(given["orientations"])
         settings = FilterSettings(
             name,
             filter_parameters(name, values),
@@ -141,6 +147,10 @@ class SkeletonFilterNode(GraphNode):
         for sensor in sensors:
             topic = graph.skeleton_topic(sensor)
             self.inputs.append(self.listen_to_skeletons(topic, partial(self.on_sensor, sensor)))
+        qos = self.skeleton_qos()
+        qos.depth = max(qos.depth, _ORIENTATIONS)
+        for topic, segment in orientation_topics(given["orientations"]).items():
+            self.inputs.append(self.listen(topic, Imu, qos, partial(self.on_orientation, segment)))
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""
@@ -164,6 +174,12 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         self.sent_ns = sent_ns
         self.stage.hold(sensor, skeletons, self.now_ns())
+
+    def on_orientation(self, segment: str, message: Any, sent_ns: int) -> None:
+        """How an inertial sensor has a segment; what it changes comes with the next frame."""
+        assert self.stage is not None
+        self.sent_ns = sent_ns
+        self.stage.on_orientation(message_to_orientation(message, segment), self.now_ns())
 
     def messages_taken(self) -> None:
         """Filter and publish what sensors have sent."""

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters
@@ -25,6 +25,7 @@ from body_tracking.filtering import (
     FILTER,
     INPUT,
     ORDER_WAIT,
+    ORIENTATIONS,
     PREDICT_AFTER,
     filter_parameters,
     filter_table,
@@ -32,10 +33,12 @@ from body_tracking.filtering import (
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings
+from body_tracking.inertial.tracking import TrackingParameters
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.recording.stages import JUMP_BACK_NS, ReplaySettings, Sink, Upstream, start_downstream
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
@@ -160,15 +163,19 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         topics = sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
-        passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in (*topics, *truth)}
+        inertial = () if settings.imus is None else graph.played_imu_topics(settings.imus.segments, bag.topics)
+        kept = (*topics, *truth, *inertial)
+        passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         downstream = start_downstream(settings, out, passed, overwrite=overwrite)
         try:
             upstream = Upstream(settings, downstream)
             progress = Progress(bag.start_ns, bag.end_ns)
             beside = _Passed(bag, truth, downstream)
+            felt = _Felt(bag, inertial, downstream, upstream, counters)
             started = False
             for sensor, skeleton, log_time_ns, cdr in skeletons_of(bag, topics, counters):
                 beside.until(log_time_ns)
+                felt.until(log_time_ns)
                 if not started:
                     started = True
                     upstream.start(log_time_ns)
@@ -176,6 +183,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
                 upstream.push(sensor, skeleton, log_time_ns)
                 progress.at(log_time_ns)
             beside.until(None)
+            felt.until(None)
             upstream.finish(bag.end_ns)
             written = downstream.finish()
         except BaseException:
@@ -186,6 +194,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             raise ReplayError(
                 f"{bag_path}: no frame of {', '.join(settings.sensors)} came through ({_listed(counters)})"
             )
+        if upstream.imus is not None:
+            counters.update({f"inertial {name}": count for name, count in upstream.imus.tracker.counters.items()})
         counters.update({f"fusion {name}": count for name, count in upstream.fusion.counters.items()})
         counters.update({f"filter {name}": count for name, count in written.counters.items()})
         return ReplayReport(
@@ -206,9 +216,30 @@ class _Passed:
         self._sink = sink
 
     def until(self, log_time_ns: int | None) -> None:
+        """All up to a log time, or all."""
         while self._next is not None and (log_time_ns is None or self._next.log_time_ns <= log_time_ns):
-            self._sink.take(self._next.topic, self._next.cdr, self._next.log_time_ns)
+            self._pass(self._next)
             self._next = next(self._messages, None)
+
+    def _pass(self, message: RawMessage) -> None:
+        self._sink.take(message.topic, message.cdr, message.log_time_ns)
+
+
+class _Felt(_Passed):
+    """Likewise messages of inertial sensors, which are tracked besides; malformed ones are counted."""
+
+    def __init__(
+        self, bag: BagReader, topics: Collection[str], sink: Sink, upstream: Upstream, counters: Counter[str]
+    ) -> None:
+        super().__init__(bag, topics, sink)
+        self._upstream, self._counters = upstream, counters
+
+    def _pass(self, message: RawMessage) -> None:
+        super()._pass(message)
+        try:
+            self._upstream.feel(message.topic, message.cdr, message.log_time_ns)
+        except BodyTrackingError:
+            self._counters[f"malformed {message.topic}"] += 1
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -266,11 +297,13 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     calibration, _ = parameters_for("calibration", CalibrationParameters, file, {**_SHARED, "calibration_file": ""})
     fusion, shared = parameters_for("fusion", FusionParameters, file, _SHARED)
     own = {**_SHARED, "body": ""}
-    filtering, _ = values_for("skeleton_filter", (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, *filter_table()), file, own)
+    table = (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, ORIENTATIONS, *filter_table())
+    filtering, _ = values_for("skeleton_filter", table, file, own)
     values_for("joint_angles", ANGLES, file, own)
     # What one node is told and another must know: from the command line, else from the file.
     chosen = graph.with_file(graph.GraphOptions(filter_name=args.filter or "", convention=args.convention or ""), file)
     filter_name = chosen.filter_name or DEFAULT_FILTER
+    imus = _imus_from(chosen, file)
     return ReplaySettings(
         tuple(args.sensors.split(",")) if args.sensors else (),
         args.reference or str(shared.get("reference", "")),
@@ -285,7 +318,22 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         fusion,
         filter_parameters(filter_name, filtering),
         args.calibration,
+        imus,
+        _names(filtering["orientations"]) or tuple(each.segment for each in graph.imu_topics(chosen.imus)),
     )
+
+
+def _imus_from(chosen: graph.GraphOptions, file: Path | None) -> ImuSettings | None:
+    """The inertial sensors that a parameters file lists; None where it lists none."""
+    values, _ = values_for("imu_skeleton", IMU_PARAMETERS, file, _SHARED)
+    if not chosen.imus:
+        return None
+    parameters: dict[str, Any] = fields_of(TrackingParameters, values)
+    return ImuSettings(chosen.imus, _names(values["mountings"]), TrackingParameters(**parameters))
+
+
+def _names(value: Value) -> tuple[str, ...]:
+    return value if isinstance(value, tuple) else ()
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -32,14 +32,18 @@ from body_tracking.filtering import (
     DEFAULT_PREDICT_AFTER,
     FilterSettings,
     FilterStage,
+    orientation_topics,
 )
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.imu_tracking import ImuSettings, ImuStage
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import AngleStream, state_estimate
 from body_tracking.messages import (
     IMAGE,
+    IMU,
     JOINT_STATE,
+    MAGNETIC_FIELD,
     POINT_CLOUD,
     SEGMENTS,
     STRING,
@@ -47,6 +51,8 @@ from body_tracking.messages import (
     TRANSFORM,
     clock_to_time_reference,
     cloud_to_skeletons,
+    message_to_orientation,
+    orientation_to_message,
     pose_to_transform,
     time_reference_to_clock,
     transform_to_pose,
@@ -80,6 +86,8 @@ class ReplaySettings:
         fusion: parameters of the fusion.
         filter_parameters: parameters of the filter.
         calibration_file: start from this calibration; None for none.
+        imus: inertial sensors, if there are any.
+        orientations: segments whose orientations by these the filter takes.
     """
 
     sensors: tuple[str, ...]
@@ -95,6 +103,8 @@ class ReplaySettings:
     fusion: FusionParameters = field(default_factory=FusionParameters)
     filter_parameters: Mapping[str, Any] = field(default_factory=dict)
     calibration_file: Path | None = None
+    imus: ImuSettings | None = None
+    orientations: tuple[str, ...] = ()
 
     def role(self) -> graph.FilterRole:
         """What the filter is to do.
@@ -133,11 +143,11 @@ class Sink(Protocol):
 
 
 class Upstream:
-    """Calibration and fusion, connected by their messages.
+    """Calibration, fusion and inertial sensors, connected by their messages.
 
     Args:
         settings: what to run.
-        sink: gets every message that the two publish.
+        sink: gets every message that they publish.
     """
 
     def __init__(self, settings: ReplaySettings, sink: Sink) -> None:
@@ -146,6 +156,7 @@ class Upstream:
         if settings.calibration_file is not None:
             self.calibration.load(load(settings.calibration_file))
         self.fusion = Fusion(settings.sensors, settings.fusion, reference)
+        self.imus = None if settings.imus is None else ImuStage(settings.imus)
         self._sink = sink
 
     def start(self, log_time_ns: int) -> None:
@@ -157,13 +168,36 @@ class Upstream:
         for update in self.calibration.push(sensor, skeleton, log_time_ns):
             self._calibrated(update, log_time_ns)
         for fused in self.fusion.push(sensor, skeleton, log_time_ns):
-            self._sink.take(graph.FUSED, encode_skeletons([fused]), log_time_ns)
+            self._fused(fused, log_time_ns)
+
+    def feel(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+        """One message of an inertial sensor.
+
+        Raises:
+            BodyTrackingError: it is of no use.
+        """
+        assert self.imus is not None
+        if topic in self.imus.mag:
+            self.imus.on_field(topic, deserialize(MAGNETIC_FIELD, cdr))
+            return
+        told = self.imus.on_imu(topic, deserialize(IMU, cdr), log_time_ns)
+        if told.orientation is not None:
+            message = serialize(orientation_to_message(told.orientation, BAG_MESSAGES))
+            self._sink.take(graph.orientation_topic(told.orientation.segment), message, log_time_ns)
+        if told.skeleton is not None:
+            self._sink.take(graph.IMU_SKELETON, encode_skeletons([told.skeleton]), log_time_ns)
 
     def finish(self, log_time_ns: int) -> None:
         """What still waits for a frame that does not come."""
         while self.fusion.deadline_ns is not None:
             for fused in self.fusion.poll(self.fusion.deadline_ns):
-                self._sink.take(graph.FUSED, encode_skeletons([fused]), log_time_ns)
+                self._fused(fused, log_time_ns)
+
+    def _fused(self, fused: Skeleton, log_time_ns: int) -> None:
+        cdr = encode_skeletons([fused])
+        self._sink.take(graph.FUSED, cdr, log_time_ns)
+        if self.imus is not None:
+            self.imus.on_skeleton(_decoded(cdr)[0], log_time_ns)
 
     def _calibrated(self, update: CalibrationUpdate, log_time_ns: int) -> None:
         result = update.result
@@ -214,6 +248,7 @@ class FilterAndAngles:
         self._angles = AngleStream(role.convention)
         self._of_model = role.angles_input == graph.MODEL_INPUT
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in settings.sensors}
+        self._orientations = orientation_topics(settings.orientations)
         self._last_ns: dict[str, int] = {}
         self._model_state = b""
         self._publish = publish
@@ -249,6 +284,9 @@ class FilterAndAngles:
                 self._filter.on_fused(_decoded(cdr)[0], log_time_ns)
         elif topic in self._sensors:
             self._seen(self._sensors[topic], _decoded(cdr), log_time_ns)
+        elif topic in self._orientations:
+            measurement = message_to_orientation(deserialize(IMU, cdr), self._orientations[topic])
+            self._filter.on_orientation(measurement, log_time_ns)
         elif topic == graph.CALIBRATION_CLOCK:
             self._filter.set_clock(*time_reference_to_clock(deserialize(TIME_REFERENCE, cdr)))
         elif topic == graph.CALIBRATION:
@@ -318,6 +356,10 @@ class Downstream:
             graph.FUSED: (POINT_CLOUD, SENSOR_DATA),
             **self._rest.published,
         }
+        if settings.imus is not None:
+            published[graph.IMU_SKELETON] = POINT_CLOUD, SENSOR_DATA
+            for each in graph.imu_topics(settings.imus.segments):
+                published[graph.orientation_topic(each.segment)] = IMU, SENSOR_DATA
         for topic, (type_name, qos) in {**topics, **published}.items():
             self._writer.add_topic(topic, type_name, qos)
 

@@ -15,7 +15,7 @@ from typing import Protocol
 from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import Skeleton
 
-RESERVED_NAMES = ("fused", "filtered", "ground_truth")
+RESERVED_NAMES = ("fused", "filtered", "ground_truth", "imu")
 """First parts of topics that are not sensors."""
 
 

@@ -1,0 +1,905 @@
+"""Inertial sensors as a source: readings in, orientations of segments and a skeleton in ``world`` out.
+
+Puts together what the other modules of this package find: each sensor's orientation in an earth of its own (``worn``),
+its alignment and heading by a pose, by elbows and by what a camera sees (``alignment``, ``heading``), its clock
+(``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``posture``).
+
+Clocks: everything comes out in the clock of the camera's skeletons, or in that of receipt where there is no camera. The
+times of receipt of both tell the offset to within what their transports differ by; motion tells that difference.
+
+Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
+all headings drifts, and says so.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.inertial.alignment import (
+    TISSUE_STDDEV,
+    Alignment,
+    Pose,
+    Stream,
+    align_in_pose,
+    mean_rotation,
+    pose_covariance,
+    pose_of,
+    pose_rotations,
+    still_periods,
+    wrapped,
+    yaw,
+)
+from body_tracking.inertial.clock import Turning, clock_offset
+from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by_motion, likelihood_by_pose
+from body_tracking.inertial.heading import HEADING_WALK, JOINTS, HeadingTracker, bone_of
+from body_tracking.inertial.mounting import mountings as meant_mountings
+from body_tracking.inertial.posture import OrientationKinematics
+from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, ReceiptClock, WornSensor
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.lengths import SkeletonLengths
+from body_tracking.kinematics.upper_body import PARENTS, UpperBody
+from body_tracking.measurement import BASE_STDDEV, body_heading
+from body_tracking.orientation import SegmentOrientation
+from body_tracking.parameters import number_field
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
+
+AUTO, T_POSE, ARMS_DOWN = "auto", "t_pose", "arms_down"
+OWN, SHARED, REFERENCE = "own", "shared", "reference"
+_POSES: Final[Mapping[str, Pose]] = {T_POSE: "t", ARMS_DOWN: "n"}
+
+_JUMP_NS = NANOSECONDS
+_STEP_NS = NANOSECONDS // 10
+"""How often what changes slowly is looked at."""
+_POSE_S, _POSE_EVERY_S = 1.6, 0.25
+"""Seconds of readings in which a pose is looked for, and how often."""
+_ASKED_S = 15.0
+"""Seconds within which a pose that was asked for must be held."""
+_FACING = float(np.radians(8.0))
+"""Radians by which a skeleton's shoulders tell wrongly where a person faces."""
+_CAMERA_CONE = float(np.radians(40.0))
+"""Radians within which a camera sees the arms as a pose has them."""
+_CAMERA_LASTS = 12.0
+"""Times as long as ``heading`` has it that a camera misreads a bone alike, by where it takes people's joints to be."""
+_CAMERA_SLIPS = 3.0
+"""The same for what looks like a slip: of what lasts longer, part is there before and after."""
+_ALONE_S = 5.0
+"""Seconds after which a camera that has shown nobody is not waited for."""
+_FRESH_NS = NANOSECONDS // 2
+_PENDING_NS = NANOSECONDS // 20
+"""A skeleton waits so long for the readings around it."""
+_ELBOW_S = 0.5
+_DRIFT_S, _LOST = 1.0, 0.05
+"""Seconds between two looks at drift, and rad2 at once by which a heading is lost rather than drifts."""
+_CLOCK_EVERY_S, _CHECK_EVERY_S, _LOOK_BACK_S = 3.0, 5.0, 30.0
+_CLOCK_WINDOW = 0.5
+_TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
+"""Seconds by which transports differ, per root second by which that changes, and that motion tells at best."""
+_SLIP_WINDOWS = 6.0, 18.0
+"""Seconds: large slips are seen soon, those hardly larger than a camera's errors late."""
+_NAMED_S = 60.0
+"""Seconds for which a slip is told."""
+_FAR_HEADING = 0.5
+"""Radians of a heading's deviation from which it counts as unknown."""
+_MAGNETIC_WALK = 0.1 * HEADING_WALK
+_RATE_STDDEV, _RATE_SHARE = 0.05, 0.1
+"""rad/s, and share of itself, that a segment's rate is off, mostly by the flesh."""
+_BASE_STDDEV, _BASE_UNKNOWN = 0.05, 1.0
+"""Metres: of the base where a camera sees it, and where nobody knows."""
+_BASE_WALK = 0.3
+"""Metres per root second that the base is known less well when the camera does not see it."""
+_STANDING: Final = np.array([0.0, 0.0, 1.0])
+_EYE3 = np.eye(3)
+_SMALL: Final = 1e-4 * np.eye(3)
+_CARRIERS: Final = {
+    "SPINE_BASE": "pelvis",
+    "HIP": "pelvis",
+    "SPINE_MID": "lower_trunk",
+    "SPINE_SHOULDER": "upper_trunk",
+    "NECK": "upper_trunk",
+    "HEAD": "head",
+    "SHOULDER": "clavicle",
+    "ELBOW": "upper_arm",
+    "WRIST": "forearm",
+    "HAND": "hand",
+    "HAND_TIP": "hand",
+    "THUMB": "hand",
+}
+"""Of each kind of joint the segment that it is a point of."""
+_LITTLE_MOVED: Final = ("lower_trunk", "clavicle_left", "clavicle_right")
+_TRUNK: Final = ("pelvis", "upper_trunk")
+
+
+class InertialTrackingError(BodyTrackingError):
+    """Sensors that cannot be tracked as was asked for."""
+
+
+def _choice(default: str, doc: str, *choices: str) -> Any:
+    return field(default=default, metadata={"doc": doc, "choices": choices})
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingParameters:
+    """What inertial sensors are taken for; each field's metadata says what it is, its unit and its range."""
+
+    pose: str = _choice(
+        AUTO,
+        "in which pose the sensors are aligned with the body: T-pose with palms down, or arms hanging with thumbs "
+        "forward; auto: the first of the two that is held for a second",
+        AUTO,
+        T_POSE,
+        ARMS_DOWN,
+    )
+    camera: bool = field(
+        default=True,
+        metadata={"doc": "take headings, slips and clocks from a camera's skeletons; false: inertial sensors alone"},
+    )
+    clock: str = _choice(
+        OWN,
+        "own: each sensor has a clock of its own; shared: all have the same; reference: they have that of world",
+        OWN,
+        SHARED,
+        REFERENCE,
+    )
+    magnetometer: bool = field(
+        default=True, metadata={"doc": "use magnetic fields, where there are any and while they are undisturbed"}
+    )
+    swap_exchanged: bool = field(
+        default=True,
+        metadata={"doc": "take sensors that are found on each other's segments for what they are; false: only tell"},
+    )
+    rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
+    orientation_rate: float = number_field(50.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
+    largest_stddev: float = number_field(
+        0.6, "tell no orientation that is known less well than this about any axis", "rad", 0.01, 2.0
+    )
+    mounting_stddev: float = number_field(
+        0.17, "by how much sensors are put on otherwise than meant, per axis", "rad", 0.001, 2.0
+    )
+    silent_after: float = number_field(0.5, "a sensor that says nothing for longer is silent", "s", 0.05, 60.0)
+    stature: float = number_field(1.75, "of the person, until a camera has measured the segments", "m", 0.5, 2.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What follows from a reading.
+
+    Attributes:
+        orientation: of the sensor's segment, or None.
+        skeleton: the whole body, when one is due, or None.
+    """
+
+    orientation: SegmentOrientation | None = None
+    skeleton: Skeleton | None = None
+
+
+_NOTHING: Final = Told()
+
+
+@dataclass(slots=True)
+class _Transports:
+    """Seconds by which a sensor's stamps come later than by the times of receipt, and how sure that is."""
+
+    offset: float = 0.0
+    variance: float = _TRANSPORTS**2
+    stamp: float = 0.0
+    found: int = 0
+
+    def correct(self, stamp: float, offset: float, stddev: float) -> None:
+        """By what motion tells (a scalar Kalman filter)."""
+        self.variance += _TRANSPORTS_WALK**2 * max(0.0, stamp - self.stamp)
+        gain = self.variance / (self.variance + stddev**2 + _OFFSET_FLOOR**2)
+        self.offset += gain * (offset - self.offset)
+        self.variance *= 1.0 - gain
+        self.stamp, self.found = stamp, self.found + 1
+
+
+class InertialTracker:
+    """Feeds on readings of several sensors, and on skeletons in ``world`` where a camera sees the person.
+
+    Args:
+        segments: of ``UpperBody.segment_names``, each with a sensor.
+        parameters: how.
+        mountings: ``segment:axes`` of sensors that are not put on in the usual way (``mounting``).
+        world: name of the frame of what comes out.
+
+    Attributes:
+        counters: what happened since the construction, for diagnostics.
+        aligned: whether a pose has aligned the sensors.
+
+    Raises:
+        InertialTrackingError: no segment, one twice or an unknown one.
+        MountingError: a mounting that is none.
+    """
+
+    def __init__(
+        self,
+        segments: Sequence[str],
+        parameters: TrackingParameters | None = None,
+        mountings: Sequence[str] = (),
+        world: str = "world",
+    ) -> None:
+        self.parameters = TrackingParameters() if parameters is None else parameters
+        self._model = UpperBody()
+        unknown = [name for name in segments if name not in self._model.segment_names]
+        if unknown or not segments or len(set(segments)) < len(segments):
+            what = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
+            raise InertialTrackingError(f"segments with inertial sensors: {what}")
+        self.segments = tuple(segments)
+        self._meant = meant_mountings(self.segments, mountings)
+        self._world = world
+        self.counters: Counter[str] = Counter()
+        self._kinematics: dict[tuple[str, ...], tuple[OrientationKinematics, BoolArray]] = {}
+        self._poses = {name: pose_rotations(self._model, pose) for name, pose in _POSES.items()}
+        self._sensors = {name: WornSensor(name, magnetometer=self.parameters.magnetometer) for name in self.segments}
+        self._begin()
+
+    def _begin(self) -> None:
+        """Know nothing of the person and of time."""
+        k = len(self.segments)
+        prior = np.tile([self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING], k)
+        self._tracker = HeadingTracker(Alignment(self.segments, self._meant, np.zeros(k), np.diag(prior)))
+        self._last = 0.0
+        self._epoch_ns: int | None = None
+        self.aligned = False
+        self._asked_until: float | None = None
+        self._asked_pose = AUTO
+        self._magnetic = np.zeros(k, dtype=np.bool_)
+        self._all_clocks = ReceiptClock()
+        self._camera_clock = ReceiptClock()
+        self._transports = {name: _Transports() for name in self.segments}
+        self._pending: deque[Skeleton] = deque()
+        self._seen: deque[Skeleton] = deque()
+        self._base: tuple[int, FloatArray] | None = None
+        self._lengths = SkeletonLengths()
+        self._first_ns: int | None = None
+        self._received_ns: int | None = None
+        self._newest_ns: int | None = None
+        self._due: dict[str, float] = {}
+        self._told_ns: dict[str, int] = {}
+        self._skeleton_ns: int | None = None
+        self._posture: FloatArray | None = None
+        self._slips: dict[str, tuple[float, str]] = {}
+        self._exchanged: dict[str, str] = {}
+        self._detectors = {name: self._new_detectors(name) for name in self.segments}
+        self._turn = 0
+
+    @staticmethod
+    def _new_detectors(segment: str) -> tuple[SlipDetector, ...]:
+        return tuple(SlipDetector(segment, window=window) for window in _SLIP_WINDOWS)
+
+    def reset(self) -> None:
+        """Begin anew, as after a jump of time; the counters stay."""
+        for name, sensor in self._sensors.items():
+            sensor.segment = name
+            sensor.reset()
+        self._begin()
+
+    def align(self) -> str:
+        """Align anew in the next pose that is held; what is said to who asked."""
+        self._asked_until, self._asked_pose = self._last + _ASKED_S, self.parameters.pose
+        what = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
+        return f"hold {what}, for a second and within the next {_ASKED_S:.0f} s"
+
+    @property
+    def alignment(self) -> Alignment:
+        """The present one, of ``segments``."""
+        return self._tracker.alignment
+
+    def problems(self, now_ns: int) -> tuple[str, ...]:
+        """A line for each thing that is wrong now.
+
+        Args:
+            now_ns: the time in the clock of receipt.
+        """
+        lines = []
+        for stated, sensor in self._sensors.items():
+            if sensor.received_ns is None:
+                lines.append(f"{stated}: nothing has come yet")
+                continue
+            silent = (now_ns - sensor.received_ns) / NANOSECONDS
+            if silent > self.parameters.silent_after:
+                lines.append(f"{stated}: silent for {silent:.0f} s")
+                continue
+            lines += [f"{stated}: {problem}" for problem in sensor.problems]
+            if sensor.disturbed:
+                lines.append(f"{stated}: magnetic field disturbed")
+            if stated in self._exchanged:
+                lines.append(f"{stated}: its sensor is on {self._exchanged[stated]}")
+            if not sensor.problems and self._stddev(sensor) > self.parameters.largest_stddev:
+                lines.append(f"{stated}: not aligned")
+        lines += [text for stamp, text in self._slips.values() if self._last - stamp < _NAMED_S]
+        return tuple(lines)
+
+    def state(self) -> dict[str, float]:
+        """How well alignments and headings are known, degrees, and what motion tells of clocks, milliseconds."""
+        stddev = np.degrees(self.alignment.stddev)
+        values = {}
+        for number, name in enumerate(self.segments):
+            values[f"{name} alignment deg"] = round(float(np.sqrt((stddev[number, :3] ** 2).mean())), 1)
+            values[f"{name} heading deg"] = round(float(stddev[number, 3]), 1)
+            if self._transports[name].found:
+                values[f"{name} clock ms"] = round(1e3 * self._transports[name].offset, 1)
+        return values
+
+    # --- readings
+
+    def add(self, segment: str, sample: ImuSample, received_ns: int) -> Told:
+        """Take one reading.
+
+        Args:
+            segment: on which the sensor is said to be.
+            sample: what it said.
+            received_ns: when, in a clock common to all sensors and to the camera.
+
+        Raises:
+            InertialTrackingError: no such segment.
+            ImuOrientationError: neither orientation nor rate and acceleration.
+        """
+        if segment not in self._sensors:
+            raise InertialTrackingError(f"{segment}: no inertial sensor is expected there")
+        self._receive(received_ns)
+        sensor = self._sensors[segment]
+        felt = sensor.take(sample, received_ns)
+        if self.parameters.clock == SHARED:
+            self._all_clocks.add(sample.stamp_ns, received_ns)
+        if felt is None or sensor.problems:
+            return _NOTHING
+        stamp_ns = self._to_reference(sensor, felt.stamp_ns)
+        if self._waits_for_camera(received_ns):
+            return _NOTHING
+        now = self._advance(stamp_ns)
+        self._note_heading(sensor, now)
+        if now >= self._due.get("step", -np.inf):
+            self._due["step"] = now + _STEP_NS / NANOSECONDS
+            self._step(now, stamp_ns)
+        return Told(self._orientation(sensor, felt, stamp_ns), self._body(stamp_ns))
+
+    def see(self, skeleton: Skeleton, received_ns: int) -> None:
+        """Take a camera's skeleton in ``world``; left out with the parameter ``camera`` false.
+
+        Args:
+            skeleton: in ``world``.
+            received_ns: as above.
+        """
+        if not self.parameters.camera:
+            return
+        self._receive(received_ns)
+        newest, first = self._newest_ns, self._camera_clock.delay_ns is None
+        if newest is not None and newest - _JUMP_NS < skeleton.stamp_ns <= newest:
+            self.counters["camera's late frames"] += 1
+            return
+        jumped = newest is not None and skeleton.stamp_ns <= newest
+        if jumped:
+            self._camera_clock.reset()
+        jumped |= not self._camera_clock.add(skeleton.stamp_ns, received_ns)
+        if jumped:
+            self.counters["camera's time jumped"] += 1
+            self._pending.clear()
+            self._seen.clear()
+        if jumped or first:
+            self._rebase()
+        self._newest_ns = skeleton.stamp_ns
+        self._pending.append(skeleton)
+        self._seen.append(skeleton)
+        while skeleton.stamp_ns - self._seen[0].stamp_ns > _LOOK_BACK_S * NANOSECONDS:
+            self._seen.popleft()
+        if skeleton.valid[Joint.SPINE_BASE]:
+            self._base = skeleton.stamp_ns, skeleton.positions[Joint.SPINE_BASE]
+        known = skeleton.valid[self._model.joints]
+        points = np.where(known[:, None], skeleton.positions[self._model.joints], np.nan)
+        variance = np.where(known, _variance(skeleton)[self._model.joints], np.inf)
+        self._lengths.update(skeleton.stamp_ns, points, variance)
+
+    def _receive(self, received_ns: int) -> None:
+        if self._received_ns is not None and received_ns < self._received_ns - _JUMP_NS:
+            self.counters["time jumps"] += 1
+            self.reset()
+        self._received_ns = received_ns
+        if self._first_ns is None:
+            self._first_ns = received_ns
+
+    def _waits_for_camera(self, received_ns: int) -> bool:
+        """Until its first skeleton nobody knows which clock and which world are meant."""
+        if not self.parameters.camera or self._camera_clock.delay_ns is not None:
+            return False
+        assert self._first_ns is not None
+        return received_ns - self._first_ns < _ALONE_S * NANOSECONDS
+
+    # --- time
+
+    def _to_reference(self, sensor: WornSensor, stamp_ns: int) -> int:
+        """A stamp of a sensor in the clock of what comes out."""
+        return stamp_ns + self._offset_ns(sensor)
+
+    def _offset_ns(self, sensor: WornSensor) -> int:
+        if self.parameters.clock == REFERENCE:
+            return 0
+        own = (self._all_clocks if self.parameters.clock == SHARED else sensor.clock).delay_ns
+        camera = self._camera_clock.delay_ns
+        assert own is not None  # it has said something
+        return own - (0 if camera is None else camera) - round(self._transport(sensor).offset * NANOSECONDS)
+
+    def _transport(self, sensor: WornSensor) -> _Transports:
+        return self._transports[self.segments[0] if self.parameters.clock == SHARED else self._stated(sensor)]
+
+    def _stated(self, sensor: WornSensor) -> str:
+        return next(name for name, each in self._sensors.items() if each is sensor)
+
+    def _rebase(self) -> None:
+        """Another clock counts from now on."""
+        self._tracker = self._new_tracker(self.alignment)
+        self._epoch_ns, self._last = None, 0.0
+        self._due.clear()
+        self._told_ns.clear()
+        self._skeleton_ns = None
+        self._slips.clear()
+        self._detectors = {name: self._new_detectors(name) for name in self.segments}
+        self._asked_until = None if self._asked_until is None else _ASKED_S
+
+    def _new_tracker(self, alignment: Alignment) -> HeadingTracker:
+        return HeadingTracker(alignment, heading_walk=np.where(self._magnetic, _MAGNETIC_WALK, HEADING_WALK))
+
+    def _advance(self, stamp_ns: int) -> float:
+        """Seconds since the beginning; never less than before."""
+        if self._epoch_ns is None:
+            self._epoch_ns = stamp_ns
+        self._last = max(self._last, (stamp_ns - self._epoch_ns) / NANOSECONDS)
+        return self._last
+
+    def _note_heading(self, sensor: WornSensor, now: float) -> None:
+        """Hand on that a sensor's heading is lost, and that it has a magnetometer."""
+        number = self.segments.index(sensor.segment)
+        if sensor.growth > _LOST:
+            self._unsure(number, sensor.growth, now)
+            sensor.growth = 0.0
+        if sensor.has_field != self._magnetic[number]:
+            self._magnetic[number] = sensor.has_field
+            self._tracker = self._new_tracker(self.alignment)
+
+    def _note_drift(self, now: float) -> None:
+        """Hand on what headings have drifted by in the last second, beyond what they are taken to."""
+        for sensor in self._sensors.values():
+            excess, sensor.growth = sensor.growth - HEADING_WALK**2 * _DRIFT_S, 0.0
+            if excess > 0.0:
+                self._unsure(self.segments.index(sensor.segment), excess, now)
+
+    def _unsure(self, number: int, variance: float, now: float) -> None:
+        """Know less of a heading, by rad2; no less than nothing."""
+        self._tracker.predict(max(now, self._last))
+        a = self.alignment
+        covariance = a.covariance.copy()
+        place = 4 * number + 3
+        covariance[place, place] += min(variance, max(0.0, UNKNOWN_HEADING - covariance[place, place]))
+        self._tracker.alignment = Alignment(a.segments, a.rotations, a.headings, covariance)
+
+    def _step(self, now: float, stamp_ns: int) -> None:
+        """Everything that need not be done for every reading."""
+        while self._pending and self._pending[0].stamp_ns < max(stamp_ns, self._newest_ns or 0) - _PENDING_NS:
+            self._compare(self._pending.popleft(), now)
+        if self._is_due("drift", now, _DRIFT_S):
+            self._note_drift(now)
+        if self._is_due("pose", now, _POSE_EVERY_S):
+            self._look_for_pose(now, stamp_ns)
+        if self._is_due("elbow", now, _ELBOW_S):
+            self._constrain(now, stamp_ns)
+        if self._is_due("clock", now, _CLOCK_EVERY_S):
+            self._look_at_clock(now, stamp_ns)
+        if self._is_due("exchange", now, _CHECK_EVERY_S):
+            self._look_for_exchange(now, stamp_ns)
+
+    def _is_due(self, what: str, now: float, every: float) -> bool:
+        if now < self._due.get(what, 0.0):
+            return False
+        self._due[what] = now + every
+        return True
+
+    def _listening(self, stamp_ns: int) -> list[tuple[int, WornSensor]]:
+        """Those sensors that said something of use lately, with the numbers of their segments."""
+        found = []
+        for sensor in self._sensors.values():
+            latest = sensor.latest
+            if latest is None or sensor.problems:
+                continue
+            if abs(self._to_reference(sensor, latest.stamp_ns) - stamp_ns) < self.parameters.silent_after * NANOSECONDS:
+                found.append((self.segments.index(sensor.segment), sensor))
+        return sorted(found, key=lambda each: each[0])
+
+    def _stream(self, sensor: WornSensor, felt: Sequence[Felt]) -> Stream:
+        """Readings in the clock of what comes out, in seconds since the beginning."""
+        assert self._epoch_ns is not None
+        offset = self._offset_ns(sensor) - self._epoch_ns
+        return Stream(
+            sensor.segment,
+            np.array([(each.stamp_ns + offset) / NANOSECONDS for each in felt]),
+            np.array([each.rotation for each in felt]).reshape(-1, 3, 3),
+            np.array([each.rate for each in felt]).reshape(-1, 3),
+        )
+
+    def _recent(self, sensor: WornSensor, stamp_ns: int, seconds: float) -> list[Felt]:
+        return sensor.history(stamp_ns - round(seconds * NANOSECONDS) - self._offset_ns(sensor))
+
+    # --- a camera
+
+    def _compare(self, skeleton: Skeleton, now: float) -> None:
+        """Headings, alignments and slips by the bones of a skeleton."""
+        if not self._is_due("bones", now, 0.9 * _STEP_NS / NANOSECONDS):
+            return
+        variance, valid = _variance(skeleton), skeleton.valid
+        for _, sensor in self._listening(skeleton.stamp_ns):
+            segment = sensor.segment
+            bone, rotation = bone_of(segment), sensor.at(skeleton.stamp_ns - self._offset_ns(sensor))
+            if bone is None or rotation is None or not (valid[bone.start] and valid[bone.end]):
+                continue
+            way = skeleton.positions[bone.end] - skeleton.positions[bone.start]
+            length = float(np.linalg.norm(way))
+            if length < 0.05:
+                continue
+            stddev = float(np.sqrt(variance[bone.start] + variance[bone.end])) / length
+            told = self._tracker.observe_bone(now, segment, rotation, way, stddev * np.sqrt(_CAMERA_LASTS))
+            if told is None or sensor.disturbed or self._stddev(sensor) > _FAR_HEADING:
+                continue
+            off = float(np.sqrt(0.5 * told.covariance.trace() - (_CAMERA_LASTS - _CAMERA_SLIPS) * stddev**2))
+            for detector in self._detectors[segment]:
+                slip = detector.update(now, told.turn, off)
+                if slip is not None:
+                    self._slipped(segment, now, float(np.linalg.norm(slip.turn)))
+                    break
+
+    def _slipped(self, segment: str, now: float, turn: float) -> None:
+        self.counters["slips"] += 1
+        self._slips[segment] = now, f"{segment}: its sensor has slipped by {np.degrees(turn):.0f} deg"
+        self._tracker.loosen(segment, max(turn, 0.2))
+        self._detectors[segment] = self._new_detectors(segment)
+
+    def _bones(self, segments: Sequence[str]) -> list[Turning | None]:
+        """How fast the camera has seen bones turn."""
+        assert self._epoch_ns is not None
+        stamps = np.array([(each.stamp_ns - self._epoch_ns) / NANOSECONDS for each in self._seen])
+        positions = np.array([np.where(each.valid[:, None], each.positions, np.nan) for each in self._seen])
+        found: list[Turning | None] = []
+        for segment in segments:
+            bone = bone_of(segment)
+            if bone is None or len(stamps) < 2:
+                found.append(None)
+            else:
+                found.append(Turning.of_bone(stamps, positions[:, bone.end] - positions[:, bone.start]))
+        return found
+
+    def _turning(self, number: int, sensor: WornSensor, stamp_ns: int) -> Turning | None:
+        """How fast a sensor has felt its bone turn."""
+        felt = self._recent(sensor, stamp_ns, _LOOK_BACK_S)
+        bone = bone_of(sensor.segment)
+        if len(felt) < 2 or bone is None:
+            return None
+        stream = self._stream(sensor, felt)
+        return Turning.of_sensor(stream.stamps, stream.rates, self.alignment.rotations[number] @ bone.axis)
+
+    def _look_at_clock(self, now: float, stamp_ns: int) -> None:
+        """Of one sensor after the other, by how much its stamps are off those of the camera."""
+        listening = self._listening(stamp_ns)
+        if not self._seen or not listening or self.parameters.clock == REFERENCE:
+            return
+        self._turn += 1
+        number, sensor = listening[self._turn % len(listening)]
+        felt, (seen,) = self._turning(number, sensor, stamp_ns), self._bones([sensor.segment])
+        if felt is None or seen is None:
+            return
+        found = clock_offset(seen, felt, window=_CLOCK_WINDOW)
+        if found is not None and sensor.segment not in self._exchanged.values():
+            transport = self._transport(sensor)
+            transport.correct(now, transport.offset + found.offset, found.offset_stddev)
+            self.counters["clocks by motion"] += 1
+
+    def _look_for_exchange(self, now: float, stamp_ns: int) -> None:
+        """Whether sensors feel what the camera sees of each other's bones."""
+        listening = [each for each in self._listening(stamp_ns) if bone_of(each[1].segment) is not None]
+        if len(self._seen) < 2 or len(listening) < 2:
+            return
+        felt = [self._turning(number, sensor, stamp_ns) for number, sensor in listening]
+        kept = [number for number, each in enumerate(felt) if each is not None]
+        segments = [listening[number][1].segment for number in kept]
+        table = likelihood_by_motion([each for each in felt if each is not None], self._bones(segments))
+        found = assign(segments, table)
+        if found.exchanged:
+            self._exchange([listening[number][1] for number in kept], found.segments)
+
+    def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> None:
+        """Sensors are on other segments than was thought."""
+        moved = [(sensor, segment) for sensor, segment in zip(sensors, segments, strict=True)]
+        moved = [(sensor, segment) for sensor, segment in moved if sensor.segment != segment]
+        for sensor, segment in moved:
+            stated = self._stated(sensor)
+            self.counters["exchanged sensors"] += 1
+            if segment == stated:
+                self._exchanged.pop(stated, None)
+            else:
+                self._exchanged[stated] = segment
+        if not self.parameters.swap_exchanged:
+            return
+        a = self.alignment
+        rotations, headings, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
+        for sensor, segment in moved:
+            sensor.segment = segment
+            number = self.segments.index(segment)
+            rows = slice(4 * number, 4 * number + 4)
+            covariance[rows], covariance[:, rows] = 0.0, 0.0
+            own = [self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING]
+            covariance[rows, rows] = np.diag(own)
+            rotations[number], headings[number] = self._meant[number], 0.0
+            self._magnetic[number] = sensor.has_field
+            self._detectors[segment] = self._new_detectors(segment)
+        self._tracker = self._new_tracker(Alignment(a.segments, rotations, headings, covariance))
+
+    # --- a pose
+
+    def _look_for_pose(self, now: float, stamp_ns: int) -> None:
+        """Align in a pose, where none has aligned the sensors yet or somebody has asked for it."""
+        asked = self._asked_until is not None and now <= self._asked_until
+        if self._asked_until is not None and not asked:
+            self.counters["poses asked for in vain"] += 1
+            self._asked_until = None
+        if self.aligned and not asked:
+            return
+        listening = self._listening(stamp_ns)
+        late = len(listening) == len(self.segments) or now > _ALONE_S
+        if not listening or not late:
+            return
+        streams = [self._stream(sensor, self._recent(sensor, stamp_ns, _POSE_S)) for _, sensor in listening]
+        if any(len(stream.stamps) < 2 for stream in streams):
+            return
+        periods = still_periods(streams)
+        if not periods or periods[-1].end < now - 0.5:
+            return
+        period = periods[-1]
+        numbers = [number for number, _ in listening]
+        seen = self._seen[-1] if self._seen and abs(self._seen[-1].stamp_ns - stamp_ns) < _FRESH_NS else None
+        if self._seen and seen is None:
+            return  # the camera knows where the person faces, but not now
+        name = self.parameters.pose
+        if name == AUTO:
+            pose = pose_of(streams, self._meant[numbers], period)
+            if pose is None:
+                return
+            name = next(each for each, letter in _POSES.items() if letter == pose)
+        arms = any(stream.segment.startswith("upper_arm") for stream in streams)
+        if seen is not None and not self._looks_like(seen, name):
+            return
+        if seen is None and not asked and not arms:
+            return  # forearms alone do not tell a pose from hands on a table
+        self._align(name, listening, [stream.between(period.begin, period.end) for stream in streams], seen)
+        self._asked_until = None
+
+    def _looks_like(self, skeleton: Skeleton, name: str) -> bool:
+        """Whether a camera sees the arms in a pose, as far as it sees them."""
+        facing = _facing(skeleton)
+        if facing is None:
+            return False
+        valid = skeleton.valid
+        for side in ("left", "right"):
+            for part in ("upper_arm", "forearm"):
+                bone = bone_of(f"{part}_{side}")
+                assert bone is not None
+                if not (valid[bone.start] and valid[bone.end]):
+                    continue
+                way = skeleton.positions[bone.end] - skeleton.positions[bone.start]
+                expected = (
+                    yaw(facing) @ self._poses[name][self._model.segment_names.index(f"{part}_{side}")] @ bone.axis
+                )
+                if float(way @ expected) < np.cos(_CAMERA_CONE) * float(np.linalg.norm(way)):
+                    return False
+        return True
+
+    def _align(
+        self, name: str, listening: Sequence[tuple[int, WornSensor]], held: Sequence[Stream], seen: Skeleton | None
+    ) -> None:
+        """The sensors that were there are aligned by a pose; of others nothing changes."""
+        numbers = [number for number, _ in listening]
+        segments = [self.segments[number] for number in numbers]
+        measured = np.array([mean_rotation(stream.rotations) for stream in held])
+        posed = self._poses[name][[self._model.segment_names.index(each) for each in segments]]
+        meant = self._meant[numbers]
+        if seen is None and len(segments) > 1:
+            table = likelihood_by_pose(
+                segments, measured, posed, meant, common_heading=bool(self._magnetic[numbers].all())
+            )
+            found = assign(segments, table)
+            if found.exchanged:
+                self._exchange([sensor for _, sensor in listening], found.segments)
+                if self.parameters.swap_exchanged:
+                    return  # aligned as what they are the next time
+        facing = 0.0 if seen is None else _facing(seen)
+        if facing is None:
+            return
+        spread = pose_covariance(self._model, _POSES[name], segments)
+        if seen is not None:
+            up = (yaw(facing) @ posed)[:, 2].reshape(-1)
+            spread = spread + _FACING**2 * np.outer(up, up)
+        a = self.alignment
+        places = [4 * number + 3 for number in numbers]
+        own = a.covariance[np.ix_(places, places)]
+        known = seen is not None and float(own.diagonal().max()) < _FAR_HEADING**2
+        found_alignment = align_in_pose(
+            segments,
+            measured,
+            posed,
+            spread,
+            mountings=meant,
+            mounting_stddev=self.parameters.mounting_stddev,
+            headings=a.headings[numbers] if known else None,
+            heading_covariance=own if known else None,
+            facing=facing,
+        )
+        rotations, headings, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
+        rows = np.concatenate([np.arange(4 * number, 4 * number + 4) for number in numbers])
+        rotations[numbers], headings[numbers] = found_alignment.rotations, found_alignment.headings
+        covariance[rows], covariance[:, rows] = 0.0, 0.0
+        covariance[np.ix_(rows, rows)] = found_alignment.covariance
+        self._tracker = self._new_tracker(Alignment(a.segments, rotations, wrapped(headings), covariance))
+        self._detectors = {each: self._new_detectors(each) for each in self.segments}
+        for each in segments:
+            self._slips.pop(each, None)
+        self.aligned = True
+        self.counters["alignments by a pose"] += 1
+
+    # --- joints
+
+    def _constrain(self, now: float, stamp_ns: int) -> None:
+        """What elbows and ranges of motion tell of alignments and headings (eq. 11 and 12 of ``heading``)."""
+        there = {
+            sensor.segment: rotation
+            for _, sensor in self._listening(stamp_ns)
+            if self._stddev(sensor) < self.parameters.largest_stddev
+            and (rotation := sensor.at(stamp_ns - self._offset_ns(sensor))) is not None
+        }
+        for side in ("left", "right"):
+            upper, lower = there.get(f"upper_arm_{side}"), there.get(f"forearm_{side}")
+            if upper is not None and lower is not None:
+                self._tracker.observe_elbow(now, side, upper, lower)
+        for parent, child in _joints():
+            if parent in there and child in there:
+                self._tracker.observe_range(now, parent, child, (there[parent], there[child]))
+
+    # --- what comes out
+
+    def _stddev(self, sensor: WornSensor) -> float:
+        """Radians, of the worst known axis of a sensor's segment, by alignment and heading."""
+        number = self.segments.index(sensor.segment)
+        variances = self.alignment.covariance.diagonal()[4 * number : 4 * number + 4]
+        return float(np.sqrt(variances.max()))
+
+    def _placed(self, number: int, felt: Felt, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(3, 3) a segment's orientation in world, and its (3, 3) covariance about the axes of world."""
+        a = self.alignment
+        world = a.oriented(number, rotation)
+        own = self._tracker.orientation_covariance(self.segments[number], rotation)
+        earth = yaw(a.headings[number])
+        covariance = world @ (own + TISSUE_STDDEV**2 * _EYE3) @ world.T + earth @ felt.covariance @ earth.T
+        return world, 0.5 * (covariance + covariance.T)
+
+    def _orientation(self, sensor: WornSensor, felt: Felt, stamp_ns: int) -> SegmentOrientation | None:
+        last = self._told_ns.get(sensor.segment)
+        if last is not None and -_JUMP_NS < stamp_ns - last < 0.9 * NANOSECONDS / self.parameters.orientation_rate:
+            return None
+        number = self.segments.index(sensor.segment)
+        world, covariance = self._placed(number, felt, felt.rotation)
+        if float(np.sqrt(covariance.diagonal().max())) > self.parameters.largest_stddev:
+            return None
+        self._told_ns[sensor.segment] = stamp_ns
+        rate = self.alignment.rotations[number].T @ felt.rate
+        return SegmentOrientation(
+            stamp_ns,
+            f"imu_{sensor.segment}",
+            sensor.segment,
+            _orthonormal(world),
+            covariance,
+            rate,
+            (_RATE_STDDEV + _RATE_SHARE * float(np.linalg.norm(rate))) ** 2,
+            self._world,
+        )
+
+    def _body(self, stamp_ns: int) -> Skeleton | None:
+        """The body that fits all orientations, when one is due."""
+        period = NANOSECONDS / self.parameters.rate
+        if self._skeleton_ns is not None and stamp_ns - self._skeleton_ns < 0.98 * period:
+            return None
+        rotations, covariances, segments = [], [], []
+        for number, sensor in self._listening(stamp_ns):
+            rotation = sensor.at(stamp_ns - self._offset_ns(sensor))
+            if rotation is None or self._stddev(sensor) > np.sqrt(UNKNOWN_HEADING) - 0.01:
+                continue
+            assert sensor.latest is not None
+            world, covariance = self._placed(number, sensor.latest, rotation)
+            rotations.append(world)
+            covariances.append(world.T @ covariance @ world)
+            segments.append(sensor.segment)
+        if not segments:
+            return None
+        self._skeleton_ns = stamp_ns
+        names = tuple(segments)
+        if names not in self._kinematics:
+            self._kinematics[names] = OrientationKinematics(self._model, names), _placed_by(self._model, names)
+        kinematics, placed = self._kinematics[names]
+        self._posture, covariance = kinematics.solve(np.array(rotations), np.array(covariances), self._posture)
+        return self._skeleton(stamp_ns, placed, self._posture, covariance)
+
+    def _skeleton(self, stamp_ns: int, placed: BoolArray, q: FloatArray, covariance: FloatArray) -> Skeleton:
+        model = self._model
+        base, variance = _STANDING, _BASE_UNKNOWN**2
+        if self._base is not None:
+            base = self._base[1]
+            unseen = abs(stamp_ns - self._base[0]) / NANOSECONDS
+            variance = min(_BASE_STDDEV**2 + _BASE_WALK**2 * unseen, _BASE_UNKNOWN**2)
+        q = q.copy()
+        q[:3] = base
+        lengths = self._lengths.lengths if self._base is not None else model.default_lengths(self.parameters.stature)
+        lines = model.linearise(q, lengths)
+        spread = covariance.copy()
+        spread[:3] = spread[:, :3] = 0.0
+        own = lines.jacobian @ spread @ lines.jacobian.swapaxes(-1, -2) + variance * _EYE3 + _SMALL
+        positions = np.full((N_JOINTS, 3), np.nan)
+        covariances = np.tile(np.diag([np.inf] * 3), (N_JOINTS, 1, 1))
+        states = np.zeros(N_JOINTS, dtype=np.uint8)
+        positions[model.joints], covariances[model.joints] = lines.posture.positions, own
+        states[model.joints] = np.where(placed, TrackingState.TRACKED, TrackingState.INFERRED)
+        return Skeleton(stamp_ns, self._world, positions, states, 0, covariances)
+
+
+def _variance(skeleton: Skeleton) -> FloatArray:
+    """(25,) square metres per axis, of a camera's joints."""
+    if skeleton.covariances is None:
+        return BASE_STDDEV**2
+    traces: FloatArray = np.trace(skeleton.covariances, axis1=1, axis2=2) / 3.0
+    return np.where(np.isfinite(traces), traces, 1.0)
+
+
+def _facing(skeleton: Skeleton) -> float | None:
+    """Radians from world's x, which way a person faces, by shoulders and hips."""
+    left = body_heading(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
+    if not np.isfinite(left).all() or np.linalg.norm(left[:2]) < 0.05:
+        return None
+    return float(np.arctan2(-left[0], left[1]))
+
+
+def _orthonormal(rotation: FloatArray) -> FloatArray:
+    """A product of many rotations, without what rounding has added up to."""
+    return so3.quat_to_matrix(so3.matrix_to_quat(rotation))
+
+
+def _joints() -> list[tuple[str, str]]:
+    """Pairs of segments whose joint has a range that both sensors may tell of."""
+    found = []
+    for parent, child in JOINTS:
+        if child in ("upper_trunk", "head"):
+            found.append((parent, child))
+        else:
+            above = [parent] * 2 if parent == "upper_trunk" else [f"{parent}_left", f"{parent}_right"]
+            found += zip(above, [f"{child}_left", f"{child}_right"], strict=True)
+    return found
+
+
+def _placed_by(model: UpperBody, sensed: Sequence[str]) -> BoolArray:
+    """(19,) points whose place against the trunk sensors tell: every segment from there on carries one.
+
+    None is asked for on the spine and on the girdle, which move little, nor on more than one end of the trunk.
+    """
+    trunk = any(name in sensed for name in _TRUNK)
+    sure: dict[str, bool] = {}
+    for number, name in enumerate(model.segment_names):
+        above = PARENTS[number] < 0 or sure[model.segment_names[PARENTS[number]]]
+        sure[name] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
+    carriers = []
+    for joint in model.joints.tolist():
+        kind, _, side = Joint(joint).name.rpartition("_")
+        if side in ("LEFT", "RIGHT"):
+            carrier = _CARRIERS[kind]
+            carriers.append(carrier if carrier == "pelvis" else f"{carrier}_{side.lower()}")
+        else:
+            carriers.append(_CARRIERS[Joint(joint).name])
+    return np.array([sure[carrier] for carrier in carriers])

@@ -1,0 +1,325 @@
+"""One inertial sensor that somebody wears: its orientation, its clock by receipt, and what is wrong with it.
+
+What a driver or VQF states of the heading's drift grows for ever without a magnetometer. Whoever keeps headings over
+time must not count it twice: such growth is handed over once, apart from the covariance.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.inertial.alignment import rotation_vectors
+from body_tracking.kinematics import so3
+from body_tracking.sensors.imu import ImuSample, ImuWatch
+from body_tracking.sensors.imu_orientation import OUTAGE_S, OrientationEstimator
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+HISTORY_S: Final = 40.0
+"""Seconds for which readings are kept."""
+NEAR_NS: Final = NANOSECONDS // 20
+"""How far from a reading its rate tells the orientation."""
+UNKNOWN_HEADING: Final = np.pi**2 / 3.0
+"""rad2: any heading."""
+_OTHER_FRAME = 50
+"""Readings of another frame in a row from which on it is the sensor's."""
+_SPACING_NS = NANOSECONDS // 55
+"""Between readings that are kept: 50 of a second are enough for what they are kept for."""
+_DELAY_S = 15.0
+"""The least delay is that of the last one to two times so long."""
+_CLOCK_SET_S = 0.5
+"""Seconds by which a delay shrinks that no transport explains: the clock was set."""
+_STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2
+"""rad2: of a driver that states no covariance."""
+_FIELDS = 100
+"""Readings from which the strength of the undisturbed field is taken."""
+_FIELD_S = 0.5
+_DISTURBED = 0.15
+"""Share of its strength by which a disturbed field is another one, lastingly over half a second."""
+_ELSEWHERE_S = 60.0
+"""After so long the field is no disturbed one, but that of another place."""
+_TURNED, _TURNED_S = float(np.radians(60.0)) ** 2, 10.0
+"""rad2 by which a disturbed field may turn the heading of a driver that is believed to follow it, and within what."""
+
+
+class WornSensorError(BodyTrackingError):
+    """A reading that cannot be of this sensor."""
+
+
+class ReceiptClock:
+    """What the times of receipt tell of a clock: stamps were given at the least so long before the receipt.
+
+    The least delay of the last quarter to half minute, so that a clock that runs fast or slow is followed.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Know nothing."""
+        self._before: int | None = None
+        self._least: int | None = None
+        self._until_ns = 0
+
+    @property
+    def delay_ns(self) -> int | None:
+        """Receipt minus stamp at least; None before anything was received."""
+        if self._least is None or self._before is None:
+            return self._least
+        return min(self._least, self._before)
+
+    def add(self, stamp_ns: int, received_ns: int) -> bool:
+        """Take one more; False when the clock was set since the last one."""
+        delay, known = received_ns - stamp_ns, self.delay_ns
+        if known is not None and delay < known - _CLOCK_SET_S * NANOSECONDS:
+            self.reset()
+            self.add(stamp_ns, received_ns)
+            return False
+        if self._least is None or received_ns > self._until_ns:
+            self._before, self._least = self._least, delay
+            self._until_ns = received_ns + round(_DELAY_S * NANOSECONDS)
+        self._least = min(self._least, delay)
+        return True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Felt:
+    """How a sensor was turned at one instant.
+
+    Attributes:
+        stamp_ns: of its own clock.
+        rotation: (3, 3) sensor to earth (z up, a heading of its own).
+        covariance: (3, 3) rad2 about the earth's axes; of the heading what does not grow for ever.
+        rate: (3,) rad/s in the sensor's frame.
+    """
+
+    stamp_ns: int
+    rotation: FloatArray
+    covariance: FloatArray
+    rate: FloatArray
+
+
+class WornSensor:
+    """Takes the readings of one sensor.
+
+    Readings with an orientation are taken as they are; of others the orientation is estimated, as long as none with one
+    comes beside them.
+
+    Args:
+        segment: on which it is, as far as known.
+        magnetometer: use the magnetic field.
+
+    Attributes:
+        segment: as above; may be corrected.
+        clock: its clock by receipt.
+        growth: rad2 by which the heading has become less sure, until somebody takes it.
+        counters: what happened.
+        received_ns: of the last reading; None before a first one.
+    """
+
+    def __init__(self, segment: str, *, magnetometer: bool = True) -> None:
+        self.segment = segment
+        self.clock = ReceiptClock()
+        self.counters: Counter[str] = Counter()
+        self.received_ns: int | None = None
+        self._magnetometer = magnetometer
+        self._watch = ImuWatch()
+        self._frame: str | None = None
+        self._strange = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._estimator = OrientationEstimator(magnetometer=self._magnetometer)
+        self._kept: deque[Felt] = deque()
+        self.latest: Felt | None = None
+        self.growth = 0.0
+        self._level: float | None = None
+        self._stated = 0.0
+        self._oriented_ns: int | None = None
+        self._field: float | None = None
+        self._fields: list[float] = []
+        self._usual = 1.0
+        self._off_s = 0.0
+        self._turned = 0.0
+        self.has_field = False
+        self._field_known = False
+        self.clock.reset()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What its readings show to be wrong with them."""
+        return self._watch.problems
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether the magnetic field is another one than that to which the heading belongs."""
+        # VQF takes ten seconds and more to be sure of the undisturbed field
+        by_vqf = self._oriented_ns is None and self._field_known and bool(self._estimator.magnetically_disturbed)
+        return by_vqf or self._off_field() > _DISTURBED
+
+    def reset(self) -> None:
+        """Forget all readings, because time began anew."""
+        self._begin()
+        self._watch = ImuWatch()
+        self._frame, self._strange = None, 0
+        self.received_ns = None
+
+    def take(self, sample: ImuSample, received_ns: int) -> Felt | None:
+        """The orientation at a reading; None where there is none, or the reading is of no use.
+
+        Raises:
+            WornSensorError: of another frame than those before; after many of these it is the sensor's.
+            ImuOrientationError: neither orientation nor rate and acceleration.
+        """
+        self._check_frame(sample.frame_id)
+        self.counters["readings"] += 1
+        if sample.orientation is None and self._oriented_ns is not None:
+            if sample.stamp_ns - self._oriented_ns < OUTAGE_S * NANOSECONDS:
+                return None
+            self._oriented_ns = None
+        self._receive(sample, received_ns)
+        latest = self.latest
+        if latest is not None and sample.stamp_ns <= latest.stamp_ns:
+            if latest.stamp_ns - sample.stamp_ns < OUTAGE_S * NANOSECONDS:
+                self.counters["late or repeated"] += 1
+                return None
+            self.counters["clock set back"] += 1
+            self._begin()
+            self.clock.add(sample.stamp_ns, received_ns)
+            self.growth = UNKNOWN_HEADING
+        self._look_at_field(sample)
+        felt = self._given(sample) if sample.orientation is not None else self._estimated(sample)
+        for problem in self._watch.add(sample):
+            self.counters[problem.partition(":")[0]] += 1
+        if felt is None:
+            return None
+        self._count_growth(felt)
+        covariance = felt.covariance
+        if not self.has_field:
+            assert self._level is not None
+            # what the heading shares with the tilt shrinks with it
+            scale = np.array([1.0, 1.0, np.sqrt(self._level / max(float(covariance[2, 2]), 1e-12))])
+            covariance = covariance * np.outer(scale, scale)
+        elif self._turned:
+            covariance = covariance + np.diag([0.0, 0.0, self._turned])
+        self.latest = felt = Felt(felt.stamp_ns, felt.rotation, covariance, felt.rate)
+        if not self._kept or felt.stamp_ns - self._kept[-1].stamp_ns >= _SPACING_NS:
+            self._kept.append(felt)
+            while felt.stamp_ns - self._kept[0].stamp_ns > HISTORY_S * NANOSECONDS:
+                self._kept.popleft()
+        return felt
+
+    def history(self, since_ns: int) -> list[Felt]:
+        """What was kept from a stamp of the sensor's clock on, 50 a second."""
+        return [felt for felt in self._kept if felt.stamp_ns >= since_ns]
+
+    def at(self, stamp_ns: int) -> FloatArray | None:
+        """(3, 3) sensor to earth at a stamp of its clock, by the nearest reading and its rate; None far from any."""
+        nearest = self.latest
+        if nearest is None:
+            return None
+        for felt in reversed(self._kept):
+            if abs(felt.stamp_ns - stamp_ns) < abs(nearest.stamp_ns - stamp_ns):
+                nearest = felt
+            if felt.stamp_ns < stamp_ns:
+                break
+        elapsed_ns = stamp_ns - nearest.stamp_ns
+        if abs(elapsed_ns) > NEAR_NS:
+            return None
+        turned: FloatArray = nearest.rotation @ so3.quat_to_matrix(so3.exp(nearest.rate * (elapsed_ns / NANOSECONDS)))
+        return turned
+
+    # --- one reading
+
+    def _check_frame(self, frame: str) -> None:
+        if frame == self._frame:
+            self._strange = 0
+            return
+        self._strange += 1
+        if self._frame is not None and self._strange < _OTHER_FRAME:
+            raise WornSensorError(f"{self.segment}: a reading of frame {frame!r}, expected {self._frame!r}")
+        if self._frame is not None:
+            self.counters["frame changes"] += 1
+            self._watch = ImuWatch()
+            self._begin()
+            self.growth = UNKNOWN_HEADING
+        self._frame, self._strange = frame, 0
+
+    def _receive(self, sample: ImuSample, received_ns: int) -> None:
+        """Look at the clock, and for how long nothing came."""
+        if not self.clock.add(sample.stamp_ns, received_ns):
+            self.counters["clock set"] += 1
+            self._kept.clear()
+        if self.received_ns is not None and received_ns - self.received_ns > OUTAGE_S * NANOSECONDS:
+            self.counters["outages"] += 1
+            if sample.orientation is not None and not self.has_field:
+                self.growth += UNKNOWN_HEADING  # a driver that begins anew has another heading
+        self.received_ns = received_ns
+
+    def _given(self, sample: ImuSample) -> Felt:
+        assert sample.orientation is not None
+        self._oriented_ns = sample.stamp_ns
+        covariance = _STATED if sample.orientation_covariance is None else sample.orientation_covariance
+        rotation = so3.quat_to_matrix(sample.orientation)
+        rate = sample.angular_velocity
+        if rate is None:
+            rate = np.zeros(3)
+            if self.latest is not None:
+                elapsed = (sample.stamp_ns - self.latest.stamp_ns) / NANOSECONDS
+                if elapsed < OUTAGE_S:
+                    rate = rotation_vectors(self.latest.rotation.T @ rotation) / elapsed
+        return Felt(sample.stamp_ns, rotation, covariance, rate)
+
+    def _estimated(self, sample: ImuSample) -> Felt | None:
+        if self._off_field() > _DISTURBED:
+            # VQF, as long as it knows no undisturbed field, would take this one for it
+            sample = replace(sample, magnetic_field=None)
+        found = self._estimator.update(sample)
+        if found is None:
+            return None
+        self._field_known |= self._estimator.magnetically_disturbed is False
+        return Felt(found.stamp_ns, so3.quat_to_matrix(found.orientation), found.covariance, found.angular_velocity)
+
+    def _count_growth(self, felt: Felt) -> None:
+        stated = float(felt.covariance[2, 2])
+        if self._level is None:
+            self._level = self._stated = stated
+        self._level = min(self._level, stated)
+        if not self.has_field:
+            self.growth += max(0.0, stated - self._stated)
+        self._stated = stated
+
+    def _look_at_field(self, sample: ImuSample) -> None:
+        """Whether the field is as strong as it was at first, and what a driver's heading may make of another one."""
+        field = sample.magnetic_field
+        if field is None or not self._magnetometer:
+            return
+        self.has_field = True
+        strength = float(np.sqrt(field @ field))
+        if len(self._fields) < _FIELDS:
+            self._fields.append(strength)
+            self._usual = max(float(np.median(self._fields)), 1e-9)
+            return
+        elapsed = _FIELD_S if self.latest is None else (sample.stamp_ns - self.latest.stamp_ns) / NANOSECONDS
+        share = 1.0 - float(np.exp(-elapsed / _FIELD_S))
+        self._field = strength if self._field is None else self._field + share * (strength - self._field)
+        if self._off_field() > _DISTURBED:
+            self._off_s += elapsed
+            if self._off_s > _ELSEWHERE_S:
+                self._fields.clear()
+                self._field = None
+        else:
+            self._off_s = 0.0
+        if sample.orientation is None:
+            return  # VQF's covariance has it
+        towards = _TURNED if self._off_field() > _DISTURBED else 0.0
+        self._turned += (1.0 - float(np.exp(-elapsed / _TURNED_S))) * (towards - self._turned)
+
+    def _off_field(self) -> float:
+        if self._field is None:
+            return 0.0
+        return abs(self._field / self._usual - 1.0)

@@ -1,0 +1,211 @@
+"""A tracker of inertial sensors says no more than it knows, names what is wrong, and goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worn_people import FOREARMS, Fed, feed, recorded, sensor
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.inertial.mounting import mounting, mountings
+from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackingParameters
+from body_tracking.inertial.worn import ReceiptClock
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.simulation.imus import Slip, usual_mounting
+from body_tracking.simulation.scene import START_NS
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+
+WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+
+
+def covered(fed: Fed, segment: str, since: float) -> FloatArray:
+    """(n,) whether an orientation is within 10 degrees, or within two of its deviations."""
+    error, stddev = fed.errors(segment, since)
+    assert len(error) > 50
+    return np.asarray(((np.abs(error) < np.radians(10.0)) | (np.abs(error) < 2.0 * stddev)).all(axis=1), float)
+
+
+def lines(fed: Fed, since: float = 0.0, until: float = np.inf) -> set[str]:
+    return {line for now, line in fed.named if since <= now <= until}
+
+
+@pytest.fixture(scope="module")
+def wrists() -> Iterator[Fed]:
+    yield feed(
+        recorded("forearm_rolling", (sensor("forearm_left"), sensor("forearm_right")), seed=3), TrackingParameters()
+    )
+
+
+def test_two_forearms_beside_a_camera_are_told_within_what_is_stated(wrists: Fed) -> None:
+    for segment in FOREARMS:
+        assert covered(wrists, segment, 4.0).mean() > 0.95
+        error, _ = wrists.errors(segment, 4.0)
+        # pronation turns by 150 degrees in this movement; what is off is hardly more than the alignment's own error
+        assert np.degrees(np.sqrt((error**2).mean())) < 12.0
+    assert wrists.tracker.counters["alignments by a pose"] == 1
+    assert not {line for line in lines(wrists, 6.0) if line}
+
+
+def test_what_comes_out_has_the_cameras_clock_and_rates_and_comes_no_more_often_than_asked(wrists: Fed) -> None:
+    for segment in FOREARMS:
+        told = [each for each in wrists.orientations if each.segment == segment]
+        steps = np.diff([each.stamp_ns for each in told]) / NANOSECONDS
+        assert (steps > 0.8 / 50.0).all()
+        assert np.median(steps) == pytest.approx(1.0 / 50.0, rel=0.2)
+        middle = told[len(told) // 2 - 100 : len(told) // 2 + 100]
+        # the rate is that at which the orientation changes
+        before, after = middle[100], middle[101]
+        turned = so3.log(so3.matrix_to_quat(before.rotation.T @ after.rotation))
+        assert before.angular_velocity is not None
+        expected = before.angular_velocity * (after.stamp_ns - before.stamp_ns) / NANOSECONDS
+        np.testing.assert_allclose(turned, expected, atol=0.05)
+    last = wrists.recording.truths[0].stamps_ns[-1]
+    assert abs(wrists.orientations[-1].stamp_ns - last) < 0.2 * NANOSECONDS
+
+
+def test_the_skeleton_has_its_forearms_and_says_what_it_guesses(wrists: Fed) -> None:
+    assert len(wrists.skeletons) > 200
+    skeleton = wrists.skeletons[-1]
+    assert skeleton.frame_id == "world"
+    assert skeleton.states[Joint.ELBOW_LEFT] == TrackingState.INFERRED
+    assert skeleton.states[Joint.KNEE_LEFT] == TrackingState.NOT_TRACKED
+    truth = wrists.recording.truths[0]
+    inside = []
+    for each in wrists.skeletons[150::10]:
+        instant = int(np.argmin(np.abs(truth.stamps_ns - each.stamp_ns)))
+        for joint in (Joint.SPINE_SHOULDER, Joint.ELBOW_LEFT, Joint.WRIST_RIGHT):
+            assert each.covariances is not None
+            off = each.positions[joint] - truth.positions[instant, joint]
+            inside.append(np.abs(off) < 2.5 * np.sqrt(each.covariances[joint].diagonal()))
+    assert np.mean(inside) > 0.9
+
+
+def test_a_sensor_that_is_switched_off_is_named_and_comes_back() -> None:
+    off = sensor("forearm_right", off=((6.0, 9.0),))
+    fed = feed(recorded("forearm_rolling", (sensor("forearm_left"), off), seed=4))
+    assert any(line.startswith("forearm_right: silent") for line in lines(fed, 6.8, 8.8))
+    assert not any("silent" in line for line in lines(fed, 9.8))
+    told = [(each.stamp_ns - START_NS) / NANOSECONDS for each in fed.orientations if each.segment == "forearm_right"]
+    assert not [stamp for stamp in told if 6.2 < stamp < 8.9]
+    if [stamp for stamp in told if stamp > 9.5]:
+        error, stddev = fed.errors("forearm_right", 9.5)
+        assert ((np.abs(error) < np.radians(10.0)) | (np.abs(error) < 2.0 * stddev)).mean() > 0.95
+    assert covered(fed, "forearm_left", 4.0).mean() > 0.95
+
+
+def test_a_slip_by_20_degrees_is_named() -> None:
+    slipped = sensor("forearm_right", slips=(Slip(14.0, np.radians([0.0, 20.0, 0.0])),))
+    fed = feed(recorded("reaching", (sensor("forearm_left"), slipped), seed=5), camera_stddev=0.01)
+    named = [line for line in lines(fed) if "slipped" in line]
+    assert named
+    assert all(line.startswith("forearm_right: its sensor has slipped by") for line in named)
+    assert not any("slipped" in line for line in lines(fed, 0.0, 13.9))
+    assert covered(fed, "forearm_right", 26.0).mean() > 0.9
+
+
+def test_two_exchanged_sensors_are_named_and_taken_for_what_they_are(wrists: Fed) -> None:
+    assert wrists.tracker.counters["exchanged sensors"] == 0
+    crossed = sensor("forearm_left", "forearm_right"), sensor("forearm_right", "forearm_left")
+    fed = feed(recorded("reaching", crossed, seed=4))
+    assert fed.tracker.counters["exchanged sensors"] == 2
+    assert "forearm_left: its sensor is on forearm_right" in lines(fed, 20.0)
+    assert "forearm_right: its sensor is on forearm_left" in lines(fed, 20.0)
+    for segment in FOREARMS:
+        assert covered(fed, segment, 20.0).mean() > 0.9
+
+
+@pytest.mark.parametrize("oriented", [False, True], ids=["raw", "oriented"])
+def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
+    imus = (sensor("forearm_left", magnetometer=True, oriented=oriented),)
+
+    def iron(now: float, _tracker: InertialTracker, sample: ImuSample) -> ImuSample:
+        assert sample.magnetic_field is not None
+        if not 10.0 < now < 25.0:
+            return sample
+        return replace(sample, magnetic_field=sample.magnetic_field + np.array([3e-5, -2e-5, 2e-5]))
+
+    fed = feed(recorded("reaching", imus, seed=3), meddle=iron)
+    assert any(line == "forearm_left: magnetic field disturbed" for line in lines(fed, 12.0, 25.0))
+    assert not any("disturbed" in line for line in lines(fed, 0.0, 9.9))
+    assert covered(fed, "forearm_left", 10.0).mean() > 0.95
+
+
+def test_without_a_camera_a_pose_aligns_and_what_drifts_is_stated() -> None:
+    imus = tuple(sensor(segment) for segment in WORN)
+    fed = feed(recorded("reaching", imus, seed=5), TrackingParameters(camera=False, rate=2.0))
+    assert fed.tracker.counters["alignments by a pose"] == 1
+    truth = fed.recording.truths[0]
+    # world is where the person faced; the receiver's clock is another than the truth's
+    assert truth.stamps_ns[0] > 0
+    stddev = [float(np.sqrt(each.covariance[2, 2])) for each in fed.orientations if each.segment == "forearm_left"]
+    assert stddev[-1] > stddev[10]
+    assert fed.skeletons[-1].states[Joint.WRIST_LEFT] == TrackingState.TRACKED
+    assert fed.skeletons[-1].states[Joint.HAND_LEFT] == TrackingState.INFERRED
+
+
+def test_a_pose_may_be_asked_for_again(wrists: Fed) -> None:
+    text = wrists.tracker.align()
+    assert "T-pose" in text
+    assert "second" in text
+
+
+def test_time_that_runs_backwards_begins_anew_and_is_counted() -> None:
+    tracker = InertialTracker(["forearm_left"], TrackingParameters(camera=False))
+    rng = np.random.default_rng(0)
+
+    def still(start_s: float) -> None:
+        for k in range(100):
+            rate, force = 0.01 * rng.normal(size=3), np.array([0.0, 0.0, 9.81]) + 0.02 * rng.normal(size=3)
+            stamp_ns = round((start_s + 0.02 * k) * NANOSECONDS)
+            tracker.add("forearm_left", ImuSample(stamp_ns, "a", None, None, rate, force), stamp_ns + 10_000_000)
+
+    still(100.0)
+    still(50.0)
+    assert tracker.counters["time jumps"] == 1
+    assert not any("silent" in line for line in tracker.problems(round(52.0 * NANOSECONDS)))
+    assert any("silent" in line for line in tracker.problems(round(60.0 * NANOSECONDS)))
+
+
+def test_a_sensor_in_other_units_is_named_and_left_out() -> None:
+    def in_g(now: float, tracker: InertialTracker, sample: ImuSample) -> ImuSample:
+        assert sample.acceleration is not None
+        return replace(sample, acceleration=sample.acceleration / 9.81)
+
+    fed = feed(recorded("two_handed_wave", (sensor("forearm_left"),), seed=1), meddle=in_g)
+    assert any(line.startswith("forearm_left: the acceleration is in units of g") for line in lines(fed, 5.0))
+    assert not [each for each in fed.orientations if each.stamp_ns - START_NS > 4 * NANOSECONDS]
+
+
+def test_a_clock_by_receipt_follows_the_least_delay_and_notices_that_it_was_set() -> None:
+    clock = ReceiptClock()
+    assert clock.delay_ns is None
+    for k in range(1000):
+        assert clock.add(k * 10**7, k * 10**7 + 5 * 10**9 + (k % 7) * 10**6)
+    assert clock.delay_ns == 5 * 10**9
+    assert not clock.add(100 * 10**9, 10 * 10**9)
+    assert clock.delay_ns == -90 * 10**9
+
+
+def test_sensors_are_meant_to_be_worn_as_they_are_simulated() -> None:
+    for segment in SEGMENTS:
+        np.testing.assert_allclose(
+            mounting(segment), so3.quat_to_matrix(usual_mounting(segment).quat_xyzw).T, atol=1e-12
+        )
+    (other,) = mountings(["head"], ["head:+x+z"])
+    np.testing.assert_allclose(other, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "segments, given",
+    [([], ()), (["nose"], ()), (["head", "head"], ()), (["head"], ["head:+x+x"]), (["head"], ["x:+x"])],
+)
+def test_what_cannot_be_worn_is_refused(segments: list[str], given: tuple[str, ...]) -> None:
+    with pytest.raises(BodyTrackingError):
+        InertialTracker(segments, mountings=given)
+    with pytest.raises(InertialTrackingError, match="no inertial sensor"):
+        InertialTracker(["head"]).add("pelvis", ImuSample(0, "a", np.array([0.0, 0.0, 0.0, 1.0])), 0)

@@ -1,0 +1,145 @@
+"""Simulated people with inertial sensors, fed to a tracker as a node would."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from body_tracking.inertial.alignment import rotation_vectors
+from body_tracking.inertial.tracking import InertialTracker, TrackingParameters
+from body_tracking.kinematics.upper_body import SEGMENTS, UpperBody
+from body_tracking.measurement import joint_stddev
+from body_tracking.orientation import SegmentOrientation
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.simulation.layouts import around
+from body_tracking.simulation.scene import START_NS, Setup, SimulatedRecording, simulate
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+
+MODEL = UpperBody()
+FOREARMS = ("forearm_left", "forearm_right")
+
+
+def sensor(segment: str, really_on: str = "", **changes: object) -> SimulatedImu:
+    """A raw sensor without magnetometer, at 50 Hz."""
+    on = really_on or segment
+    return replace(SimulatedImu(segment, on, usual_mounting(on), 50.0, magnetometer=False), **changes)  # type: ignore[arg-type]
+
+
+def recorded(
+    motion: str, imus: tuple[SimulatedImu, ...], seconds: float | None = None, seed: int = 0
+) -> SimulatedRecording:
+    """One person before one camera."""
+    return simulate(Setup(motion, around((0.0,)), imus=imus, seconds=seconds, seed=seed))
+
+
+def samples_of(imu: SimulatedImu, said: ImuSamples) -> list[tuple[int, str, ImuSample]]:
+    """Receipt, segment that is stated, reading."""
+    found = []
+    for k, stamp_ns in enumerate(said.stamps_ns.tolist()):
+        sample = ImuSample(
+            stamp_ns,
+            f"{imu.name}_link",
+            None if said.orientation is None else said.orientation[k],
+            None if said.orientation is None else said.orientation_covariance[k],
+            said.angular_velocity[k],
+            said.linear_acceleration[k],
+            None if said.magnetic_field is None else said.magnetic_field[k],
+        )
+        found.append((int(said.received_ns[k]), imu.name, sample))
+    return found
+
+
+@dataclass(eq=False)
+class Fed:
+    """What a tracker made of a recording."""
+
+    tracker: InertialTracker
+    recording: SimulatedRecording
+    orientations: list[SegmentOrientation]
+    skeletons: list[Skeleton]
+    named: list[tuple[float, str]]
+
+    def true_rotations(self, stamps_ns: list[int]) -> FloatArray:
+        """(n, 12, 3, 3) of the nearest captures."""
+        truth = self.recording.truths[0]
+        nearest = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, len(truth.stamps_ns) - 1)
+        before = np.asarray(stamps_ns) - truth.stamps_ns[nearest - 1]
+        share = before / (truth.stamps_ns[nearest] - truth.stamps_ns[nearest - 1])
+        q = MODEL.integrate(
+            truth.q[nearest - 1], share[:, None] * MODEL.difference(truth.q[nearest - 1], truth.q[nearest])
+        )
+        return MODEL.forward(q, truth.person.lengths).rotations
+
+    def errors(self, segment: str, since: float) -> tuple[FloatArray, FloatArray]:
+        """(n, 3) rotation vectors, radians about world's axes, and (n, 3) stated deviations."""
+        told = [
+            each
+            for each in self.orientations
+            if each.segment == segment and (each.stamp_ns - START_NS) / NANOSECONDS >= since
+        ]
+        true = self.true_rotations([each.stamp_ns for each in told])[:, SEGMENTS.index(segment)]
+        found = np.array([each.rotation for each in told])
+        stddev = np.array([np.sqrt(each.covariance.diagonal()) for each in told])
+        return rotation_vectors(found @ true.swapaxes(-1, -2)), stddev
+
+
+def feed(
+    recording: SimulatedRecording,
+    parameters: TrackingParameters | None = None,
+    meddle: Callable[[float, InertialTracker, ImuSample], ImuSample] | None = None,
+    camera_stddev: float | None = None,
+) -> Fed:
+    """All readings and frames in the order of receipt; the camera's truly placed.
+
+    Args:
+        recording: of somebody.
+        parameters: of the tracker; by default with fewer skeletons than usual, which take their time.
+        meddle: what becomes of a reading, at seconds from the beginning.
+        camera_stddev: metres, of a camera with white noise in the place of the simulated one.
+    """
+    stated = tuple(imu.name for imu, _ in recording.imus)
+    tracker = InertialTracker(stated, TrackingParameters(rate=2.0) if parameters is None else parameters)
+    events: list[tuple[int, str, object]] = [e for imu, said in recording.imus for e in samples_of(imu, said)]
+    (camera,) = recording.sensors
+    rng = np.random.default_rng(0)
+    truth = recording.truths[0]
+    for frame in recording.frames:
+        seen = frame.skeletons[0]
+        if camera_stddev is not None:
+            instant = min(int(np.searchsorted(truth.stamps_ns, seen.stamp_ns)), len(truth.stamps_ns) - 1)
+            clean = truth.skeleton(instant)
+            noisy = clean.positions + camera_stddev * rng.normal(size=(25, 3))
+            told = np.tile(camera_stddev**2 * np.eye(3), (25, 1, 1))
+            events.append((frame.received_ns, "", replace(clean, positions=noisy, covariances=told, velocities=None)))
+            continue
+        variance = joint_stddev(seen.positions, seen.states) ** 2
+        known = np.where(np.isfinite(variance), variance, 1e6)
+        placed = replace(
+            seen,
+            frame_id="world",
+            positions=camera.pose.apply(seen.positions),
+            covariances=known[:, None, None] * np.eye(3),
+        )
+        events.append((frame.received_ns, "", placed))
+    events.sort(key=lambda each: each[:2])
+    fed = Fed(tracker, recording, [], [], [])
+    begin = events[0][0]
+    for received_ns, name, what in events:
+        now = (received_ns - begin) / NANOSECONDS
+        if isinstance(what, Skeleton):
+            tracker.see(what, received_ns)
+        else:
+            assert isinstance(what, ImuSample)
+            if meddle is not None:
+                what = meddle(now, tracker, what)
+            told = tracker.add(name, what, received_ns)
+            if told.orientation is not None:
+                fed.orientations.append(told.orientation)
+            if told.skeleton is not None:
+                fed.skeletons.append(told.skeleton)
+        if not fed.named or now - fed.named[-1][0] > 0.2:
+            fed.named += [(now, line) for line in tracker.problems(received_ns)] or [(now, "")]
+    return fed
