@@ -14,8 +14,8 @@ frames were laid evenly over the rows, also where the log of the sensors stood s
 against those of their own Vicon; the link itself has no say in it. ``1 offset`` beside it: the figures by one constant
 offset, of up to 0.1 s, that is fitted to the link itself. The bars are those of the former.
 
-What remains: over 0.3 s the gyroscopes alone differ from Vicon, so aligned, by 0.6, 1.6, 1.8 degrees RMS (median 0.3,
-0.5 and 0.6); the third is at its stop ten times, for 0.05 to 0.2 s. Another ``tauAcc`` of VQF (1.5 to 12 s) leaves
+What remains: over 0.3 s the gyroscopes alone differ from Vicon, so aligned, by 0.6, 1.6 and 1.8 degrees RMS (median
+0.3, 0.5 and 0.6); the third is at its stop ten times, for 0.05 to 0.2 s. Another ``tauAcc`` of VQF (1.5 to 12 s) leaves
 inclinations of at least 1.06 and 1.9 degrees on the second and third link, stamps on the sensors' own 20 ms none less.
 
 Left out: Vicon's frames within half a second of where its orientation is none (a quaternion that is not of unit
