@@ -457,7 +457,8 @@ def _markdown(table: Table, figure: str) -> list[str]:
             half = "" if np.isnan(mean.half) else f" ± {mean.half:.{digits}f}"
             cells.append("-" if np.isnan(mean.value) else f"{mean.value:.{digits}f}{half}")
         rows.append(f"| {kind} | {' | '.join(cells)} |")
-    medians = (np.nanmedian([row[method][figure].value for row in table.values()]) for method in methods)
+    columns = ([row[method][figure].value for row in table.values()] for method in methods)
+    medians = (float("nan") if np.isnan(column).all() else np.nanmedian(column) for column in columns)
     rows.append("| **median** | " + " | ".join("-" if np.isnan(m) else f"**{m:.{digits}f}**" for m in medians) + " |")
     return rows
 

@@ -29,10 +29,9 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import gzip
 import json
 import sys
-import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,6 +59,9 @@ from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by
 from body_tracking.inertial.heading import HeadingTracker, bone_of
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import PARENTS, SEGMENTS, UpperBody
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.sensors.imu_csv import ImuCsvRecording
+from body_tracking.sensors.mvnx import MvnxFrame, MvnxRecording
 from body_tracking.simulation.imus import CONSUMER, Motion, SimulatedImu, usual_mounting
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.repertoire import make_movement
@@ -79,15 +81,21 @@ TRUE_OFFSET_S = 11.03
 
 
 def read_two_arm(path: Path) -> tuple[Stream, Stream]:
-    """Both sensors, each in its own clock. LPMS: rates in deg/s; quaternions wxyz, earth to sensor."""
-    with gzip.open(path, "rt") as file:
-        numbers = np.genfromtxt(file, delimiter=",", skip_header=1)
-    streams = []
-    for number, segment in enumerate(("upper_arm_right", "forearm_right")):
-        s = numbers[:, 20 * number : 20 * number + 20]
-        rotations = Rotation.from_quat(s[:, [17, 18, 19, 16]]).inv().as_matrix()
-        streams.append(Stream(segment, s[:, 0], rotations, np.radians(s[:, 1:4])))
-    return streams[0], streams[1]
+    """Both sensors, each in its own clock."""
+    segments = ("upper_arm_right", "forearm_right")
+    samples: dict[str, list[ImuSample]] = {segment: [] for segment in segments}
+    for reading in ImuCsvRecording(path, segments):
+        samples[reading.sensor].append(reading.sample)
+    upper, lower = (
+        Stream(
+            segment,
+            np.array([sample.stamp_ns for sample in own]) / NANOSECONDS,
+            so3.quat_to_matrix(np.array([sample.orientation for sample in own])),
+            np.array([sample.angular_velocity for sample in own]),
+        )
+        for segment, own in samples.items()
+    )
+    return upper, lower
 
 
 def two_arm(path: Path) -> dict[str, Any]:
@@ -150,36 +158,30 @@ XSENS_SEGMENTS = {"pelvis": "Pelvis", "upper_trunk": "T8", "head": "Head"} | {
     for ours, theirs in (("clavicle", "Shoulder"), ("upper_arm", "UpperArm"), ("forearm", "ForeArm"), ("hand", "Hand"))
 }
 ALIGNED_FRAMES = 30
-_NAMESPACE = "{http://www.xsens.com/mvn/mvnx}"
 _TO_ISB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Vectors of frames with z up to ISB's: x forward, y up, z to the right."""
 
 
 def read_xsens(path: Path) -> dict[str, Any]:
-    """Labels, and per frame type the fields of all frames as one array."""
-    with gzip.open(path) as file:
-        subject = ET.parse(file).getroot().find(f"{_NAMESPACE}subject")
-    assert subject is not None
-    labels = {
-        what: [str(each.get("label")) for each in subject.iterfind(f"{_NAMESPACE}{what}/*")]
-        for what in ("segments", "sensors", "joints")
-    }
-    frames: dict[str, list[dict[str, FloatArray]]] = {}
-    for frame in subject.iterfind(f"{_NAMESPACE}frames/{_NAMESPACE}frame"):
-        fields = {each.tag.removeprefix(_NAMESPACE): np.array((each.text or "").split(), float) for each in frame}
-        frames.setdefault(str(frame.get("type")), []).append(fields)
+    """Rotations of segments and sensors and angles by name: of all frames, and of the poses before them."""
+    recording = MvnxRecording(path)
+    frames: dict[str, list[MvnxFrame]] = {}
+    for frame in recording.frames():
+        frames.setdefault(frame.kind, []).append(frame)
+    header = recording.header
+    assert header is not None
 
-    def rotations(kind: str, what: str, names: list[str]) -> dict[str, FloatArray]:
-        values = np.array([frame[what] for frame in frames[kind]]).reshape(-1, len(names), 4)[..., [1, 2, 3, 0]]
-        return {name: so3.quat_to_matrix(values[:, number]) for number, name in enumerate(names)}
+    def rotations(kind: str, what: str, names: Sequence[str]) -> dict[str, FloatArray]:
+        turned = so3.quat_to_matrix(np.array([getattr(frame, what) for frame in frames[kind]]))
+        return {name: turned[:, number] for number, name in enumerate(names)}
 
-    angles = np.array([frame["jointAngle"] for frame in frames["normal"]]).reshape(-1, len(labels["joints"]), 3)
+    angles = np.array([frame.joint_angles for frame in frames["normal"]])
     return {
-        "segments": rotations("normal", "orientation", labels["segments"]),
-        "sensors": rotations("normal", "sensorOrientation", labels["sensors"]),
-        "tpose": {name: each[0] for name, each in rotations("tpose", "orientation", labels["segments"]).items()},
-        "isb": {name: each[0] for name, each in rotations("tpose-isb", "orientation", labels["segments"]).items()},
-        "angles": {name: np.radians(angles[:, number]) for number, name in enumerate(labels["joints"])},
+        "segments": rotations("normal", "segment_xyzw", header.segments),
+        "sensors": rotations("normal", "sensor_xyzw", header.sensors),
+        "tpose": {name: each[0] for name, each in rotations("tpose", "segment_xyzw", header.segments).items()},
+        "isb": {name: each[0] for name, each in rotations("tpose-isb", "segment_xyzw", header.segments).items()},
+        "angles": {name: angles[:, number] for number, name in enumerate(header.joints)},
     }
 
 

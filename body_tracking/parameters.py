@@ -81,7 +81,8 @@ class Parameter:
         if isinstance(checked, int | float) and not isinstance(checked, bool):
             low = -math.inf if self.min is None else self.min
             high = math.inf if self.max is None else self.max
-            if not low <= checked <= high or not math.isfinite(checked):
+            # a number may be infinite where its bound says so
+            if not low <= checked <= high or (math.isinf(checked) and checked not in (self.min, self.max)):
                 raise ParameterError(f"parameter {self.name!r}: {value!r}, expected {self.constraint or 'finite'}")
         if self.choices and checked not in self.choices:
             raise ParameterError(f"parameter {self.name!r}: {value!r}, expected one of {self.constraint}")
@@ -94,7 +95,7 @@ class Parameter:
             return None
         if isinstance(value, bool) or isinstance(self.default, bool):
             return value if isinstance(value, bool) and isinstance(self.default, bool) else None
-        if isinstance(self.default, float) and isinstance(value, int):
+        if isinstance(self.default, float) and isinstance(value, int | float):
             return float(value)
         return value if type(value) is type(self.default) else None
 
@@ -122,6 +123,24 @@ def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: s
         name, doc = f"{prefix}{item.name}", item.metadata.get("doc", "")
         table.append(Parameter(name, default, doc, choices=choices, live=live, **known))
     return tuple(table)
+
+
+def check_fields(parameters: Any, what: str, error: type[BodyTrackingError]) -> None:
+    """Check the values of a parameter dataclass by the metadata of its fields.
+
+    Args:
+        parameters: an instance of a class as :func:`parameters_from` takes it.
+        what: the parameters are of, for the error's text.
+        error: the class of the error.
+
+    Raises:
+        BodyTrackingError: a value is of another type, or out of its range: one of the class ``error``.
+    """
+    for item in parameters_from(type(parameters)):
+        try:
+            item.check(getattr(parameters, item.name))
+        except ParameterError as problem:
+            raise error(f"{what}: {problem}") from problem
 
 
 def fields_of(parameter_class: type[Any], values: Mapping[str, Value], *, prefix: str = "") -> dict[str, Any]:

@@ -35,7 +35,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 from scipy.stats import chi2
 
 from body_tracking.filters import orientation
-from body_tracking.filters.linear import check_fields
+from body_tracking.filters.linear import FilterError
 from body_tracking.filters.orientation import PER_SOURCE, OrientationParameters, Sources
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.estimate import ModelEstimate
@@ -46,7 +46,7 @@ from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
-from body_tracking.parameters import number_field
+from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     BONES,
     N_JOINTS,
@@ -266,7 +266,7 @@ class EkfParameters(OrientationParameters):
     )
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_fields(self, "extended filter", FilterError)
 
 
 class _Changeable:

@@ -20,8 +20,7 @@ soon (adjustable level of the process noise, Bar-Shalom, Li and Kirubarajan 2001
 
 from __future__ import annotations
 
-from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 from filterpy.common import Q_continuous_white_noise
@@ -32,6 +31,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
+from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     BONES,
     N_JOINTS,
@@ -76,26 +76,6 @@ class FilterError(BodyTrackingError):
     """A filter was asked for by an unknown name or with parameters that make no sense."""
 
 
-class Parameters(Protocol):
-    """Any dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-
-def check_fields(parameters: Parameters) -> None:
-    """Check numbers of a dataclass by the ``min`` and ``max`` in their fields' metadata.
-
-    Raises:
-        FilterError: one is out of its range, or no number, or not a whole one where the default is.
-    """
-    for item in fields(parameters):
-        value, low, high = getattr(parameters, item.name), item.metadata["min"], item.metadata["max"]
-        whole = isinstance(item.default, int)
-        if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not low <= value <= high:
-            expected = f"a {'whole ' if whole else ''}number from {low} to {high}"
-            raise FilterError(f"filter parameter {item.name}: {value!r}, expected {expected}")
-
-
 @dataclass(frozen=True, slots=True)
 class LinearKalmanParameters:
     """The settings of both linear filters; each field's metadata says what it is, its unit and its range.
@@ -104,160 +84,108 @@ class LinearKalmanParameters:
         FilterError: a value out of its range.
     """
 
-    acceleration_density_trunk: float = field(
-        default=ACCELERATION_DENSITIES[0],
-        metadata={
-            "doc": "constant velocity: spectral density of the acceleration of spine, head, shoulders, hips, per axis",
-            "unit": "m2/s3",
-            "min": 1e-6,
-            "max": 1e4,
-        },
+    acceleration_density_trunk: float = number_field(
+        ACCELERATION_DENSITIES[0],
+        "constant velocity: spectral density of the acceleration of spine, head, shoulders, hips, per axis",
+        "m2/s3",
+        1e-6,
+        1e4,
     )
-    acceleration_density_limb: float = field(
-        default=ACCELERATION_DENSITIES[1],
-        metadata={
-            "doc": "constant velocity: spectral density of the acceleration of elbows and knees, per axis",
-            "unit": "m2/s3",
-            "min": 1e-6,
-            "max": 1e4,
-        },
+    acceleration_density_limb: float = number_field(
+        ACCELERATION_DENSITIES[1],
+        "constant velocity: spectral density of the acceleration of elbows and knees, per axis",
+        "m2/s3",
+        1e-6,
+        1e4,
     )
-    acceleration_density_extremity: float = field(
-        default=ACCELERATION_DENSITIES[2],
-        metadata={
-            "doc": "constant velocity: spectral density of the acceleration of wrists, hands, ankles, feet, per axis",
-            "unit": "m2/s3",
-            "min": 1e-6,
-            "max": 1e4,
-        },
+    acceleration_density_extremity: float = number_field(
+        ACCELERATION_DENSITIES[2],
+        "constant velocity: spectral density of the acceleration of wrists, hands, ankles, feet, per axis",
+        "m2/s3",
+        1e-6,
+        1e4,
     )
-    velocity_density_trunk: float = field(
-        default=0.02,
-        metadata={
-            "doc": "zero velocity: spectral density of the velocity of spine, head, shoulders, hips, per axis",
-            "unit": "m2/s",
-            "min": 1e-8,
-            "max": 1e3,
-        },
+    velocity_density_trunk: float = number_field(
+        0.02,
+        "zero velocity: spectral density of the velocity of spine, head, shoulders, hips, per axis",
+        "m2/s",
+        1e-8,
+        1e3,
     )
-    velocity_density_limb: float = field(
-        default=0.06,
-        metadata={
-            "doc": "zero velocity: spectral density of the velocity of elbows and knees, per axis",
-            "unit": "m2/s",
-            "min": 1e-8,
-            "max": 1e3,
-        },
+    velocity_density_limb: float = number_field(
+        0.06, "zero velocity: spectral density of the velocity of elbows and knees, per axis", "m2/s", 1e-8, 1e3
     )
-    velocity_density_extremity: float = field(
-        default=0.2,
-        metadata={
-            "doc": "zero velocity: spectral density of the velocity of wrists, hands, ankles, feet, per axis",
-            "unit": "m2/s",
-            "min": 1e-8,
-            "max": 1e3,
-        },
+    velocity_density_extremity: float = number_field(
+        0.2,
+        "zero velocity: spectral density of the velocity of wrists, hands, ankles, feet, per axis",
+        "m2/s",
+        1e-8,
+        1e3,
     )
-    measurement_noise_scale: float = field(
-        default=1.0,
-        metadata={
-            "doc": "where the skeleton brings no covariance: factor on the standard deviation per joint, tracking "
-            "state and distance of body_tracking.measurement",
-            "unit": "",
-            "min": 0.01,
-            "max": 100.0,
-        },
+    measurement_noise_scale: float = number_field(
+        1.0,
+        "where the skeleton brings no covariance: factor on the standard deviation per joint, tracking "
+        "state and distance of body_tracking.measurement",
+        "",
+        0.01,
+        100.0,
     )
-    white_noise_share: float = field(
-        default=0.06,
-        metadata={
-            "doc": "share of the measurement variance that is new in every frame, and is filtered; the rest is a slow "
-            "error that no filter can remove, and is added to the covariance of the result",
-            "unit": "",
-            "min": 0.001,
-            "max": 1.0,
-        },
+    white_noise_share: float = number_field(
+        0.06,
+        "share of the measurement variance that is new in every frame, and is filtered; the rest is a slow "
+        "error that no filter can remove, and is added to the covariance of the result",
+        "",
+        0.001,
+        1.0,
     )
-    adaptation: float = field(
-        default=0.5,
-        metadata={
-            "doc": "by how much the logarithm of a joint's process noise rises with each normalised innovation squared "
-            "beyond four times its expectation; 0 leaves the noise as it is",
-            "unit": "",
-            "min": 0.0,
-            "max": 10.0,
-        },
+    adaptation: float = number_field(
+        0.5,
+        "by how much the logarithm of a joint's process noise rises with each normalised innovation squared "
+        "beyond four times its expectation; 0 leaves the noise as it is",
+        "",
+        0.0,
+        10.0,
     )
-    adaptation_time: float = field(
-        default=0.1,
-        metadata={
-            "doc": "time constant with which that fades: a thrust lasts that long",
-            "unit": "s",
-            "min": 0.001,
-            "max": 100.0,
-        },
+    adaptation_time: float = number_field(
+        0.1, "time constant with which that fades: a thrust lasts that long", "s", 0.001, 100.0
     )
-    initial_velocity_stddev: float = field(
-        default=1.0,
-        metadata={
-            "doc": "standard deviation per axis of the velocity of a joint when it is first seen",
-            "unit": "m/s",
-            "min": 1e-3,
-            "max": 100.0,
-        },
+    initial_velocity_stddev: float = number_field(
+        1.0, "standard deviation per axis of the velocity of a joint when it is first seen", "m/s", 1e-3, 100.0
     )
-    gate_probability: float = field(
-        default=0.9999,
-        metadata={
-            "doc": "a measurement is rejected where its innovation lies beyond this chi-square quantile (3 degrees of "
-            "freedom); 1 rejects nothing",
-            "unit": "",
-            "min": 0.5,
-            "max": 1.0,
-        },
+    gate_probability: float = number_field(
+        0.9999,
+        "a measurement is rejected where its innovation lies beyond this chi-square quantile (3 degrees of "
+        "freedom); 1 rejects nothing",
+        "",
+        0.5,
+        1.0,
     )
-    reacquire_after: float = field(
-        default=0.12,
-        metadata={
-            "doc": "a joint rejected without a break for longer than this is started anew on its measurement; much "
-            "later the grown uncertainty would let it in as a sudden movement, and overshoot",
-            "unit": "s",
-            "min": 0.0,
-            "max": 60.0,
-        },
+    reacquire_after: float = number_field(
+        0.12,
+        "a joint rejected without a break for longer than this is started anew on its measurement; much "
+        "later the grown uncertainty would let it in as a sudden movement, and overshoot",
+        "s",
+        0.0,
+        60.0,
     )
-    predict_for: float = field(
-        default=0.5,
-        metadata={
-            "doc": "a joint without an accepted measurement for longer than this is lost: not tracked, NaN",
-            "unit": "s",
-            "min": 0.0,
-            "max": 60.0,
-        },
+    predict_for: float = number_field(
+        0.5, "a joint without an accepted measurement for longer than this is lost: not tracked, NaN", "s", 0.0, 60.0
     )
-    reset_gap: float = field(
-        default=1.0,
-        metadata={
-            "doc": "a gap between frames longer than this starts every joint anew",
-            "unit": "s",
-            "min": 0.01,
-            "max": 600.0,
-        },
+    reset_gap: float = number_field(
+        1.0, "a gap between frames longer than this starts every joint anew", "s", 0.01, 600.0
     )
 
-    reorder_window: float = field(
-        default=0.1,
-        metadata={
-            "doc": "a frame older than the last one by no more than this came late and is ignored; an older one is a "
-            "backward jump of time, which starts every joint anew",
-            "unit": "s",
-            "min": 0.0,
-            "max": 10.0,
-        },
+    reorder_window: float = number_field(
+        0.1,
+        "a frame older than the last one by no more than this came late and is ignored; an older one is a "
+        "backward jump of time, which starts every joint anew",
+        "s",
+        0.0,
+        10.0,
     )
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_fields(self, "linear filter", FilterError)
 
 
 class LinearKalmanFilter:

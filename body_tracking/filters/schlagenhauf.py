@@ -19,9 +19,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from body_tracking.filters.linear import check_fields
+from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.measurement import left_right_axes
+from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     N_JOINTS,
     NANOSECONDS,
@@ -60,40 +61,20 @@ class SchlagenhaufParameters:
         FilterError: a value out of its range.
     """
 
-    process_noise: float = field(
-        default=1e-4,
-        metadata={
-            "doc": "Q: variance added in every frame to each angle (rad2) and to each rate (rad2/s2); figure 5.11",
-            "unit": "",
-            "min": 1e-12,
-            "max": 1e4,
-        },
+    process_noise: float = number_field(
+        1e-4,
+        "Q: variance added in every frame to each angle (rad2) and to each rate (rad2/s2); figure 5.11",
+        "",
+        1e-12,
+        1e4,
     )
-    measurement_stddev: float = field(
-        default=0.005,
-        metadata={
-            "doc": "square root of R: standard deviation of each coordinate of each measured joint",
-            "unit": "m",
-            "min": 1e-4,
-            "max": 10.0,
-        },
+    measurement_stddev: float = number_field(
+        0.005, "square root of R: standard deviation of each coordinate of each measured joint", "m", 1e-4, 10.0
     )
-    initial_angle_stddev: float = field(
-        default=0.1,
-        metadata={"doc": "square root of P(0|0) of the angles", "unit": "rad", "min": 1e-6, "max": 10.0},
-    )
-    initial_rate_stddev: float = field(
-        default=0.1,
-        metadata={"doc": "square root of P(0|0) of the rates", "unit": "rad/s", "min": 1e-6, "max": 100.0},
-    )
-    time_step: float = field(
-        default=1.0 / 30.0,
-        metadata={
-            "doc": "what passes from frame to frame, whatever their stamps say",
-            "unit": "s",
-            "min": 1e-3,
-            "max": 1.0,
-        },
+    initial_angle_stddev: float = number_field(0.1, "square root of P(0|0) of the angles", "rad", 1e-6, 10.0)
+    initial_rate_stddev: float = number_field(0.1, "square root of P(0|0) of the rates", "rad/s", 1e-6, 100.0)
+    time_step: float = number_field(
+        1.0 / 30.0, "what passes from frame to frame, whatever their stamps say", "s", 1e-3, 1.0
     )
     calibration_frames: int = field(
         default=50,
@@ -105,29 +86,25 @@ class SchlagenhaufParameters:
             "max": 10_000,
         },
     )
-    reset_gap: float = field(
-        default=1.0,
-        metadata={
-            "doc": "a gap between frames longer than this is counted; it is one step like any other, for a new start "
-            "would need the T-pose",
-            "unit": "s",
-            "min": 0.01,
-            "max": 600.0,
-        },
+    reset_gap: float = number_field(
+        1.0,
+        "a gap between frames longer than this is counted; it is one step like any other, for a new start "
+        "would need the T-pose",
+        "s",
+        0.01,
+        600.0,
     )
-    reorder_window: float = field(
-        default=0.1,
-        metadata={
-            "doc": "a frame older than the last one by no more than this came late and is ignored; an older one is a "
-            "backward jump of time, which starts with a new T-pose",
-            "unit": "s",
-            "min": 0.0,
-            "max": 10.0,
-        },
+    reorder_window: float = number_field(
+        0.1,
+        "a frame older than the last one by no more than this came late and is ignored; an older one is a "
+        "backward jump of time, which starts with a new T-pose",
+        "s",
+        0.0,
+        10.0,
     )
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_fields(self, "filter of the thesis", FilterError)
 
 
 class SchlagenhaufKalmanFilter:

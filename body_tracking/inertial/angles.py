@@ -31,8 +31,8 @@ class SegmentAngles:
     def __init__(self, model: UpperBody) -> None:
         isb = convention("isb", model)
         # all its chains are between segments: one stage
-        ((self._sequences, self._parents, self._children, rows),) = isb._stages
-        told = dict(zip((isb._rows - rows.start).tolist(), isb.names, strict=True))
+        ((self._sequences, self._parents, self._children, rows),) = isb.stages
+        told = dict(zip((isb.rows - rows.start).tolist(), isb.names, strict=True))
         names = []
         for place in range(rows.stop - rows.start):
             if place in told:

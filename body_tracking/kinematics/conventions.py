@@ -99,7 +99,9 @@ class Convention:
     """Names of angles and how to get them.
 
     Attributes:
-        names: in the order of the output.
+        names: n, in the order of the output.
+        rows: (n,) where among all that can be computed each of them is: coordinates, then three angles of each chain.
+        stages: what is computed together: the chains' sequences, parents and children among the segments, and rows.
     """
 
     def __init__(
@@ -139,10 +141,10 @@ class Convention:
         for number, chain in enumerate(all_chains):
             rows |= {name: count + 3 * number + k for k, name in enumerate(chain.names) if name is not None}
             rows |= dict.fromkeys(chain.redundant, zero)
-        self._rows: IntArray = np.array([rows[name] for name in names], dtype=np.intp)
-        self._redundant = self._rows == zero
-        self._greatest = np.where(self._rows < count, np.inf, GREATEST_STDDEV)
-        self._stages = []
+        self.rows: IntArray = np.array([rows[name] for name in names], dtype=np.intp)
+        self._redundant = self.rows == zero
+        self._greatest = np.where(self.rows < count, np.inf, GREATEST_STDDEV)
+        self.stages = []
         start = count
         for stage in (chains, later):
             if stage:
@@ -151,7 +153,7 @@ class Convention:
                     for end in ("parent", "child")
                 )
                 stop = start + 3 * len(stage)
-                self._stages.append((EulerSequences([c.angles for c in stage]), parents, children, slice(start, stop)))
+                self.stages.append((EulerSequences([c.angles for c in stage]), parents, children, slice(start, stop)))
                 start = stop
         self._size = zero + 1
         # where the previous angles of the output belong among all rows
@@ -174,11 +176,11 @@ class Convention:
                 raise ConventionError(f"previous angles: names {previous.names[:3]}..., expected {self.names[:3]}...")
             if np.isfinite(previous.position).all():
                 before = np.zeros(self._size)
-                before[self._rows] = previous.position
+                before[self.rows] = previous.position
         values = np.zeros(self._size)
         values[self._scalar_row] = estimate.q[self._scalar]
         gradients, rates = self._identity.copy(), self._identity.copy()
-        for stage, (sequences, parents, children, rows) in enumerate(self._stages):
+        for stage, (sequences, parents, children, rows) in enumerate(self.stages):
             if stage == 1 and self._frames:
                 rotations, turning = self._extend(rotations, turning, values, gradients)
             back = rotations[parents].swapaxes(-1, -2)
@@ -193,7 +195,7 @@ class Convention:
             gradients[rows] = (split.gradients @ turned).reshape(-1, nv - 6)
             rates[rows] = (split.rates @ turned).reshape(-1, nv - 6)
 
-        gradient, rate_gradient = gradients[self._rows], rates[self._rows]
+        gradient, rate_gradient = gradients[self.rows], rates[self.rows]
         stddev = _stddev(gradient, covariance, unknown)
         by_range = np.sqrt((gradient * gradient) @ self._prior)
         lost_angle = self._redundant | (stddev > KNOWN_SHARE * np.minimum(by_range, self._greatest))
@@ -201,7 +203,7 @@ class Convention:
         return JointAngles(
             stamp_ns=estimate.stamp_ns,
             names=self.names,
-            position=values[self._rows],
+            position=values[self.rows],
             velocity=_times(rate_gradient, estimate.velocity[joint]),
             position_stddev=np.where(lost_angle, np.inf, stddev),
             # what says nothing of an angle says nothing of its rate
@@ -212,7 +214,7 @@ class Convention:
         self, rotations: FloatArray, turning: FloatArray, values: FloatArray, gradients: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Rotations and their derivatives with those of the frames behind."""
-        sequences, _, _, rows = self._stages[0]
+        sequences, _, _, rows = self.stages[0]
         more_rotations, more_turning = [], []
         for parent, chain, count in self._frames:
             basis = sequences.basis[chain]

@@ -264,6 +264,10 @@ class GraphNode(Node):
         """Of skeleton topics, by the parameter ``reliable``."""
         return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else graph.SKELETON)
 
+    def result_qos(self) -> QoSProfile:
+        """Of results, which are reliable; as deep as skeletons by the parameter ``reliable``."""
+        return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else RELIABLE_QOS)
+
     def listen(
         self, topic: str, kind: type[Any], qos: QoSProfile, handle: Callable[[Any, int], None], *, raw: bool = False
     ) -> Subscription:

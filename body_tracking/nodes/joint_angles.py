@@ -19,10 +19,8 @@ from body_tracking.filtering import ANGLES
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import AngleStream, state_estimate
 from body_tracking.messages import MessageError, image_to_covariance, joint_state_to_model
-from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import BODY, RELIABLE, GraphNode, run
 from body_tracking.parameters import Value
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.skeleton import Skeleton
 
 PARAMETERS = (BODY, *ANGLES, RELIABLE)
@@ -54,7 +52,7 @@ class JointAnglesNode(GraphNode):
 
     def start(self) -> None:
         """Connect."""
-        qos = to_profile(RELIABLE_QOS)
+        qos = self.result_qos()
         self.output = self.create_publisher(JointState, graph.joint_states_topic(self.body), qos)
         self.stddev_output = self.create_publisher(JointState, graph.joint_states_stddev_topic(self.body), qos)
         self.connect()

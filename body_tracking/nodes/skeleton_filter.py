@@ -44,7 +44,6 @@ from body_tracking.nodes.common import (
 )
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import LATCHED, Qos
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
@@ -123,7 +122,7 @@ class SkeletonFilterNode(GraphNode):
                 graph.MODEL_STATE: (JointState, skeletons),
                 graph.MODEL_STATE_STDDEV: (JointState, skeletons),
                 graph.MODEL_COVARIANCE: (Image, skeletons),
-                graph.segments_topic(body): (MultiDOFJointState, to_profile(RELIABLE_QOS)),
+                graph.segments_topic(body): (MultiDOFJointState, self.result_qos()),
                 graph.urdf_topic(body): (String, to_profile(graph.URDF_QOS)),
             }
         for topic in topics.keys() - self.outputs.keys():

@@ -13,7 +13,8 @@ in the sensor's frame: both are turned about. A row was received when the first 
 ``RepoIMU``, of Szczesna et al., "Reference data set for accuracy evaluation of orientation estimation algorithms for
 inertial motion capture systems", 2016: two lines of header, semicolons, ``Time``, the reference's orientation, and
 acceleration, rate and magnetic field of one sensor. The latter is normalised, and taken for shares of 50 microtesla.
-Rows were written faster than the sensor spoke: those that repeat its reading are left out.
+Rows were written faster than the sensor spoke: those that repeat its reading are left out. On the pendulum they come
+every 11 ms, rates at 50 Hz and accelerations at 26 Hz; ``Time`` has five digits, so from 100 s on steps of 10 ms.
 """
 
 from __future__ import annotations

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
 from vqf import VQF
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.sensors.imu import STANDARD_GRAVITY, ImuSample
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray
 
 OUTAGE_S: Final = 1.0
 """After a gap this long the tilt is found anew, and the heading is as good as lost."""
@@ -31,6 +33,8 @@ _UNIT_OF_BIAS: Final = np.radians(0.01)
 """rad/s: VQF's covariance of the bias is in (0.01 deg/s)^2."""
 _VQF_WANDER: Final = np.radians(0.1) / np.sqrt(100.0)
 """rad/s/sqrt(s): VQF's bias walks 0.1 deg/s within its ``biasForgettingTime``."""
+_CLIPPED: Final = 0.95
+"""Share of the range from which on a rate is taken for clipped: calibration moves the stop by scale and bias."""
 _UNIFORM: Final = np.pi / np.sqrt(3.0)
 """Standard deviation of an angle that may be any."""
 
@@ -52,6 +56,7 @@ class InertialErrors:
         gyro_wander: rad/s/sqrt(s), by which the bias walks.
         gyro_scale: 1.
         gyro_axes: 1, cross-axis sensitivity.
+        gyro_range: rad/s, at which an axis is clipped.
         acc_bias: m/s2.
         acc_scale: 1, scale and cross-axis sensitivity.
         mag_bias: tesla, what calibration left of hard iron.
@@ -63,6 +68,7 @@ class InertialErrors:
     gyro_wander: float = float(np.radians(0.002))
     gyro_scale: float = 0.01
     gyro_axes: float = 0.005
+    gyro_range: float = float(np.radians(2000.0))
     acc_bias: float = 0.1
     acc_scale: float = 0.005
     mag_bias: float = 1e-6
@@ -104,6 +110,11 @@ class OrientationEstimator:
     found anew, and the heading goes on with the uncertainty of what may have happened. Time that runs backwards begins
     everything anew. A stamp that repeats is left out.
 
+    Range: a rate at the gyroscope's stop says less than the sensor turned. What it hid, for up to half a second, is
+    made up for at the second reading after, by the cubic that goes on from the rates before and after; until then the
+    covariance knows nothing of it. After that, as after lost readings, the accelerometer levels with the weight that
+    the doubt gives it: VQF's low-pass begins anew as the mean of as many readings as the old tilt is still worth.
+
     Args:
         magnetometer: use the magnetic field where readings have it.
         errors: what the sensor is taken to err by.
@@ -125,6 +136,7 @@ class OrientationEstimator:
         self._step = 0.0
         self._intervals: deque[float] = deque(maxlen=_RATE_OVER)
         self._budget = _Budget(self._errors)
+        self._stretch = _ClippedRate(self._errors.gyro_range)
         self._before: tuple[FloatArray, Any] | None = None
         self._field_seen = False
 
@@ -190,6 +202,7 @@ class OrientationEstimator:
             self._before = self._before[0], {**self._before[1], "bias": None}
             self._budget.forget_bias()
         self._filter = None
+        self._stretch = _ClippedRate(self._errors.gyro_range)
         self._starting.clear()
         self._intervals.clear()
 
@@ -250,6 +263,12 @@ class OrientationEstimator:
         after = vqf.state
         up = _up(vqf.getQuat6D())
         self._budget.predict(interval, steps, self._step, up, middle - bias, before, after)
+        hidden = self._stretch.update(steps * self._step, rate)
+        if hidden is not None:
+            self._budget.doubt(hidden.doubt**2)
+            self._turn_by(hidden.angle)
+        if hidden is not None or steps > 2:
+            self._level_anew()
         if self._magnetometer and sample.magnetic_field is not None:
             self._turn_to(sample.magnetic_field)
         self._latest = sample
@@ -263,6 +282,26 @@ class OrientationEstimator:
             bias,
             bool(vqf.getRestDetected()),
         )
+
+    def _turn_by(self, angle: FloatArray) -> None:
+        """Turn by a rotation vector (3,) in the sensor's frame."""
+        state = self._filter.state
+        half = 0.5 * angle
+        turn = np.concatenate([[np.cos(np.linalg.norm(half))], np.sinc(np.linalg.norm(half) / np.pi) * half])
+        state["gyrQuat"] = VQF.quatMultiply(np.array(state["gyrQuat"]), turn)
+        self._filter.state = state
+
+    def _level_anew(self) -> None:
+        """Let the mean of the acceleration, which is vertical, begin with the weight that the tilt still deserves."""
+        state, params = self._filter.state, self._filter.params
+        worth = max(params["tauAcc"] * self._budget.known_tilt(), _LEAST_WORTH_S) / self._step
+        low_pass = np.array(state["accLpState"])
+        if worth >= (low_pass[1] if np.isnan(low_pass[0]) else 0.5 * params["tauAcc"] / self._step):
+            return
+        low_pass[:2] = np.nan, worth
+        low_pass[2:5] = worth * np.asarray(state["lastAccLp"])
+        state["accLpState"] = low_pass
+        self._filter.state = state
 
     def _turn_to(self, field: FloatArray) -> None:
         """Let VQF correct the heading by a magnetic field, and see by how much."""
@@ -282,6 +321,86 @@ class OrientationEstimator:
             vqf.getMagRefDip(),
             bool(vqf.getMagDistDetected()),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hidden:
+    """What a clipped rate hid: a rotation vector (3,) in the sensor's frame, and its standard deviation, radians."""
+
+    angle: FloatArray
+    doubt: float
+
+
+class _ClippedRate:
+    """Where the rate of an axis is at its stop, and how far the sensor turned meanwhile.
+
+    The rate of such an axis is taken for the cubic (Hermite) that has the rates and slopes just outside the stretch:
+    with rates a, b, slopes a', b' and duration T it turns by ``T (a + b) / 2 + T^2 (a' - b') / 12``.
+    Slopes want the sensor's own clock, whose steps are even: the jitter of stamps does not average out in them.
+    """
+
+    def __init__(self, stop: float) -> None:
+        self._stop = stop
+        self._readings: list[tuple[float, FloatArray]] = []
+        self._open = False
+        self._free = 0
+
+    def update(self, interval: float, rate: FloatArray) -> _Hidden | None:
+        """What was hidden, at the second reading after a stretch; None at all others.
+
+        Args:
+            interval: seconds since the reading before, whole steps of the sensor.
+            rate: (3,) rad/s.
+        """
+        time = (self._readings[-1][0] if self._readings else 0.0) + interval
+        self._readings.append((time, rate))
+        if self._at_stop(rate).any():
+            # without two readings before there is no slope to go on from
+            self._open = self._open or len(self._readings) > 2
+            self._free = 0
+            if not self._open:
+                self._readings.clear()
+            elif time - self._readings[1][0] > _JOINED_S:
+                del self._readings[2:-1]
+            return None
+        self._free += 1
+        if self._open and self._free < 2:
+            return None
+        result = self._joined() if self._open else None
+        self._open = False
+        del self._readings[:-2]
+        return result
+
+    def _at_stop(self, rate: FloatArray) -> BoolArray:
+        return np.abs(rate) >= _CLIPPED * self._stop
+
+    def _joined(self) -> _Hidden:
+        times, rates = np.array([time for time, _ in self._readings]), np.array([rate for _, rate in self._readings])
+        slopes = (rates[[1, -1]] - rates[[0, -2]]) / (times[[1, -1]] - times[[0, -2]])[:, None]
+        times, rates = times[1:-1], rates[1:-1]
+        length = float(times[-1] - times[0])
+        if length > _JOINED_S:
+            return _Hidden(np.zeros(3), self._stop * length)
+        turned = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
+        cubic = np.diff(CubicHermiteSpline(times[[0, -1]], rates[[0, -1]], slopes).antiderivative()(times), axis=0)
+        total = turned.sum(axis=0)
+        # the stop hides what is beyond it
+        beyond = self._at_stop(rates).any(axis=0) & ((cubic.sum(axis=0) - total) * total > 0.0)
+        true = np.where(beyond, cubic, turned)
+        hidden = np.where(beyond, cubic.sum(axis=0) - total, 0.0)
+        share = _HIDDEN * max(1.0, length / _COHERENT_S) ** 2
+        doubt = max(_LEAST_HIDDEN * self._stop * length, share * float(np.linalg.norm(hidden)))
+        # the other axes turn about where the sensor really was
+        angle = (_product(turned).inv() * _product(true)).as_rotvec()
+        return _Hidden(angle, doubt)
+
+
+def _product(turns: FloatArray) -> Rotation:
+    """Rotation vectors (n, 3), one after the other, each in the sensor's frame."""
+    result = Rotation.identity()
+    for turn in turns:
+        result = result * Rotation.from_rotvec(turn)
+    return result
 
 
 def _up(quat_wxyz: FloatArray) -> FloatArray:
@@ -307,6 +426,14 @@ _TURNING: Final = 0.5
 _TURNING_S: Final = 5.0
 _COHERENT_S: Final = 0.3
 """As long a rate persists: beyond it, linear interpolation over a gap tells nothing."""
+_HIDDEN: Final = 0.2
+"""Standard deviation of the angle that a clipped rate hid, as a share of it: twice that on swings of 1.2 Hz."""
+_JOINED_S: Final = 0.5
+"""After longer at the stop nobody knows how far the sensor turned."""
+_LEAST_HIDDEN: Final = 0.03
+"""The same, at least, as a share of range times duration."""
+_LEAST_WORTH_S: Final = 0.3
+"""The tilt is worth at least the mean of so long an acceleration: over less, a motion's own does not average out."""
 _UNKNOWN_FIELD: Final = np.radians(10.0)
 """Heading by a field of which nothing else is known."""
 _DISTURBED_FIELD: Final = np.radians(60.0)
@@ -390,9 +517,17 @@ class _Budget:
 
     def lose(self, gap: float) -> None:
         """A gap of so many seconds: how far the turn may have been another one than the interpolated."""
-        missed = self._turning * gap**2 * min(1.0, gap / _COHERENT_S) ** 2 / 3.0
+        self.doubt(self._turning * gap**2 * min(1.0, gap / _COHERENT_S) ** 2 / 3.0)
+
+    def doubt(self, missed: float) -> None:
+        """A turn may have been another one, by so much variance per axis."""
         self._missed_tilt += missed
         self._noise = min(self._noise + missed, _UNIFORM**2)
+
+    def known_tilt(self) -> float:
+        """Share of the tilt's variance that no missed turn has added."""
+        moved = self._steady + self._moved()
+        return 1.0 - self._missed_tilt / moved
 
     def correct(
         self, gain: float, strength: float, dip: float, known: float, known_dip: float, disturbed: bool

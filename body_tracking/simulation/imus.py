@@ -31,7 +31,7 @@ from body_tracking.calibration.result import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS
-from body_tracking.parameters import number_field
+from body_tracking.parameters import check_fields, number_field
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
@@ -144,11 +144,7 @@ class ImuErrors:
     delay_jitter: float = number_field(0.005, "what is added to it on average", "s", 0.0, 10.0)
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, low, high = getattr(self, item.name), item.metadata["min"], item.metadata["max"]
-            kinds = int if isinstance(item.default, int) else int | float
-            if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
-                raise ImuSimulationError(f"IMU errors: {item.name} of {value!r}, expected {low} to {high}")
+        check_fields(self, "IMU errors", ImuSimulationError)
 
 
 CONSUMER: Final = ImuErrors()

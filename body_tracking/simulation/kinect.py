@@ -40,6 +40,7 @@ from body_tracking.parameters import (
     ParameterError,
     as_yaml,
     check_all,
+    check_fields,
     number_field,
     parameters_from,
     read_file,
@@ -175,11 +176,7 @@ class KinectErrors:
     delay_jitter: float = number_field(0.003, "time added to it on average", "s", 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        for item in parameters():
-            try:
-                item.check(getattr(self, item.name))
-            except ParameterError as error:
-                raise SimulatedKinectError(f"simulated Kinect: {error}") from error
+        check_fields(self, "simulated Kinect", SimulatedKinectError)
 
     @classmethod
     def none(cls) -> KinectErrors:

@@ -399,9 +399,9 @@ def test_names_and_parameters_are_checked() -> None:
         make_filter("ekg")
     with pytest.raises(FilterError, match="unknown parameter"):
         make_filter(CONSTANT_VELOCITY, gate=1.0)
-    with pytest.raises(FilterError, match=r"gate_probability: 2\.0"):
+    with pytest.raises(FilterError, match=r"'gate_probability': 2\.0"):
         make_filter(CONSTANT_VELOCITY, gate_probability=2.0)
-    with pytest.raises(FilterError, match="predict_for: nan"):
+    with pytest.raises(FilterError, match="'predict_for': nan"):
         make_filter(CONSTANT_VELOCITY, predict_for=float("nan"))
 
 

@@ -302,11 +302,11 @@ def test_a_broken_covariance_starts_it_anew_instead_of_handing_out_nan(damage: f
 
 
 def test_parameters_are_checked_and_say_what_they_are() -> None:
-    with pytest.raises(FilterError, match=r"process_noise: -1\.0"):
+    with pytest.raises(FilterError, match=r"'process_noise': -1\.0"):
         SchlagenhaufParameters(process_noise=-1.0)
     with pytest.raises(FilterError, match="whole number"):
         SchlagenhaufParameters(calibration_frames=2.5)  # type: ignore[arg-type]
-    with pytest.raises(FilterError, match="measurement_stddev: nan"):
+    with pytest.raises(FilterError, match="'measurement_stddev': nan"):
         SchlagenhaufParameters(measurement_stddev=float("nan"))
     for item in fields(SchlagenhaufParameters):
         assert item.metadata["doc"] and item.metadata["min"] <= item.default <= item.metadata["max"]

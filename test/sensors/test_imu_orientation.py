@@ -190,6 +190,52 @@ def test_after_an_outage_the_heading_goes_on_with_the_doubt_of_it() -> None:
     assert np.abs(run.tilt[after:]).max() < 3.0
 
 
+def test_after_lost_readings_the_accelerometer_levels_the_sooner() -> None:
+    """0.6 s of the swings are lost, which no interpolation bridges; VQF's own low-pass would take six seconds."""
+    samples = measured(IDEAL, 11.0, motion=pivot)
+    lost = (samples.truth.times > 8.0) & (samples.truth.times < 8.6)
+    estimator = OrientationEstimator()
+    off: dict[float, float] = {}
+    for k in np.flatnonzero(~lost):
+        orientation = estimator.update(sample(samples, int(k)))
+        if orientation is not None:
+            up = so3.quat_to_matrix(np.stack([orientation.orientation, samples.truth.quat_xyzw[k]]))[:, 2]
+            off[float(samples.truth.times[k])] = float(np.degrees(np.arccos(min(up[0] @ up[1], 1.0))))
+    times, tilt = np.array(list(off)), np.array(list(off.values()))
+    assert estimator.restarts == 0
+    assert tilt[(times > 6.0) & (times < 8.0)].max() < 1.0 < 20.0 < tilt[np.searchsorted(times, 8.6)]
+    assert tilt[times > 10.0].max() < 0.2 * tilt[np.searchsorted(times, 8.6)]
+
+
+@pytest.mark.parametrize("stamp_jitter", [0.0, 0.004])
+def test_what_a_clipped_rate_hid_is_made_up_for(stamp_jitter: float) -> None:
+    """Where the range is told: the swings have up to 286 degrees per second."""
+    samples = measured(replace(IDEAL, gyro_range=250.0, stamp_jitter=stamp_jitter), 10.0, motion=pivot)
+    assert (np.abs(samples.angular_velocity) > np.radians(249.9)).any(axis=1).mean() > 0.1
+    told, untold = (Run(samples, errors=errors) for errors in (InertialErrors(gyro_range=np.radians(250.0)), None))
+    settled = told.times > 1.0
+    assert np.square(told.tilt[settled]).mean() < 0.25 * np.square(untold.tilt[settled]).mean()
+    assert np.square(told.heading).mean() < 0.1 * np.square(untold.heading).mean()
+    assert (np.abs(told.tilt) < 2.0 * told.tilt_stddev).mean() > 0.95
+    assert (np.abs(told.heading) < 2.0 * np.maximum(told.heading_stddev, 0.1)).mean() > 0.95
+
+
+def test_a_rate_that_stays_at_its_stop_leaves_the_heading_unknown() -> None:
+    still_here = np.array([0.0, 0.0, 9.8])
+    estimator = OrientationEstimator()
+    before = after = None
+    for k in range(300):
+        rate = np.array([0.0, 0.0, np.radians(2000.0) if 100 <= k < 200 else 0.0])
+        orientation = estimator.update(
+            ImuSample(k * NANOSECONDS // 100, "imu_link", angular_velocity=rate, acceleration=still_here)
+        )
+        before, after = (orientation if k == 99 else before), orientation
+    assert before is not None and after is not None
+    assert np.degrees(np.sqrt(before.covariance[2, 2])) < 5.0
+    assert np.degrees(np.sqrt(after.covariance[2, 2])) > 100.0
+    assert np.degrees(np.abs(so3.quat_to_matrix(after.orientation)[2, :2])).max() < 1.0
+
+
 def test_another_rate_is_noticed() -> None:
     slow, fast = measured(seconds=10.0, rate_hz=50.0), measured(seconds=20.0)
     estimator = OrientationEstimator()
