@@ -1,0 +1,234 @@
+"""Two wrist-worn inertial sensors beside a Kinect, as processes over DDS: angles, bad messages, and a silent sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from running import RELIABLE, Running  # noqa: E402
+from sensor_msgs.msg import Imu, JointState, PointCloud2  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from body_tracking import graph  # noqa: E402
+from body_tracking.messages import (  # noqa: E402
+    cloud_to_skeletons,
+    message_to_orientation,
+    to_nanoseconds,
+)
+from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
+from body_tracking.simulation.bags import write_bag  # noqa: E402
+from body_tracking.simulation.imus import SimulatedImu, usual_mounting  # noqa: E402
+from body_tracking.simulation.layouts import around  # noqa: E402
+from body_tracking.simulation.scene import Setup, simulate  # noqa: E402
+from body_tracking.skeleton import NANOSECONDS, FloatArray, TrackingState  # noqa: E402
+
+FOREARMS = ("forearm_left", "forearm_right")
+OFF_FROM = 10.0
+SETTLED = 4.0
+
+
+class Wrists(Running):
+    """The graph of ``config/kinect_wrist_imus.yaml`` over a bag in which one sensor is switched off at last."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        imus = tuple(
+            SimulatedImu(
+                segment,
+                segment,
+                usual_mounting(segment),
+                50.0,
+                magnetometer=segment == "forearm_left",
+                off=() if segment == "forearm_left" else ((OFF_FROM, 60.0),),
+            )
+            for segment in FOREARMS
+        )
+        self.bag = folder / "bag"
+        write_bag(simulate(Setup("forearm_rolling", around((0.0,)), imus=imus, seed=3)), self.bag)
+        self.orientations = {segment: self.collect(Imu, graph.orientation_topic(segment)) for segment in FOREARMS}
+        self.skeletons = self.collect(PointCloud2, graph.IMU_SKELETON)
+        self.angles = self.collect(JointState, graph.joint_states_topic("body1"))
+        common = {"use_sim_time": True, "reliable": True}
+        listed = f"[{','.join(FOREARMS)}]"
+        self.start("joint_angles", input="model_state", convention="model", **common)
+        self.start("skeleton_filter", filter="ekf", sensors="[kinect1]", orientations=listed, **common)
+        self.start("fusion", sensors="[kinect1]", **common)
+        self.start("calibration", sensors="[kinect1]", **common)
+        self.start("imu_skeleton", segments=listed, **common)
+        raw = [f"/{segment}/imu/data_raw" for segment in FOREARMS]
+        waited = ["'/kinect1/skeleton:3'", *(f"'{topic}:1'" for topic in raw)]
+        self.start(
+            "bag_player",
+            bag=self.bag,
+            reliable=True,
+            wait_for_subscribers=f"[{','.join(waited)}]",
+            topics=f"[/kinect1/skeleton,/forearm_left/imu/mag,{','.join(raw)}]",
+            on_end="idle",
+            wait_timeout=120.0,
+        )
+
+    def truth(self) -> tuple[FloatArray, list[dict[str, float]]]:
+        """Stamps in seconds, and the model's coordinates by name."""
+        stamps, values = [], []
+        with BagReader(self.bag) as reader:
+            for raw in reader.messages([graph.TRUE_MODEL_STATE]):
+                state = deserialize("sensor_msgs/msg/JointState", raw.cdr)
+                stamps.append(to_nanoseconds(state.header.stamp) / NANOSECONDS)
+                values.append(dict(zip(state.name, state.position, strict=True)))
+        return np.array(stamps), values
+
+
+@pytest.fixture(scope="module")
+def wrists(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wrists]:
+    with Wrists(tmp_path_factory.mktemp("wrists")) as running:
+        stamps, _ = running.truth()
+
+        def ended() -> bool:
+            # not ended, but dead: nobody need wait for that
+            alive = all(process.poll() is None for process in running.processes.values())
+            return not alive or (bool(running.angles) and stamp(running.angles[-1]) > stamps[-1] - 0.3)
+
+        assert running.until(ended, 150.0), running.diagnostics
+        assert {name: running.log(name) for name, each in running.processes.items() if each.poll() is not None} == {}
+        yield running
+
+
+def stamp(message: Any) -> float:
+    return to_nanoseconds(message.header.stamp) / NANOSECONDS
+
+
+def test_forearms_come_out_oriented_in_world_and_in_the_cameras_clock(wrists: Wrists) -> None:
+    stamps, _ = wrists.truth()
+    for segment, messages in wrists.orientations.items():
+        end = stamps[-1] if segment == "forearm_left" else stamps[0] + OFF_FROM
+        told = [message_to_orientation(message, segment) for message in messages]
+        assert len(told) > 200
+        assert all(each.frame_id == "world" for each in told)
+        assert stamps[0] - 0.1 < told[0].stamp_ns / NANOSECONDS < told[-1].stamp_ns / NANOSECONDS < end + 0.1
+        assert (np.diff([each.stamp_ns for each in told]) > 0).all()
+    (skeleton,) = cloud_to_skeletons(wrists.skeletons[-1])
+    assert skeleton.frame_id == "world"
+    assert (skeleton.states == TrackingState.INFERRED).any()
+
+
+def test_pronation_follows_the_truth_that_no_skeleton_camera_sees(wrists: Wrists) -> None:
+    stamps, values = wrists.truth()
+    for side in ("left", "right"):
+        end = stamps[-1] if side == "left" else stamps[0] + OFF_FROM
+        name = f"forearm_pronation_{side}"
+        true = np.array([each[name] for each in values])
+        judged = [
+            (stamp(each), each.position[each.name.index(f"{name}_body1")])
+            for each in wrists.angles
+            if stamps[0] + SETTLED < stamp(each) < end
+        ]
+        times, angles = np.array(judged).T
+        assert len(times) > 100
+        # along a straight arm pronation and the upper arm's rotation are one
+        flexion = np.array([each[f"elbow_flexion_{side}"] for each in values])
+        bent = np.interp(times, stamps, flexion) > 0.5
+        assert bent.sum() > 60
+        off = np.degrees(angles - np.interp(times, stamps, true))[bent]
+        # one Kinect alone is 54 and 56 degrees off in this recording; what is left is how a person holds a T-pose
+        assert np.sqrt((off**2).mean()) < 25.0
+
+
+def test_a_sensor_that_is_switched_off_is_named(wrists: Wrists) -> None:
+    assert wrists.until(lambda: "forearm_right: silent" in wrists.diagnostics["imu_skeleton"][""], 30.0)
+    assert "forearm_left: silent" not in wrists.diagnostics["imu_skeleton"][""]
+
+
+def bad_ones() -> list[Imu]:
+    """What drivers send that should not."""
+
+    def still(change: Callable[[Imu], None]) -> Imu:
+        message = Imu()
+        message.header.frame_id = "forearm_left_link"
+        message.linear_acceleration.z = 9.81
+        message.orientation.w = 1.0
+        message.orientation_covariance[0] = -1.0
+        change(message)
+        return message
+
+    def set_to(path: str, value: Any) -> Callable[[Imu], None]:
+        def change(message: Imu) -> None:
+            message.orientation_covariance[0] = 0.01
+            *places, last = path.split(".")
+            part: Any = message
+            for place in places:
+                part = getattr(part, place)
+            setattr(part, last, value)
+
+        return change
+
+    def nothing(message: Imu) -> None:
+        message.angular_velocity_covariance[0] = -1.0
+        message.linear_acceleration_covariance[0] = -1.0
+
+    return [
+        still(set_to("orientation.w", 0.0)),
+        still(set_to("orientation.w", math.nan)),
+        still(set_to("orientation.w", 0.5)),
+        still(set_to("angular_velocity.x", math.inf)),
+        still(set_to("angular_velocity.x", 500.0)),
+        still(set_to("linear_acceleration.z", 9810.0)),
+        still(set_to("header.frame_id", "")),
+        still(set_to("header.frame_id", "another_link")),
+        still(nothing),
+    ]
+
+
+def test_bad_messages_are_counted_and_survived(wrists: Wrists) -> None:
+    topic = "/forearm_left/imu/data_raw"
+    publisher = wrists.node.create_publisher(Imu, topic, RELIABLE)
+    assert wrists.until(lambda: publisher.get_subscription_count() == 1)
+    before = int(wrists.diagnostics["imu_skeleton"].get("refused of forearm_left", 0))
+    messages = bad_ones()
+    for message in messages:
+        publisher.publish(message)
+    assert wrists.until(
+        lambda: int(wrists.diagnostics["imu_skeleton"].get("refused of forearm_left", 0)) == before + len(messages),
+        30.0,
+    ), wrists.diagnostics["imu_skeleton"]
+    assert wrists.processes["imu_skeleton"].poll() is None
+    assert topic in wrists.diagnostics["imu_skeleton"]["last malformed"]
+    assert topic in wrists.log("imu_skeleton")
+    # an orientation that is none does not stop the filter either
+    others = wrists.node.create_publisher(Imu, graph.orientation_topic("forearm_left"), RELIABLE)
+    assert wrists.until(lambda: others.get_subscription_count() >= 1)
+    refused = [Imu(), bad_ones()[1]]
+    filter_before = sum(int(wrists.diagnostics["skeleton_filter"].get(key, 0)) for key in ("malformed", "refused"))
+    for message in refused:
+        others.publish(message)
+    assert wrists.until(
+        lambda: (
+            sum(int(wrists.diagnostics["skeleton_filter"].get(key, 0)) for key in ("malformed", "refused"))
+            == filter_before + len(refused)
+        ),
+        30.0,
+    )
+
+
+def test_an_alignment_can_be_asked_for(wrists: Wrists) -> None:
+    client = wrists.node.create_client(Trigger, graph.ALIGN_SERVICE)
+    assert client.wait_for_service(20.0)
+    future = client.call_async(Trigger.Request())
+    assert wrists.until(future.done, 30.0)
+    assert future.result().success
+    assert "hold" in future.result().message
+
+
+def test_who_lists_no_segment_or_an_unknown_one_is_told_in_a_line(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        for given in ({}, {"segments": "[nose]"}, {"segments": "[head]", "mountings": "['head:up']"}):
+            process = running.start("imu_skeleton", **given)
+            assert process.wait(60.0) == 2
+            assert running.log("imu_skeleton").count("\n") == 1
+            assert running.log("imu_skeleton").startswith("imu_skeleton: ")
