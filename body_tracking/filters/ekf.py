@@ -2018,8 +2018,9 @@ class ExtendedKalmanFilter:
             if state.sources.names:
                 weights = np.where(self._thumbs[state.sources.segments].any(axis=0), 0.0, weights)
                 information = information + self._held(state, lines)
-            weighted = self._observation(lines).T * weights.repeat(_DIMENSIONS)
-            gain = np.linalg.solve(weighted @ self._observation(lines) + information, weighted)
+            observation = self._observation(lines)
+            weighted = observation.T * weights.repeat(_DIMENSIONS)
+            gain = np.linalg.solve(weighted @ observation + information, weighted)
             offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
             displacement = gain * offsets.repeat(_DIMENSIONS)
             self._last_displaced = period, displacement @ displacement.T

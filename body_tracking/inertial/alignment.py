@@ -16,11 +16,7 @@ Delta unknown besides, Laidig, Weygers and Seel, Sensors 22 (2022) 9850):
 
     (R1 w1 - Rz(Delta) R2 w2) . n / |n| = 0,  n = R1 j1 x Rz(Delta) R2 j2                                           (5)
 
-and where only flexion moves, both sensors turn alike about its axis (Seel, Schauer and Raisch 2012, 2014):
-
-    |w1 x j1| = |w2 x j2|                                                                                            (6)
-
-Both are weighted by what an angular rate is worth at that speed (as Olsson et al., Sensors 20 (2020) 3534, weigh
+It is weighted by what an angular rate is worth at that speed (as Olsson et al., Sensors 20 (2020) 3534, weigh
 samples by their motion), and robust. A sample counts as often as what it leaves is independent of the one before; and
 no movement knows an axis better than the flesh and the person's own joint let it.
 """
@@ -69,8 +65,6 @@ AXIS_OFF: Final = float(np.radians(4.0))
 FLESH_TURN: Final = float(np.radians(15.0))
 """Radians by which the movement of an elbow tells the heading between its sensors wrongly, as skin lags a twist by a
 fifth; simulated."""
-AXIS_WORST: Final = float(np.radians(20.0))
-"""Radians: an axis known no better than that is not told."""
 _RATE_NOISE = 0.03
 _RATE_SHARE = 0.1
 """rad/s and share of itself that a relative rate is off: noise and bias, and the flesh that swings."""
@@ -411,21 +405,6 @@ def align_in_pose(
 # the axes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointAxes:
-    """The axes of a joint between two sensors, from movement.
-
-    Attributes:
-        first, second: (3,) unit vectors in the frames of the two sensors.
-        covariance: (4, 4) radians squared: of two directions of the first axis, then of two of the second, along the
-            columns of :func:`across`.
-    """
-
-    first: FloatArray
-    second: FloatArray
-    covariance: FloatArray
-
-
 def across(axis: FloatArray) -> FloatArray:
     """(3, 2) two directions square to a unit vector and to each other."""
     least = np.eye(3)[int(np.abs(axis).argmin())]
@@ -449,122 +428,6 @@ def _common(first: Stream, second: Stream) -> tuple[FloatArray, ...]:
     (r1, w1, known), (r2, w2, known2) = first.at(times), second.at(times)
     both = known & known2
     return times[both], r1[both], w1[both], r2[both], w2[both]
-
-
-def hinge_axes(first: Stream, second: Stream, start: tuple[FloatArray, FloatArray]) -> JointAxes | None:
-    """The axis of a hinge in both sensors' frames, from rates alone (eq. 6): an elbow that bends and does not turn.
-
-    Args:
-        first: on one of the two segments.
-        second: on the other.
-        start: (3,) and (3,) the axis in both frames, a first guess, whose senses are kept.
-
-    Returns:
-        None where the movement does not tell, by the fit's own covariance, or the joint is no hinge.
-    """
-    times, _, w1, _, w2 = _common(first, second)
-    if len(times) < 50:
-        return None
-
-    def residuals(x: FloatArray) -> FloatArray:
-        sizes = [
-            np.linalg.norm(np.cross(w, _tilted(axis, part)), axis=1)
-            for w, axis, part in ((w1, start[0], x[:2]), (w2, start[1], x[2:4]))
-        ]
-        scale = np.hypot(_RATE_NOISE, _RATE_SHARE * np.maximum(*(np.linalg.norm(w, axis=1) for w in (w1, w2))))
-        result: FloatArray = (sizes[0] - sizes[1]) / scale
-        return result
-
-    if np.sqrt((np.maximum((w1**2).sum(axis=1), (w2**2).sum(axis=1))).mean()) < _LEAST_TURNING:
-        return None
-    found = least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.2)
-    x, covariance = found.x, _fit_covariance(found.jac, residuals(found.x))
-    if covariance is None or np.abs(x).max() > 1.0:
-        return None
-    first_axis, second_axis = _tilted(start[0], x[:2]), _tilted(start[1], x[2:4])
-    covariance = _carried(covariance, (start[0], x[:2], first_axis), (start[1], x[2:4], second_axis))
-    covariance += AXIS_FLOOR**2 * np.eye(4)
-    if np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > AXIS_WORST:
-        return None
-    return JointAxes(first_axis, second_axis, covariance)
-
-
-def _fit_covariance(jacobian: FloatArray, residuals: FloatArray) -> FloatArray | None:
-    """The covariance of a fit whose residuals are correlated over time; None where it is not determined."""
-    normal = jacobian.T @ jacobian
-    if np.linalg.cond(normal) > 1e9:
-        return None
-    # the gradient's own correlation, up to a tenth of the samples (Newey and West 1987)
-    scores = jacobian * residuals[:, None]
-    n = len(scores)
-    most = max(min(n // 10, 400), 1)
-    inner = scores.T @ scores
-    for lag in range(1, most + 1):
-        cross = scores[lag:].T @ scores[:-lag]
-        inner += (1.0 - lag / (most + 1.0)) * (cross + cross.T)
-    outer = np.linalg.inv(normal)
-    result: FloatArray = outer @ inner @ outer
-    return 0.5 * (result + result.T)
-
-
-def _carried(covariance: FloatArray, *axes: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
-    """The covariance along the directions across the axes found, in the place of those across the guesses."""
-    carry = np.eye(len(covariance))
-    for number, (start, by, axis) in enumerate(axes):
-        part = slice(2 * number, 2 * number + 2)
-        carry[part, part] = across(axis).T @ across(start) / np.linalg.norm(start + across(start) @ by)
-    result: FloatArray = carry @ covariance @ carry.T
-    return result
-
-
-def with_axes(
-    alignment: Alignment,
-    numbers: tuple[int, int],
-    axes: JointAxes,
-    segment_axes: tuple[FloatArray, FloatArray],
-    off: float = AXIS_OFF,
-) -> Alignment:
-    """An alignment, corrected by axes that a movement told.
-
-    Of an axis j in the sensor's frame and a in the segment's, with P the columns of :func:`across`,
-
-        P^T (j - A a) = -P^T A [a]x delta                                                                            (7)
-
-    is a measurement of delta.
-
-    Args:
-        alignment: so far, such as of a pose.
-        numbers: of the two sensors in it.
-        axes: what the movement told.
-        segment_axes: (3,) and (3,) the axes in the frames of the two segments by the model, such as of
-            :func:`elbow_segment_axes`.
-        off: radians per direction by which a person's axes are off the model's.
-
-    Raises:
-        AlignmentError: an axis lies more than 60 degrees from where the alignment has it.
-    """
-    k4 = len(alignment.covariance)
-    found = alignment
-    noise = axes.covariance + off**2 * np.eye(4)
-    prior, error = alignment.covariance, np.zeros(k4)
-    covariance = prior
-    for _ in range(4):
-        jacobian, residual = np.zeros((4, k4)), np.zeros(4)
-        for part, (number, axis, model) in enumerate(
-            zip(numbers, (axes.first, axes.second), segment_axes, strict=True)
-        ):
-            rotation = found.rotations[number]
-            if float(axis @ rotation @ model) < 0.5:
-                raise AlignmentError(f"{found.segments[number]}: the axis of movement is not the one aligned")
-            square = across(axis).T
-            residual[2 * part : 2 * part + 2] = square @ (axis - rotation @ model)
-            jacobian[2 * part : 2 * part + 2, 4 * number : 4 * number + 3] = -square @ rotation @ so3.skew(model)
-        # iterated: the residual at the present state, the prior's pull by the error so far
-        gain = prior @ jacobian.T @ np.linalg.inv(jacobian @ prior @ jacobian.T + noise)
-        error = gain @ (residual + jacobian @ error)
-        covariance = prior - gain @ jacobian @ prior
-        found = alignment.moved(error, covariance)
-    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

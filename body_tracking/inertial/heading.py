@@ -10,7 +10,6 @@ Between observations both walk: headings as gyroscopes drift without a magnetome
 observes them:
 
 - a bone that a camera sees, along the axis a of a segment: ``P^T R^T d = -P^T [a]x e``, P square to a               (9)
-- a whole segment's orientation: ``log(R^T R_seen) = e``                                                            (10)
 - an elbow, whose axes of flexion and pronation stay square: ``(R1 a1) . (R2 a2) = 0`` (Mueller 2016)               (11)
 - ranges of motion: an angle beyond its limit is taken for the limit, and one within it for nothing (Lehmann, Laidig and
   Seel 2020 use them so for headings)                                                                               (12)
@@ -36,7 +35,6 @@ from body_tracking.inertial.alignment import (
     AlignmentError,
     across,
     elbow_segment_axes,
-    rotation_vectors,
 )
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import RANGES
@@ -227,44 +225,6 @@ class HeadingTracker:
         back = (-square.T @ so3.skew(axis)).T  # its pseudoinverse: the rows are square to each other
         return self._update(stamp, ("bone", segment), linear, noise, CAMERA_TIME, number, turned, back)
 
-    def observe_orientation(
-        self, stamp: float, segment: str, rotation: FloatArray, orientation: FloatArray, covariance: FloatArray
-    ) -> Innovation:
-        """A camera's skeleton, or its model, tells how a whole segment is turned (eq. 10).
-
-        Args:
-            stamp: seconds.
-            segment: which one.
-            rotation: (3, 3) sensor to earth at that time.
-            orientation: (3, 3) segment to world.
-            covariance: (3, 3) radians squared of it, in the segment's frame.
-        """
-        number = self._number(segment)
-
-        def linear(a: Alignment) -> _Linear:
-            world = a.oriented(number, rotation)
-            off = rotation_vectors(world.T @ orientation)
-            return off, self._turning(number, world)
-
-        def turned(a: Alignment) -> float:
-            apart = orientation @ a.oriented(number, rotation).T
-            return float(np.arctan2(apart[1, 0] - apart[0, 1], apart[0, 0] + apart[1, 1]))
-
-        noise = covariance + TISSUE_STDDEV**2 * np.eye(3)
-        return self._update(stamp, ("orientation", segment), linear, noise, CAMERA_TIME, number, turned, np.eye(3))
-
-    def observe_heading(self, stamp: float, segment: str, heading: float, stddev: float, lasting: float) -> Innovation:
-        """Something else tells a heading, such as a magnetometer; its errors last so many seconds."""
-        number = self._number(segment)
-
-        def linear(a: Alignment) -> _Linear:
-            jacobian = np.zeros((1, len(a.covariance)))
-            jacobian[0, 4 * number + 3] = 1.0
-            off = heading - a.headings[number]
-            return np.array([np.arctan2(np.sin(off), np.cos(off))]), jacobian
-
-        return self._update(stamp, ("heading", segment), linear, np.array([[stddev**2]]), lasting)
-
     def observe_elbow(
         self, stamp: float, side: str, upper: FloatArray, lower: FloatArray, stddev: float = ELBOW_STDDEV
     ) -> Innovation:
@@ -440,32 +400,3 @@ JOINTS: Final[dict[tuple[str, str], tuple[tuple[float, float], tuple[float, floa
 }
 """Degrees about y, x and z of the parent, of joints whose two segments may both carry a sensor; those of the left side.
 A shoulder is missing: it goes nearly everywhere."""
-
-
-def wahba_heading(
-    rotations: FloatArray, axis: FloatArray, directions: FloatArray, weights: FloatArray | None = None
-) -> tuple[float, float]:
-    """The heading that turns a sensor's axis to directions seen over a movement, all at once.
-
-    Wahba's problem about the vertical alone: ``psi = arg sum w (conj(p) d)`` of the horizontal parts p and d as complex
-    numbers, which maximises ``sum w p . Rz(psi)^T d``.
-
-    Args:
-        rotations: (n, 3, 3) sensor to earth.
-        axis: (3,) in the sensor's frame.
-        directions: (n, 3) unit vectors in world; NaN where unknown.
-        weights: (n,) not negative; equal when None.
-
-    Returns:
-        Radians, and the concentration from 0 (anything) to 1 (all agree); NaN and 0 where nothing is horizontal.
-    """
-    points = rotations @ axis
-    known = np.isfinite(directions).all(axis=1)
-    p = points[known, 0] + 1j * points[known, 1]
-    d = directions[known, 0] + 1j * directions[known, 1]
-    w = np.ones(len(p)) if weights is None else weights[known]
-    total = (w * np.conj(p) * d).sum()
-    most = float((w * np.abs(p) * np.abs(d)).sum())
-    if most <= 1e-6 * max(float(w.sum()), 1.0):
-        return float("nan"), 0.0
-    return float(np.angle(total)), float(np.abs(total)) / most

@@ -15,14 +15,12 @@ from body_tracking.inertial.alignment import (
     align_by_elbow,
     align_in_pose,
     elbow_segment_axes,
-    hinge_axes,
     mean_rotation,
     pose_covariance,
     pose_of,
     pose_rotations,
     rotation_vectors,
     still_periods,
-    with_axes,
     wrapped,
     yaw,
 )
@@ -187,30 +185,6 @@ def test_an_elbow_that_does_not_move_says_nothing() -> None:
     assert align_by_elbow(start, "right", *streams) is None
     with pytest.raises(AlignmentError, match="no sensor on upper_arm_left"):
         align_by_elbow(start, "left", *streams)
-
-
-def test_a_hinge_shows_its_axis_in_both_sensors_and_corrects_an_alignment() -> None:
-    rng = np.random.default_rng(0)
-    times, upper, _ = elbow(0)
-    flexion, _ = elbow_segment_axes("right")
-    bend = 1.0 + 0.8 * np.sin(3.0 * times)
-    lower = upper @ so3.quat_to_matrix(so3.exp(bend[:, None] * flexion))
-    true = random_rotations(rng, 2)
-    segments = ("upper_arm_right", "forearm_right")
-    streams = [sensed(*each) for each in zip(segments, (times, times), (upper, lower), true, (0.3, -1.0), strict=True)]
-    prior = np.radians(8.0) ** 2 * np.eye(8)
-    off = np.radians([6.0, 3.0, -6.0, 0.0, -4.0, 5.0, 6.0, 0.0])
-    start = Alignment(segments, true, np.zeros(2), prior).moved(off, prior)
-    axes = hinge_axes(*streams, (start.rotations[0] @ flexion, start.rotations[1] @ flexion))
-    assert axes is not None
-    for found, rotation in zip((axes.first, axes.second), true, strict=True):
-        assert np.degrees(np.arccos(min(float(found @ rotation @ flexion), 1.0))) < 1.0
-    better = with_axes(start, (0, 1), axes, (flexion, flexion))
-    for number in range(2):
-        told = [float(a.rotations[number] @ flexion @ true[number] @ flexion) for a in (start, better)]
-        assert np.arccos(min(told[1], 1.0)) < 0.7 * np.arccos(told[0])
-    with pytest.raises(AlignmentError, match="not the one aligned"):
-        with_axes(start, (0, 1), axes, (-flexion, flexion))
 
 
 def test_the_mean_of_rotations_about_one_is_that_one() -> None:
