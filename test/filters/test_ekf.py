@@ -159,6 +159,21 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
     assert np.mean(np.array(hidden) < chi2.ppf(0.95, 1)) < 0.85
 
 
+def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
+    """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
+    rng = np.random.default_rng(3)
+    truth = somebody(3, 10.0)
+    stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
+    offsets = {name: 0.04 * rng.normal(size=(N_JOINTS, 3)) for name in "abcd"}
+    estimator = ExtendedKalmanFilter()
+    for frame in measured(truth, 0.004, 3).skeletons:
+        for place, (name, offset) in enumerate(offsets.items()):
+            stamp_ns = frame.stamp_ns + place * 8_000_000
+            moved = replace(frame, stamp_ns=stamp_ns, positions=frame.positions + offset, covariances=stated)
+            estimator.update(moved, name)
+    assert estimator.counters["restarts"] <= 4  # looked for every quarter of a second it was 24
+
+
 def test_its_uncertainty_is_true() -> None:
     """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees."""
     for_angles, for_points, for_lengths = [], [], []
