@@ -21,6 +21,7 @@ from body_tracking.messages import (
     IMAGE,
     IMU,
     JOINT_STATE,
+    MARKERS,
     POINT_CLOUD,
     SEGMENTS,
     STRING,
@@ -54,6 +55,7 @@ TRUE_CALIBRATION = "/ground_truth/calibration"
 TRUE_CLOCK = f"{TRUE_CALIBRATION}/clock"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 CLOCK_TOPIC = "/clock"
+TF = "/tf"
 TF_STATIC = "/tf_static"
 START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
@@ -146,6 +148,17 @@ def joint_states_topic(body: str) -> str:
 def joint_states_stddev_topic(body: str) -> str:
     """Where the standard deviations of a person's joint angles are published."""
     return f"{joint_states_topic(body)}_stddev"
+
+
+def bodies_among(topics: Iterable[str]) -> tuple[str, ...]:
+    """The persons whose joint angles are among these topics, by name."""
+    found = (re.fullmatch(r"/humans/bodies/([A-Za-z]\w*)/joint_states", topic) for topic in topics)
+    return tuple(sorted(match[1] for match in found if match))
+
+
+def markers_topic(body: str) -> str:
+    """Where a person's markers for RViz and Foxglove are published."""
+    return f"/humans/bodies/{body}/markers"
 
 
 def urdf_topic(body: str) -> str:
@@ -357,6 +370,21 @@ TOPICS: tuple[TopicSpec, ...] = (
         "the standard deviation of each, same names and order; infinity where nothing observes the angle",
     ),
     TopicSpec(
+        markers_topic("<id>"),
+        MARKERS,
+        RELIABLE,
+        "body_markers",
+        "what the sensors see, the fused and the filtered skeleton, 95 % ellipsoids of its joints, and the sensors, in "
+        "`world`",
+    ),
+    TopicSpec(
+        TF,
+        "tf2_msgs/msg/TFMessage",
+        RELIABLE,
+        "body_markers",
+        "`ekf`: the pose of each segment in `world`, named as the links of the URDF, where tf2_msgs is installed",
+    ),
+    TopicSpec(
         DIAGNOSTICS_TOPIC,
         DIAGNOSTICS,
         RELIABLE,
@@ -365,7 +393,7 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
@@ -388,6 +416,8 @@ EXECUTABLES: tuple[str, ...] = (
     "joint_angles",
     "bag_player",
     "bag_recorder",
+    "body_markers",
+    "viewer",
 )
 
 
@@ -446,6 +476,8 @@ class GraphOptions:
         reliable: transport every skeleton reliably.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
+        viewer: show it on a live page, with a recorder that waits for its button where nothing is recorded anyway.
+        markers: publish markers for RViz and Foxglove.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -460,6 +492,8 @@ class GraphOptions:
     reliable: bool = False
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
+    viewer: bool = False
+    markers: bool = False
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -496,14 +530,21 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         )
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
+    elif options.viewer:
+        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **common}))
+    # These listen to every skeleton.
+    watchers = [name for name, wanted in (("body_markers", options.markers), ("viewer", options.viewer)) if wanted]
+    specs += [NodeSpec(name, name, parameters={"sensors": sensors, **common}) for name in watchers]
     recorders = int(bool(options.record))
     # Besides the next node and the recorder nobody is waited for; inertial sensors take their world from the fusion.
-    to_filter = {FUSED: int(role.input == FUSED_INPUT) + int(bool(worn))}
-    to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    to_filter = {FUSED: len(watchers) + int(role.input == FUSED_INPUT) + int(bool(worn))}
+    to_angles = (
+        {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    )
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
-        # Calibration, fusion and, maybe, the filter and the recorder.
-        listeners = 2 + int(role.input == SENSORS_INPUT) + recorders
+        # Calibration, fusion and, maybe, the filter, the recorder and those who show.
+        listeners = 2 + int(role.input == SENSORS_INPUT) + recorders + len(watchers)
         specs.append(_player(options, sensors, listeners, after))
     else:
         specs += [
@@ -584,8 +625,8 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag, a recorder and inertial sensors."""
-    more = replace(options, record="recording", imus=options.imus or SOME_IMUS)
+    """The nodes of a graph, and those that it would have live, with a bag, a recorder, inertial sensors and a page."""
+    more = replace(options, record="recording", imus=options.imus or SOME_IMUS, viewer=True, markers=True)
     variants = [options] + [replace(more, bag=bag) for bag in ("", options.bag or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 

@@ -24,6 +24,8 @@ ARGUMENTS = {
     "filter": ("", "which filter; overrides the parameters file"),
     "convention": ("", "of the joint angles; overrides the parameters file"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
+    "viewer": ("false", "show it on a live page in a browser"),
+    "markers": ("false", "publish markers for RViz and Foxglove"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
 
@@ -57,6 +59,8 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         filter_name=given["filter"],
         convention=given["convention"],
         calibration_file=given["calibration"],
+        viewer=given["viewer"].lower() == "true",
+        markers=given["markers"].lower() == "true",
     )
     file = Path(given["params_file"]) if given["params_file"] else None
     options = with_file(options, file)
