@@ -44,6 +44,7 @@ from body_tracking.skeleton import NANOSECONDS
 
 ROS = RosMessages()
 LIMIT = 1.10
+PATIENCE_MS = 180e3
 SETTLE = 2.0
 """Seconds at the beginning of each stretch that do not count."""
 
@@ -107,7 +108,7 @@ def yields() -> None:
     os.setsid()
     os.nice(19)
     with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text("19", encoding="ascii")
+        Path("/proc/self/autogroup").write_text("10", encoding="ascii")
 
 
 @contextlib.contextmanager
@@ -129,7 +130,7 @@ def chromium(folder: Path) -> Iterator[Any]:
         address = next(match[0] for line in process.stderr if (match := re.search(r"ws://\S+", line)))
         threading.Thread(target=process.stderr.read, daemon=True).start()
         with sync_playwright() as driver:
-            browser = driver.chromium.connect_over_cdp(address)
+            browser = driver.chromium.connect_over_cdp(address, timeout=PATIENCE_MS)
             yield browser.contexts[0].pages[0], psutil.Process(process.pid)
     finally:
         process.terminate()
@@ -152,10 +153,10 @@ def viewer(page: Any, folder: Path, sharpness: float) -> Iterator[psutil.Process
             if time.monotonic() > end or process.poll() is not None:
                 raise SystemExit(f"viewer: it did not come up\n{log.read_text()}")
             time.sleep(0.1)
-        page.goto(f"{found[0]}/?fixedDpr={sharpness}", timeout=120e3)
+        page.goto(f"{found[0]}/?fixedDpr={sharpness}", timeout=PATIENCE_MS)
         page.wait_for_function(
             "Object.values(window.__viserTestpoints?.uplots ?? {}).some(plot => plot.chart.data[0].length > 20)",
-            timeout=120e3,
+            timeout=PATIENCE_MS,
         )
         yield psutil.Process(process.pid)
         page.goto("about:blank")

@@ -29,6 +29,7 @@ from body_tracking.viewing.colours import (
     UNCERTAINTY,
     Colour,
     ColourArray,
+    linear,
     sensor_colours,
 )
 from body_tracking.viewing.curves import AngleHistory, first_choice
@@ -160,7 +161,7 @@ class Page:
                 aspect=float(np.tan(KINECT_VIEW[0] / 2.0) / np.tan(KINECT_VIEW[1] / 2.0)),
                 scale=0.18,
                 thickness=0.006,
-                color=colour,
+                color=linear(colour),
                 visible=False,
                 cast_shadow=False,
             )
@@ -416,7 +417,7 @@ class _Drawn:
         if len(drawn.bones):
             points[len(drawn.bones) :] = drawn.bones[0, 0]
             self._lines.points = points
-            self._lines.colors = np.array(colour, np.uint8)
+            self._lines.colors = linear(colour)
         _show(self._lines, bool(len(drawn.bones)))
 
 
@@ -461,7 +462,7 @@ class _Shapes:
         if quats_xyzw is not None:
             wxyz[:count] = np.roll(quats_xyzw, 1, axis=1)
         colours = np.zeros((room, 3), np.uint8)
-        colours[:count] = self._colour if colour is None else colour
+        colours[:count] = linear(self._colour if colour is None else colour)
         handle = self._handle
         handle.batched_positions, handle.batched_scales, handle.batched_colors = batch, sizes, colours
         if quats_xyzw is not None:

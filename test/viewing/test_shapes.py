@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from body_tracking.calibration.result import level_pose
 from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.viewing import shapes
-from body_tracking.viewing.colours import INFERRED, NOT_TRACKED, PALETTE, joint_colours, sensor_colours
+from body_tracking.viewing.colours import INFERRED, NOT_TRACKED, PALETTE, joint_colours, linear, sensor_colours
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -94,6 +94,14 @@ def test_every_sensor_has_a_colour_and_the_first_ones_differ() -> None:
     colours = sensor_colours([f"kinect{number}" for number in range(1, 10)])
     assert len(colours) == 9
     assert len(set(list(colours.values())[: len(PALETTE)])) == len(PALETTE)
+
+
+def test_intensities_give_the_colour_back_as_a_screen_shows_them() -> None:
+    grey = np.arange(256, dtype=np.uint8)
+    intensities = linear(np.stack([grey] * 3, axis=1)) / 255.0
+    shown = np.where(intensities <= 0.0031308, 12.92 * intensities, 1.055 * intensities ** (1 / 2.4) - 0.055)
+    assert np.abs(255.0 * shown - grey[:, None])[30:].max() < 5.0  # of dark ones, 8 bits tell few apart
+    assert (linear((0, 0, 0)) == 0).all() and (linear((255, 255, 255)) == 255).all()
 
 
 # --- skeletons
