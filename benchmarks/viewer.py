@@ -107,8 +107,6 @@ def yields() -> None:
     """In a process that is to draw whenever nobody else has anything to do."""
     os.setsid()
     os.nice(19)
-    with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text("10", encoding="ascii")
 
 
 @contextlib.contextmanager

@@ -52,7 +52,7 @@ def joint_colours(states: NDArray[np.uint8], own: Colour) -> ColourArray:
 
 
 def linear(colours: Colour | ColourArray) -> ColourArray:
-    """(..., 3) intensities of sRGB colours (IEC 61966-2-1), for those who take colours for intensities, as viser."""
+    """(..., 3) intensities of sRGB colours (IEC 61966-2-1), as viser takes the colours of many meshes."""
     shares = np.asarray(colours, dtype=np.float64) / 255.0
     intensities = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * intensities).astype(np.uint8)

@@ -161,7 +161,7 @@ class Page:
                 aspect=float(np.tan(KINECT_VIEW[0] / 2.0) / np.tan(KINECT_VIEW[1] / 2.0)),
                 scale=0.18,
                 thickness=0.006,
-                color=linear(colour),
+                color=colour,
                 visible=False,
                 cast_shadow=False,
             )
@@ -417,7 +417,7 @@ class _Drawn:
         if len(drawn.bones):
             points[len(drawn.bones) :] = drawn.bones[0, 0]
             self._lines.points = points
-            self._lines.colors = linear(colour)
+            self._lines.colors = np.array(colour, np.uint8)
         _show(self._lines, bool(len(drawn.bones)))
 
 
