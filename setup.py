@@ -38,6 +38,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         share("config", "*.yaml"),
+        share("config/robots", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         *(share(bag.as_posix(), "*.*") for bag in sorted(Path("bags").iterdir()) if bag.is_dir()),
