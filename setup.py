@@ -13,6 +13,7 @@ NODES = [
     "fusion",
     "skeleton_filter",
     "joint_angles",
+    "robot_commands",
     "bag_player",
     "bag_recorder",
 ]
@@ -75,9 +76,11 @@ setup(
             "psutil",
             "setuptools>=77",
             "ezc3d>=1.7",
+            "mujoco-core>=4",
         ],
         "c3d": ["ezc3d>=1.7"],
         "bench": ["psutil"],
+        "examples": ["mujoco-core>=4"],
         "peers": ["biorbd==1.12.4", "opensim==4.6"],
     },
     entry_points={

@@ -37,7 +37,6 @@ def angle_names(name: str) -> tuple[str, ...]:
     return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
 
 
-
 _GAP_NS = NANOSECONDS // 2
 """After longer than this the last pose is no better a start than none."""
 _POOR = 4.0

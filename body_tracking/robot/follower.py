@@ -42,6 +42,11 @@ JUMP_BACK_NS = NANOSECONDS
 ROBOT_SILENCE = 0.5
 """Seconds without a word of the robot's own state after which it is taken to be away."""
 
+AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK = "auto", "ros", "sensor"
+
+_OTHER_CLOCK_NS = 10 * NANOSECONDS
+"""Stamps further than this from now are by another clock."""
+
 _AHEAD = 0.05
 """Seconds by which stamps may be in the future: clocks that are kept together differ by less."""
 
@@ -135,8 +140,10 @@ class Follower:
     Args:
         mapping: of the robot.
         period: seconds between two commands. A fault that would be one by the next command is one now.
-        delay: seconds from capture to here, where stamps are by another clock than ``now_ns``: the least difference
-            between the two in the last 10 to 20 s stands for this delay. None where they are by the same clock.
+        clock: by which angles are stamped: ``ROS_CLOCK`` for that of ``now_ns``; ``SENSOR_CLOCK`` for another one, as a
+            Kinect's own that counts from its start; ``AUTO_CLOCK`` for the former unless they are 10 s apart.
+        delay: seconds from capture to here of the quickest angles, where the clock is another one, and nobody can tell:
+            the least difference between the clocks in the last 10 to 20 s stands for this delay.
 
     Attributes:
         state: what it does now.
@@ -146,7 +153,7 @@ class Follower:
         FollowerError: ``silence`` is not longer than the period, or the point of a trajectory nearer than that.
     """
 
-    def __init__(self, mapping: RobotMapping, period: float, delay: float | None = None) -> None:
+    def __init__(self, mapping: RobotMapping, period: float, clock: str = AUTO_CLOCK, delay: float = 0.05) -> None:
         if period >= mapping.safety.silence:
             raise FollowerError(
                 f"{mapping.robot}: silence {mapping.safety.silence:g} s is no more than the period {period:g} s"
@@ -159,7 +166,7 @@ class Follower:
         self.state = State.STOPPED
         self.transitions: list[Transition] = []
         self._limits = mapping.safety
-        self._period, self._delay = period, delay
+        self._period, self._clock, self._delay = period, clock, delay
         self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
         self._offsets = _LeastOffset()
         self._angles: _Angles | None = None
@@ -301,7 +308,8 @@ class Follower:
             unknown = np.full(len(mapping.angles), np.inf)
             return _Expected(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
         behind = now_ns - angles.stamp_ns
-        if self._delay is not None:
+        apart = self._clock == AUTO_CLOCK and abs(self._offsets.least) > _OTHER_CLOCK_NS
+        if apart or self._clock == SENSOR_CLOCK:
             behind -= self._offsets.least - round(self._delay * NANOSECONDS)
         age = behind / NANOSECONDS
         wait = max(age, 0.0)

@@ -1,0 +1,204 @@
+"""A simulated arm that follows a person: ``python examples/robot_arms/drive.py two_joint_arm --bag bags/tpose_wave``.
+
+Starts ``body_tracking up`` over a bag with the robot's mapping file, follows its commands in MuJoCo, and prints and
+draws what became of them. Without ``--bag`` only the arm runs, until Ctrl-C, for a graph that is started elsewhere:
+``body_tracking up --robot config/robots/two_joint_arm.yaml``. Needs ROS, and ``pip install 'body_tracking[examples]'``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from simulated_arm import FloatArray, SimulatedArm
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
+
+HERE = Path(__file__).resolve().parent
+ROBOTS = HERE.parents[1] / "config" / "robots"
+PERIOD = 0.01
+"""Seconds between two words of the robot's state."""
+COMPARED_DELAYS = np.arange(0.0, 0.3, 0.01)
+"""Seconds by which the joints may be behind the commands, to be told from errors of another kind."""
+
+
+class Arm(Node):
+    """Takes commands, moves the arm in real time, and says how it stands.
+
+    Attributes:
+        times: seconds, of each entry of the others.
+        told: (n,) the last command by then; NaN while there are none.
+        stood: (n,) how the joints stood.
+        points: (n + 1, 3) where they were.
+        commands: how many came.
+    """
+
+    def __init__(self, mapping: RobotMapping, arm: SimulatedArm, context: rclpy.Context) -> None:
+        super().__init__(mapping.robot, context=context)
+        self.mapping, self.arm = mapping, arm
+        self.times: list[float] = []
+        self.told: list[FloatArray] = []
+        self.stood: list[FloatArray] = []
+        self.points: list[FloatArray] = []
+        self.commands = 0
+        self.command = np.full(len(mapping.joints), np.nan)
+        self.heard = self.passed = time.monotonic()
+        output = mapping.output
+        if output.kind == TRAJECTORY:
+            self.create_subscription(JointTrajectory, output.topic, self.on_trajectory, 10)
+        else:
+            self.create_subscription(Float64MultiArray, output.topic, self.on_array, 10)
+        self.states = self.create_publisher(JointState, output.state_topic, 10)
+        self.create_timer(PERIOD, self.advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def on_trajectory(self, message: JointTrajectory) -> None:
+        """A point, in the order that the message names."""
+        place = [message.joint_names.index(name) for name in self.mapping.joints]
+        (point,) = message.points
+        seconds = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+        self.go_to(np.array(point.positions)[place], seconds)
+
+    def on_array(self, message: Float64MultiArray) -> None:
+        """Positions in the controller's order."""
+        self.go_to(np.array(message.data), 0.0)
+
+    def go_to(self, position: FloatArray, seconds: float) -> None:
+        """Follow a command."""
+        self.command, self.heard = position, time.monotonic()
+        self.commands += 1
+        self.arm.go_to(position, seconds)
+
+    def advance(self) -> None:
+        """Up to the present; what was missed for longer than a moment is left out."""
+        now = time.monotonic()
+        self.arm.advance(min(now - self.passed, 10 * PERIOD))
+        self.passed = now
+        message = JointState(name=list(self.mapping.joints))
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.position, message.velocity = self.arm.position.tolist(), self.arm.velocity.tolist()
+        self.states.publish(message)
+        self.times.append(now)
+        self.told.append(self.command if now - self.heard < 0.1 else np.full_like(self.command, np.nan))
+        self.stood.append(self.arm.position)
+        self.points.append(self.arm.points)
+
+
+def report(arm: Arm) -> str:
+    """How each joint followed its commands, as a table."""
+    times, told, stood = np.array(arm.times), np.array(arm.told), np.array(arm.stood)
+    lines = [f"{'joint':<10} {'from':>7} {'to':>7} {'rms error':>10} {'behind':>8}   (degrees, ms)"]
+    for column, name in enumerate(arm.mapping.joints):
+        errors = []
+        for delay in COMPARED_DELAYS:
+            then = np.interp(times + delay, times, stood[:, column])
+            errors.append(float(np.sqrt(np.nanmean((then - told[:, column]) ** 2))))
+        best = int(np.argmin(errors))
+        low, high = np.degrees(np.nanmin(told[:, column])), np.degrees(np.nanmax(told[:, column]))
+        behind = f"{1e3 * COMPARED_DELAYS[best]:.0f}" if high - low > 1.0 else "-"
+        lines.append(f"{name:<10} {low:7.1f} {high:7.1f} {np.degrees(errors[best]):10.2f} {behind:>8}")
+    return "\n".join(lines)
+
+
+def draw(arm: Arm, path: Path) -> None:
+    """Commands and joints over time, and the arm at some instants."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    times, told, stood = np.array(arm.times), np.degrees(arm.told), np.degrees(arm.stood)
+    given = np.isfinite(told).all(axis=1)
+    time_s = times - times[given][0]
+    shown = (time_s >= -0.5) & (time_s <= time_s[given][-1] + 1.0)
+    n = len(arm.mapping.joints)
+    figure: Any = Figure(figsize=(10.0, 1.4 + 1.3 * n if n > 2 else 5.0), dpi=80, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(n, 2, width_ratios=(3.0, 2.0))
+    for column, name in enumerate(arm.mapping.joints):
+        axis = figure.add_subplot(grid[column, 0])
+        axis.plot(time_s[shown], told[shown, column], color="#d1571b", linewidth=2.2, label="commanded")
+        axis.plot(time_s[shown], stood[shown, column], color="#1f6fb4", linewidth=1.0, label="followed")
+        axis.set_ylabel(f"{name} (deg)", fontsize=8)
+        axis.grid(color="#eeeeee")
+        if column == 0:
+            axis.legend(fontsize=8, loc="upper right")
+    axis.set_xlabel("s since the first command; no orange line: no commands")
+    picture = figure.add_subplot(grid[:, 1], projection="3d")
+    instants = np.linspace(*np.flatnonzero(given)[[0, -1]], 7).astype(int)
+    for number, instant in enumerate(instants):
+        points = arm.points[instant]
+        shade = 0.85 - 0.85 * number / (len(instants) - 1)
+        picture.plot(*points.T, "-o", color=(shade, shade, shade), markersize=3)
+    picture.set_title(f"{arm.mapping.robot}, light to dark", fontsize=9)
+    picture.set(xlabel="x forward (m)", ylabel="y left (m)", zlabel="z up (m)")
+    picture.set_aspect("equal")
+    picture.view_init(elev=15, azim=-60)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, format="png")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Of the command line."""
+    made = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0] if __doc__ else "")
+    made.add_argument("robot", choices=sorted(path.stem for path in HERE.glob("*.xml")), help="which arm")
+    made.add_argument(
+        "--bag", type=Path, metavar="BAG", help="play this through the graph; without it, wait for commands"
+    )
+    made.add_argument("--filter", default="ekf", help="of the graph (default: ekf)")
+    made.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
+    return made
+
+
+def main() -> int:
+    """Until the bag ends, or Ctrl-C."""
+    args = parser().parse_args()
+    file = ROBOTS / f"{args.robot}.yaml"
+    try:
+        mapping = load(file, {name: angle_names(name) for name in ALL_CONVENTIONS})
+    except BodyTrackingError as error:
+        print(f"drive: {error}", file=sys.stderr)
+        return 2
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = Arm(mapping, SimulatedArm(HERE / f"{args.robot}.xml", mapping.joints, mapping.home), context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    graph = None
+    if args.bag is not None:
+        command = [sys.executable, "-m", "body_tracking.cli", "up", "--bag", args.bag, "--filter", args.filter]
+        graph = subprocess.Popen([*command, "--robot", file])
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        while graph is None or graph.poll() is None:
+            executor.spin_once(timeout_sec=0.5)
+    if graph is not None and graph.poll() is None:
+        graph.send_signal(signal.SIGINT)
+        graph.wait()
+    rclpy.try_shutdown(context=context)
+    code = graph.returncode if graph is not None else 0
+    if not node.commands:
+        print("no command came" + ("" if code else ": the diagnostics of robot_commands say why"), file=sys.stderr)
+        return code or 1
+    print(f"\n{mapping.robot}: {node.commands} commands\n{report(node)}")
+    if args.output is not None:
+        draw(node, args.output)
+        print(f"picture: {args.output}")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
