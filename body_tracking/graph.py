@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.messages import (
     CLOCK,
     DIAGNOSTICS,
@@ -31,7 +30,6 @@ from body_tracking.messages import (
 )
 from body_tracking.parameters import Parameter, Value, as_yaml, is_wildcard, matches, read_file
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
-from body_tracking.robot.mapping import load
 from body_tracking.sensors import check_sensor_name
 
 PARENT_VARIABLE = "BODY_TRACKING_SUPERVISOR"
@@ -564,6 +562,10 @@ def convention_of_robot(mapping: Path, asked: str) -> str:
         MappingError: the file is none.
         GraphError: another convention is asked for.
     """
+    # only who drives a robot pays for these
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+    from body_tracking.robot.mapping import load
+
     found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention
     if asked not in ("", AUTO, found):
         raise GraphError(f"convention {asked}: {mapping} is about angles of the convention {found}")

@@ -395,8 +395,8 @@ class Follower:
                 self._enter(State.APPROACHING, f"everything was good for {good:.2f} s", steady_ns)
             elif fault and self.state == State.HOLDING and since >= limits.stop_after:
                 self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
-            elif fault:
-                self._reason = fault
+            else:
+                self._reason = fault or f"everything is good for {good:.2f} s, {limits.recover_after:g} s are needed"
         elif fault:
             self._enter(State.HOLDING, fault, steady_ns)
         elif self.state == State.APPROACHING and since >= limits.approach:

@@ -3,7 +3,7 @@
 A mapping is a YAML file; ``docs/robots.md`` explains it, ``config/robots/`` has two. Radians, seconds, metres::
 
     robot: two_joint_arm            # a name, for people
-    convention: positional          # whose angle names these are
+    convention: isb                 # whose angle names these are
     output:
       kind: joint_trajectory        # or float64_multi_array
       topic: /arm_controller/joint_trajectory
@@ -14,7 +14,7 @@ A mapping is a YAML file; ``docs/robots.md`` explains it, ``config/robots/`` has
     joints:                         # in the same order
       - name: shoulder
         angle: shoulder_elevation_left          # or angles: [{angle: NAME, weight: NUMBER}, ...], or constant: NUMBER
-        scale: 1.0                  # robot = scale * person + offset
+        scale: -1.0                 # robot = scale * person + offset
         offset: 0.0
         lower: 0.0
         upper: 2.8
@@ -66,7 +66,7 @@ class SafetyLimits:
 
     silence: float = number_field(
         0.1,
-        "the robot holds at the latest this long after the last new angles, and after any sensor's last frame",
+        "the robot holds at the latest this long after the last new angles, and after the last frame of all sensors",
         "s",
         0.02,
         5.0,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -28,6 +30,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.graph import DIAGNOSTICS_TOPIC
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
 
@@ -48,6 +51,9 @@ class Arm(Node):
         stood: (n,) how the joints stood.
         points: (n + 1, 3) where they were.
         commands: how many came.
+        first: steady time of the first of them; infinite before.
+        reason: what the diagnostics of ``robot_commands`` said last.
+        killed: steady time at which the player was killed; infinite if it was not.
     """
 
     def __init__(self, mapping: RobotMapping, arm: SimulatedArm, context: rclpy.Context) -> None:
@@ -58,6 +64,7 @@ class Arm(Node):
         self.stood: list[FloatArray] = []
         self.points: list[FloatArray] = []
         self.commands = 0
+        self.first = self.killed = np.inf
         self.command = np.full(len(mapping.joints), np.nan)
         self.heard = self.passed = time.monotonic()
         output = mapping.output
@@ -66,6 +73,8 @@ class Arm(Node):
         else:
             self.create_subscription(Float64MultiArray, output.topic, self.on_array, 10)
         self.states = self.create_publisher(JointState, output.state_topic, 10)
+        self.reason = "robot_commands was not heard of"
+        self.create_subscription(DiagnosticArray, DIAGNOSTICS_TOPIC, self.on_diagnostics, 10)
         self.create_timer(PERIOD, self.advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_trajectory(self, message: JointTrajectory) -> None:
@@ -79,10 +88,18 @@ class Arm(Node):
         """Positions in the controller's order."""
         self.go_to(np.array(message.data), 0.0)
 
+    def on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Why there are commands, or none."""
+        for status in message.status:
+            if status.name.startswith("robot_commands:") and status.message != self.reason:
+                self.reason = status.message
+                print(f"robot_commands: {self.reason}")
+
     def go_to(self, position: FloatArray, seconds: float) -> None:
         """Follow a command."""
         self.command, self.heard = position, time.monotonic()
         self.commands += 1
+        self.first = min(self.first, self.heard)
         self.arm.go_to(position, seconds)
 
     def advance(self) -> None:
@@ -135,6 +152,8 @@ def draw(arm: Arm, path: Path) -> None:
         axis.plot(time_s[shown], stood[shown, column], color="#1f6fb4", linewidth=1.0, label="followed")
         axis.set_ylabel(f"{name} (deg)", fontsize=8)
         axis.grid(color="#eeeeee")
+        if np.isfinite(arm.killed):
+            axis.axvline(arm.killed - times[given][0], color="black", linestyle=":", label="player killed")
         if column == 0:
             axis.legend(fontsize=8, loc="upper right")
     axis.set_xlabel("s since the first command; no orange line: no commands")
@@ -152,6 +171,13 @@ def draw(arm: Arm, path: Path) -> None:
     figure.savefig(path, format="png")
 
 
+def kill_child(parent: int, executable: str) -> None:
+    """End one of a graph's nodes as a crash does. Linux only."""
+    for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        if executable.encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+            os.kill(int(child), signal.SIGKILL)
+
+
 def parser() -> argparse.ArgumentParser:
     """Of the command line."""
     made = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0] if __doc__ else "")
@@ -160,6 +186,12 @@ def parser() -> argparse.ArgumentParser:
         "--bag", type=Path, metavar="BAG", help="play this through the graph; without it, wait for commands"
     )
     made.add_argument("--filter", default="ekf", help="of the graph (default: ekf)")
+    made.add_argument(
+        "--kill",
+        type=float,
+        metavar="S",
+        help="kill the player of the bag so long after the first command; up restarts it",
+    )
     made.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
     return made
 
@@ -179,19 +211,24 @@ def main() -> int:
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     graph = None
+    kill = args.kill
     if args.bag is not None:
         command = [sys.executable, "-m", "body_tracking.cli", "up", "--bag", args.bag, "--filter", args.filter]
         graph = subprocess.Popen([*command, "--robot", file])
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         while graph is None or graph.poll() is None:
             executor.spin_once(timeout_sec=0.5)
+            if graph is not None and kill is not None and time.monotonic() - node.first > kill:
+                kill, node.killed = None, time.monotonic()
+                kill_child(graph.pid, "bag_player")
     if graph is not None and graph.poll() is None:
         graph.send_signal(signal.SIGINT)
         graph.wait()
+    executor.shutdown()
     rclpy.try_shutdown(context=context)
     code = graph.returncode if graph is not None else 0
     if not node.commands:
-        print("no command came" + ("" if code else ": the diagnostics of robot_commands say why"), file=sys.stderr)
+        print(f"no command came: {node.reason}", file=sys.stderr)
         return code or 1
     print(f"\n{mapping.robot}: {node.commands} commands\n{report(node)}")
     if args.output is not None:

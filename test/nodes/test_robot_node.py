@@ -25,7 +25,6 @@ from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
 from body_tracking.cdr import encode_angles  # noqa: E402
-from body_tracking.kinematics.angles import JointAngles  # noqa: E402
 from body_tracking.kinematics.conventions import angles_of  # noqa: E402
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
@@ -80,40 +79,22 @@ def test_a_wrong_mapping_is_refused_at_the_start_by_name(change: Any, said: str,
 # --- a recording of the angles that the graph would find, if it saw everything
 
 
-def angles_of_the_person(stamp_ns: int, truth: Any, state: Any) -> dict[str, JointAngles]:
-    """The true angles of a moment, by body: two persons who do the same, told in two conventions."""
-    names = tuple(name.rsplit("_", 1)[0] if name.endswith("_body1") else name for name in truth.name)
-    n = len(names)
-    positional = JointAngles(
-        stamp_ns, names, np.array(truth.position), np.array(truth.velocity), np.full(n, 0.1), np.full(n, 0.3)
-    )
-    model = UpperBody()
-    _, frame_id, q, velocity = joint_state_to_model(state, model)
-    estimate = state_estimate(model, stamp_ns, frame_id, q, velocity, 1e-3 * np.eye(2 * model.nv))
-    return {"body1": positional, "body2": angles_of(estimate, model, "isb")}
-
-
 def write_angles(path: Path) -> None:
-    """A bag with the frames of one sensor, and the angles of the same moments."""
-    state_topic, angle_topic = graph.TRUE_MODEL_STATE, graph.TRUE_ANGLES
+    """A bag with the frames of one sensor, and the true angles of the same moments, of two people who move alike."""
+    model = UpperBody()
+    covariance = 1e-3 * np.eye(2 * model.nv)
     with BagReader(BAG) as reader, BagWriter(path) as writer:
         writer.add_topic(SENSOR, reader.topics[SENSOR].type_name, SENSOR_DATA)
         for body in BODIES.values():
             for topic in (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body)):
                 writer.add_topic(topic, "sensor_msgs/msg/JointState", RELIABLE_QOS)
-        states: dict[int, Any] = {}
-        for raw in reader.messages([SENSOR, state_topic, angle_topic]):
+        for raw in reader.messages([SENSOR, graph.TRUE_MODEL_STATE]):
             if raw.topic == SENSOR:
                 writer.write(SENSOR, raw.cdr, raw.log_time_ns)
                 continue
-            message = deserialize("sensor_msgs/msg/JointState", raw.cdr)
-            stamp_ns = to_nanoseconds(message.header.stamp)
-            other = states.pop(stamp_ns, None)
-            if other is None:
-                states[stamp_ns] = message
-                continue
-            state, truth = (message, other) if raw.topic == state_topic else (other, message)
-            for body, angles in angles_of_the_person(stamp_ns, truth, state).items():
+            state = joint_state_to_model(deserialize("sensor_msgs/msg/JointState", raw.cdr), model)
+            angles = angles_of(state_estimate(model, *state, covariance), model, "isb")
+            for body in BODIES.values():
                 topics = (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body))
                 for topic, cdr in zip(topics, encode_angles(angles, body, "world"), strict=True):
                     writer.write(topic, cdr, raw.log_time_ns + LATENCY_NS)
