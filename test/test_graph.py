@@ -25,6 +25,7 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
+    GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
 ]
 
 
@@ -74,6 +75,24 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         )
         assert all(after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
+    specs = nodes_for(GraphOptions(bag="bag", record="r", filter_name="ekf", robot="robot.yaml"))
+    assert specs[0].executable == "robot_commands"
+    assert specs[0].parameters["mapping"] == "robot.yaml"
+    assert specs[0].parameters["sensors"] == ("kinect1", "kinect2")
+    assert specs[-1].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:5", "/kinect2/skeleton:5")
+    assert "robot_commands" not in named(nodes_for(GraphOptions()))
+
+
+def test_the_convention_is_the_robots() -> None:
+    file = ROOT / "config" / "robots" / "iiwa7.yaml"
+    assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
+    with pytest.raises(graph.GraphError, match=r"convention model: .*iiwa7\.yaml is about angles of the convention isb"):
+        graph.convention_of_robot(file, "model")
+    with pytest.raises(BodyTrackingError, match="cannot be read"):
+        graph.convention_of_robot(ROOT / "nowhere.yaml", "")
 
 
 def test_angles_of_positions_need_no_model() -> None:

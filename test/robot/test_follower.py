@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_mappings import content, mapping, seen
 
@@ -96,7 +96,7 @@ def test_a_moving_angle_is_predicted_to_now_but_not_beyond_the_horizon() -> None
         np.testing.assert_allclose(command.position, [0.5 + moved, 0.5 - moved], atol=1e-3)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.floats(0.0, 0.09), st.floats(0.0, 1.0))
 def test_it_holds_within_the_silence_of_the_last_angles(phase: float, speed: float) -> None:
     bench = following()
@@ -404,7 +404,7 @@ wild = st.builds(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.one_of(calm, wild), max_size=12), st.booleans())
 def test_whatever_is_heard_the_robot_is_never_told_what_it_must_not(events: list[Event], alone: bool) -> None:
     made = content(recover_after=0.05, approach=0.1, stop_after=0.3, max_stddev=1.0)

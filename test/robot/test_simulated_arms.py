@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from simulated_arm import SimulatedArm
 
@@ -36,7 +36,7 @@ def directions(arm: SimulatedArm, elbow: int, wrist: int) -> tuple[np.ndarray, n
     return parts[0] / np.linalg.norm(parts[0]), parts[1] / np.linalg.norm(parts[1])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     plane=st.floats(-0.4, 1.8),
     elevation=st.floats(0.3, 1.9),
