@@ -89,7 +89,7 @@ def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() ->
 def test_the_convention_is_the_robots() -> None:
     file = ROOT / "config" / "robots" / "iiwa7.yaml"
     assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
-    with pytest.raises(graph.GraphError, match=r"convention model: .*iiwa7\.yaml is about angles of the convention isb"):
+    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
         graph.convention_of_robot(file, "model")
     with pytest.raises(BodyTrackingError, match="cannot be read"):
         graph.convention_of_robot(ROOT / "nowhere.yaml", "")

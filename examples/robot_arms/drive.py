@@ -2,7 +2,8 @@
 
 Starts ``body_tracking up`` over a bag with the robot's mapping file, follows its commands in MuJoCo, and prints and
 draws what became of them. Without ``--bag`` only the arm runs, until Ctrl-C, for a graph that is started elsewhere:
-``body_tracking up --robot config/robots/two_joint_arm.yaml``. Needs ROS, and ``pip install 'body_tracking[examples]'``.
+``body_tracking up --robot config/robots/two_joint_arm.yaml``. With ``--angles`` no graph runs: the bag holds its result
+already. Needs ROS, and ``pip install 'body_tracking[examples]'``.
 """
 
 from __future__ import annotations
@@ -30,12 +31,22 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.graph import DIAGNOSTICS_TOPIC
+from body_tracking.graph import (
+    DEFAULT_BODY,
+    DIAGNOSTICS_TOPIC,
+    joint_states_stddev_topic,
+    joint_states_topic,
+    sensors_among,
+    skeleton_topic,
+)
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
 
 HERE = Path(__file__).resolve().parent
 ROBOTS = HERE.parents[1] / "config" / "robots"
+RESTART = 4.0
+"""Seconds after which a killed player is started again."""
 PERIOD = 0.01
 """Seconds between two words of the robot's state."""
 COMPARED_DELAYS = np.arange(0.0, 0.3, 0.01)
@@ -52,6 +63,7 @@ class Arm(Node):
         points: (n + 1, 3) where they were.
         commands: how many came.
         first: steady time of the first of them; infinite before.
+        played: seconds of the bag, by the player's diagnostics.
         reason: what the diagnostics of ``robot_commands`` said last.
         killed: steady time at which the player was killed; infinite if it was not.
     """
@@ -73,6 +85,7 @@ class Arm(Node):
         else:
             self.create_subscription(Float64MultiArray, output.topic, self.on_array, 10)
         self.states = self.create_publisher(JointState, output.state_topic, 10)
+        self.played = 0.0
         self.reason = "robot_commands was not heard of"
         self.create_subscription(DiagnosticArray, DIAGNOSTICS_TOPIC, self.on_diagnostics, 10)
         self.create_timer(PERIOD, self.advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -91,6 +104,9 @@ class Arm(Node):
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         """Why there are commands, or none."""
         for status in message.status:
+            if status.name.startswith("bag_player:"):
+                values = {item.key: item.value for item in status.values}
+                self.played = float(values.get("position s", 0.0))
             if status.name.startswith("robot_commands:") and status.message != self.reason:
                 self.reason = status.message
                 print(f"robot_commands: {self.reason}")
@@ -171,11 +187,76 @@ def draw(arm: Arm, path: Path) -> None:
     figure.savefig(path, format="png")
 
 
-def kill_child(parent: int, executable: str) -> None:
-    """End one of a graph's nodes as a crash does. Linux only."""
-    for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
-        if executable.encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
-            os.kill(int(child), signal.SIGKILL)
+class Graph:
+    """What commands the arm: ``body_tracking up`` over a bag, or, where the bag holds angles already, a player of them.
+
+    Args:
+        bag: what is played.
+        file: the robot's mapping.
+        filter_name: of the graph; empty where the bag holds angles.
+    """
+
+    def __init__(self, bag: Path, file: Path, filter_name: str) -> None:
+        self._bag, self._live = bag, bool(filter_name)
+        self._others: list[subprocess.Popen[bytes]] = []
+        self._begun = self._again = np.inf
+        self._played = 0.0
+        if self._live:
+            command = ["body_tracking.cli", "up", "--bag", bag, "--filter", filter_name, "--robot", file]
+            self._main = subprocess.Popen([sys.executable, "-m", *command])
+            return
+        with BagReader(bag) as reader:
+            self._sensors = sensors_among(reader.topics)
+        listed = f"[{','.join(self._sensors)}]"
+        self._others = [
+            self._node("calibration", sensors=listed, use_sim_time=True),
+            self._node("robot_commands", mapping=file, sensors=listed, use_sim_time=True),
+        ]
+        self._play()
+
+    @staticmethod
+    def _node(executable: str, **parameters: object) -> subprocess.Popen[bytes]:
+        words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        return subprocess.Popen([sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *words])
+
+    def _play(self) -> None:
+        skeletons = [skeleton_topic(sensor) for sensor in self._sensors]
+        angles = [joint_states_topic(DEFAULT_BODY), joint_states_stddev_topic(DEFAULT_BODY)]
+        self._main = self._node(
+            "bag_player",
+            bag=self._bag,
+            topics=f"[{','.join([*skeletons, *angles])}]",
+            wait_for_subscribers=f"[{','.join(repr(f'{topic}:2') for topic in skeletons)}]",
+            start_offset=self._played,
+        )
+
+    def running(self) -> bool:
+        """Whether there is more to come; a player that was killed is started again after a while, as ``up`` does."""
+        if self._main.poll() is None:
+            return True
+        if time.monotonic() > self._again:
+            self._again = np.inf
+            self._play()
+            return True
+        return np.isfinite(self._again)
+
+    def kill(self, played: float) -> None:
+        """End the player as a crash does. Linux only."""
+        if not self._live:
+            self._main.kill()
+            self._again, self._played = time.monotonic() + RESTART, played
+            return
+        for child in Path(f"/proc/{self._main.pid}/task/{self._main.pid}/children").read_text().split():
+            if b"bag_player" in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                os.kill(int(child), signal.SIGKILL)
+
+    def end(self) -> int:
+        """Stop everything; the exit code."""
+        for process in (self._main, *self._others):
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            process.wait()
+        return max(0, self._main.returncode, *(process.returncode for process in self._others))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -186,6 +267,9 @@ def parser() -> argparse.ArgumentParser:
         "--bag", type=Path, metavar="BAG", help="play this through the graph; without it, wait for commands"
     )
     made.add_argument("--filter", default="ekf", help="of the graph (default: ekf)")
+    made.add_argument(
+        "--angles", action="store_true", help="the bag holds joint angles, by body_tracking replay: play these alone"
+    )
     made.add_argument(
         "--kill",
         type=float,
@@ -210,23 +294,18 @@ def main() -> int:
     node = Arm(mapping, SimulatedArm(HERE / f"{args.robot}.xml", mapping.joints, mapping.home), context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    graph = None
-    kill = args.kill
-    if args.bag is not None:
-        command = [sys.executable, "-m", "body_tracking.cli", "up", "--bag", args.bag, "--filter", args.filter]
-        graph = subprocess.Popen([*command, "--robot", file])
+    graph, kill = None, args.kill
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        while graph is None or graph.poll() is None:
+        if args.bag is not None:
+            graph = Graph(args.bag, file, "" if args.angles else args.filter)
+        while graph is None or graph.running():
             executor.spin_once(timeout_sec=0.5)
             if graph is not None and kill is not None and time.monotonic() - node.first > kill:
                 kill, node.killed = None, time.monotonic()
-                kill_child(graph.pid, "bag_player")
-    if graph is not None and graph.poll() is None:
-        graph.send_signal(signal.SIGINT)
-        graph.wait()
+                graph.kill(node.played)
+    code = graph.end() if graph is not None else 0
     executor.shutdown()
     rclpy.try_shutdown(context=context)
-    code = graph.returncode if graph is not None else 0
     if not node.commands:
         print(f"no command came: {node.reason}", file=sys.stderr)
         return code or 1

@@ -79,8 +79,13 @@ def test_a_wrong_mapping_is_refused_at_the_start_by_name(change: Any, said: str,
 # --- a recording of the angles that the graph would find, if it saw everything
 
 
-def write_angles(path: Path) -> None:
-    """A bag with the frames of one sensor, and the true angles of the same moments, of two people who move alike."""
+def write_angles(path: Path, seconds: float = np.inf) -> None:
+    """A bag with the frames of one sensor, and the true angles of the same moments, of two people who move alike.
+
+    Args:
+        path: of the bag.
+        seconds: of the recording that are used.
+    """
     model = UpperBody()
     covariance = 1e-3 * np.eye(2 * model.nv)
     with BagReader(BAG) as reader, BagWriter(path) as writer:
@@ -89,6 +94,8 @@ def write_angles(path: Path) -> None:
             for topic in (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body)):
                 writer.add_topic(topic, "sensor_msgs/msg/JointState", RELIABLE_QOS)
         for raw in reader.messages([SENSOR, graph.TRUE_MODEL_STATE]):
+            if raw.log_time_ns - reader.start_ns > seconds * NANOSECONDS:
+                break
             if raw.topic == SENSOR:
                 writer.write(SENSOR, raw.cdr, raw.log_time_ns)
                 continue
@@ -310,3 +317,19 @@ def test_it_recovers_after_good_data_alone_and_slowly(run: Run) -> None:
         begun = [position for _, _, position in itertools.islice(commands, 20)]
         # a fifth of a second into an approach of 1.5 s
         assert (np.abs(np.diff(begun, axis=0)) <= arm.mapping.rate * 2 * PERIOD * 0.4 / 1.5 + 1e-9).all()
+
+
+def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
+    write_angles(tmp_path / "angles", 8.0)
+    example = ROOT / "examples" / "robot_arms" / "drive.py"
+    picture = tmp_path / "arm.png"
+    words = ["iiwa7", "--bag", tmp_path / "angles", "--angles", "-o", picture]
+    done = subprocess.run(
+        [sys.executable, example, *words], capture_output=True, text=True, timeout=120, env=environment(), check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "robot_commands: approaching: everything was good for 0.5" in done.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    rows = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.startswith("joint_a")}
+    assert len(rows) == 7
+    assert all(float(row[3]) < 5.0 for row in rows.values())
