@@ -433,6 +433,8 @@ class _LeastOffset:
         return min(self._older, self._newer)
 
     def add(self, offset_ns: int, steady_ns: int) -> None:
+        if self._since_ns is not None and abs(offset_ns - self.least) > _OTHER_CLOCK_NS:
+            self._since_ns = None  # one of the clocks was set, or there was no /clock yet
         if self._since_ns is None or steady_ns - self._since_ns > self._BUCKET_NS:
             self._older = offset_ns if self._since_ns is None else self._newer
             self._newer, self._since_ns = offset_ns, steady_ns

@@ -244,6 +244,12 @@ def test_a_calibration_must_go_on_being_heard_of_and_may_get_too_old() -> None:
     assert "calibration is 20 s old, limit 20 s" in bench.run(0.2).reason
 
 
+def test_angles_that_came_before_the_clock_do_not_count_for_long() -> None:
+    bench = Bench()
+    bench.follower.hear_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), 0, bench.steady_ns)
+    assert bench.run(3.0).state == State.FOLLOWING
+
+
 @pytest.mark.parametrize("clock", ["auto", "ros"])
 def test_old_angles_and_angles_of_the_future_are_not_followed(clock: str) -> None:
     for shift, said in ((-0.4, "old, limit 0.3 s"), (0.2, "in the future")):
