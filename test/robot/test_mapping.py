@@ -12,7 +12,8 @@ import yaml
 from small_mappings import ANGLES, content, mapping
 
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.robot.mapping import MappingError, load
+from body_tracking.parameters import parameters_from
+from body_tracking.robot.mapping import MappingError, SafetyLimits, load
 
 ROBOTS = sorted((Path(__file__).resolve().parents[2] / "config" / "robots").glob("*.yaml"))
 
@@ -165,3 +166,14 @@ def test_the_shipped_mappings_are_sound(file: Path) -> None:
 
 def test_two_are_shipped() -> None:
     assert {file.stem for file in ROBOTS} == {"two_joint_arm", "iiwa7"}
+
+
+def test_the_documentation_knows_every_threshold_and_its_default() -> None:
+    text = (Path(__file__).resolve().parents[2] / "docs" / "robots.md").read_text(encoding="utf-8")
+    rows = {line.split("|")[1].strip(" `"): line.split("|")[2].strip() for line in text.splitlines() if "|" in line}
+    for item in parameters_from(SafetyLimits):
+        said = rows[item.name]
+        value = item.default
+        assert isinstance(value, bool | float)
+        expected = str(value).lower() if isinstance(value, bool) else f"{value:g}"
+        assert said.split()[0] == ("any" if expected == "inf" else expected)
