@@ -78,6 +78,11 @@ def orientation_topic(segment: str) -> str:
     return f"/imu/{segment}/orientation"
 
 
+def is_orientation_topic(topic: str) -> bool:
+    """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
+    return topic == orientation_topic(topic.removeprefix("/imu/").removesuffix("/orientation"))
+
+
 @dataclass(frozen=True, slots=True)
 class ImuTopics:
     """Where the driver of a segment's inertial sensor publishes.
@@ -446,6 +451,7 @@ class GraphOptions:
         reliable: transport every skeleton reliably.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
+        external: live, somebody else publishes the sensors' skeletons.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -460,6 +466,7 @@ class GraphOptions:
     reliable: bool = False
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
+    external: bool = False
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -505,7 +512,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         # Calibration, fusion and, maybe, the filter and the recorder.
         listeners = 2 + int(role.input == SENSORS_INPUT) + recorders
         specs.append(_player(options, sensors, listeners, after))
-    else:
+    elif not options.external:
         specs += [
             NodeSpec(
                 f"{sensor}_skeleton",
