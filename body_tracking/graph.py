@@ -79,6 +79,11 @@ def orientation_topic(segment: str) -> str:
     return f"/imu/{segment}/orientation"
 
 
+def is_orientation_topic(topic: str) -> bool:
+    """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
+    return topic == orientation_topic(topic.removeprefix("/imu/").removesuffix("/orientation"))
+
+
 @dataclass(frozen=True, slots=True)
 class ImuTopics:
     """Where the driver of a segment's inertial sensor publishes.
@@ -457,6 +462,7 @@ class GraphOptions:
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
         robot: mapping file of a robot that follows; empty for none.
+        external: live, somebody else publishes the sensors' skeletons.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -472,6 +478,7 @@ class GraphOptions:
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
     robot: str = ""
+    external: bool = False
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -519,7 +526,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         # Calibration, fusion and, maybe, the filter, the robot's commands and the recorder.
         listeners = 2 + int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders
         specs.append(_player(options, sensors, listeners, after))
-    else:
+    elif not options.external:
         specs += [
             NodeSpec(
                 f"{sensor}_skeleton",

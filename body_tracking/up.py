@@ -129,6 +129,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         raise UpError("--sensors: no name")
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
+    if args.external and args.bag is not None:
+        raise UpError("--external: a bag is played in place of the sensors; give one of the two")
     if args.bag is None:
         if args.rate != 1.0:
             raise UpError("--rate is the rate of a bag; give --bag too")
@@ -159,6 +161,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
         robot=str(args.robot) if args.robot else "",
+        external=args.external,
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -498,6 +501,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles; overrides the file, too")
     parser.add_argument(
         "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
+    )
+    parser.add_argument(
+        "--external", action="store_true", help="start no sensor nodes: somebody else publishes /<sensor>/skeleton"
     )
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"

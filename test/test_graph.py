@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,13 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
     # Calibration, fusion and recorder listen to the sensors.
     assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
+
+
+def test_sensors_of_somebody_else_need_no_nodes() -> None:
+    own, external = nodes_for(GraphOptions()), nodes_for(GraphOptions(external=True))
+    assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
+    played = GraphOptions(bag="bag")
+    assert nodes_for(replace(played, external=True)) == nodes_for(played)
 
 
 def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
