@@ -154,6 +154,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         convention=args.convention or "",
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
+        adapted=tuple(args.adapt or ()),
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -493,6 +494,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles; overrides the file, too")
     parser.add_argument(
         "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
+    )
+    parser.add_argument(
+        "--adapt",
+        action="append",
+        metavar="SENSOR[:/TOPIC]",
+        help="this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
     )
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"

@@ -380,9 +380,6 @@ def main() -> int:
         return 2
     try:
         stream(sender, source)
-    except SenderError as error:
-        print(f"kinect_sender: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         pass
     finally:
