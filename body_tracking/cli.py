@@ -11,21 +11,21 @@ from importlib.metadata import version
 
 from body_tracking.errors import BodyTrackingError
 
-SUBCOMMANDS = (
-    "recording.importer",
-    "recording.info",
-    "recording.replay",
-    "calibration.offline",
-    "up",
-    "evaluation.show",
-    "evaluation.evaluate",
-    "simulation.bags",
-)
-"""Modules of the package with ``add_parser(subparsers)``, which sets ``run`` on its parser; in the help's order."""
+SUBCOMMANDS = {
+    "import": "recording.importer",
+    "bag": "recording.info",
+    "replay": "recording.replay",
+    "calibrate": "calibration.offline",
+    "up": "up",
+    "show": "evaluation.show",
+    "evaluate": "evaluation.evaluate",
+    "simulate": "simulation.bags",
+}
+"""In the help's order; modules of the package with ``add_parser(subparsers)``, which sets ``run`` on its parser."""
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser with all subcommands."""
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The parser with all subcommands, or with one only: the others' modules need not be loaded for it."""
     top = argparse.ArgumentParser(
         prog="body_tracking",
         description="Joint angles with honest uncertainty from several sensors: recordings in, the live graph, "
@@ -34,8 +34,8 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name in SUBCOMMANDS:
-        importlib.import_module(f"body_tracking.{name}").add_parser(subparsers)
+    for name in [command] if command in SUBCOMMANDS else SUBCOMMANDS:
+        importlib.import_module(f"body_tracking.{SUBCOMMANDS[name]}").add_parser(subparsers)
     return top
 
 
@@ -45,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The program itself, not a call within another one. Matrices as small as these gain nothing by a second thread,
         # which OpenBLAS lets spin meanwhile; it has to be said before numpy is loaded, with the first subcommand.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    args = parser().parse_args(arguments)
+        arguments = sys.argv[1:]
+    args = parser(arguments[0] if arguments else None).parse_args(arguments)
     try:
         code: int = args.run(args)
     except BodyTrackingError as error:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.errors import BodyTrackingError
@@ -33,8 +33,8 @@ MIN_SPEED = 0.02
 """m/s, RMS over joints: a slower movement does not show its time."""
 
 _LEVEL = 0.95
-_NORMAL = float(np.sqrt(chi2.ppf(_LEVEL, 1)))
-_ELLIPSOID = float(chi2.ppf(_LEVEL, 3))
+_NORMAL = float(np.sqrt(chdtri(1, 1.0 - _LEVEL)))
+_ELLIPSOID = float(chdtri(3, 1.0 - _LEVEL))
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 _PARENTS, _CHILDREN = (np.array([bone[end] for bone in BONES], dtype=np.intp) for end in (0, 1))
 

@@ -32,7 +32,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from body_tracking.filters import orientation
 from body_tracking.filters.linear import FilterError
@@ -467,7 +467,7 @@ class ExtendedKalmanFilter:
         self._velocities = slice(self._observed, self._size)
         self._ball_rows = self.model.ball_v.reshape(-1)
         self._base_variance = BASE_STDDEV[self.model.joints] ** 2
-        self._gate = float(chi2.ppf(p.gate_probability, _DIMENSIONS))
+        self._gate = float(chdtri(_DIMENSIONS, 1.0 - p.gate_probability))
         self._group, self._first_log_density = self._groups()
         self._log_density_bounds = self._first_log_density - _DENSITY_DOWN, self._first_log_density + _DENSITY_UP
         self._group_sum = np.zeros((len(self._first_log_density), self._nv))

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
@@ -233,7 +233,7 @@ class LinearKalmanFilter:
         self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
         # an Ornstein-Uhlenbeck velocity of variance s driven by white noise of density q fades in 2 s / q
         self._fading_time: FloatArray = 2.0 * p.initial_velocity_stddev**2 / joint_densities(densities)
-        self._gate = float(chi2.ppf(p.gate_probability, 3))
+        self._gate = float(chdtri(3, 1.0 - p.gate_probability))
         self.counters: dict[str, int] = dict.fromkeys(
             (
                 "frames",

@@ -71,6 +71,8 @@ JUMP_BACK_NS = 1 * NANOSECONDS
 GAP_NS = 50_000_000
 """Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
 
+_EVERYWHERE = frozenset({"/rosout", "/parameter_events", graph.DIAGNOSTICS_TOPIC})
+"""Outputs that every node has."""
 _LOG_PERIOD_S = 5.0
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
 
@@ -219,7 +221,7 @@ class GraphNode(Node):
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         self.configure(self.values)
         self.add_on_set_parameters_callback(self._on_set)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", to_profile(RELIABLE_QOS))
+        self._diagnostics = self.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, to_profile(RELIABLE_QOS))
         self.start()
         self.create_timer(1.0, self._report, clock=STEADY)
 
@@ -350,11 +352,19 @@ class GraphNode(Node):
 
     def _report(self) -> None:
         level, text, values = self.state()
-        values = {**self.monitor.values(), **values}
+        values = {**self.monitor.values(), **self._listeners(), **values}
         if self.monitor.totals["malformed"] and level == 0:
             text = text or f"{self.monitor.totals['malformed']} malformed messages"
         message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)
         self._diagnostics.publish(message)
+
+    def _listeners(self) -> dict[str, object]:
+        """How many subscribers this node has found of each of its outputs: none yet is why nothing arrives."""
+        return {
+            f"subscribers {each.topic_name}": each.get_subscription_count()
+            for each in self.publishers
+            if each.topic_name not in _EVERYWHERE
+        }
 
 
 def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:

@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
@@ -738,8 +738,8 @@ class _Sighting:
         hidden = self._lag(cover)
         # what is said of a hidden joint is said for a while
         chance = self._wander(shape, rng)
-        inferred = (hidden > errors.hidden_from) & (chance > norm.ppf(errors.mislabelled))
-        lost = inferred & (hidden > _MIDDLE) & (chance > norm.isf(errors.given_up))
+        inferred = (hidden > errors.hidden_from) & (chance > ndtri(errors.mislabelled))
+        lost = inferred & (hidden > _MIDDLE) & (chance > -ndtri(errors.given_up))
         flickers = rng.random(shape) < errors.flicker * _FLICKERS
         states = np.where(inferred | flickers, TrackingState.INFERRED, TrackingState.TRACKED).astype(np.uint8)
         states[lost | ~in_view] = TrackingState.NOT_TRACKED

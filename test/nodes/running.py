@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,6 +17,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -85,6 +86,29 @@ class Running:
             )
         self.processes[executable] = process
         return process
+
+    def play(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
+        """Let a ``bag_player`` that was started paused go on, once nodes have found who is to hear them.
+
+        Args:
+            links: of nodes the number of subscribers of each topic.
+            timeout: seconds until that is an error.
+        """
+
+        def missing() -> list[str]:
+            return [
+                f"{node}: {topic}"
+                for node, topics in links.items()
+                for topic, number in topics.items()
+                if int(self.diagnostics.get(node, {}).get(f"subscribers {topic}", 0)) < number
+            ]
+
+        assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)
+        client = self.node.create_client(Trigger, "/bag_player/resume")
+        assert client.wait_for_service(timeout)
+        future = client.call_async(Trigger.Request())
+        assert self.until(future.done, timeout)
+        assert future.result().success
 
     def log(self, executable: str) -> str:
         """What a node printed so far."""
