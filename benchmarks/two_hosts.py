@@ -382,25 +382,34 @@ def compare(live: Angles, stamps: FloatArray, whole: Angles, lossy: Angles, star
         "loss_alone_deg": _rms(loss_alone[use]),
     }
     if link.cut[1]:
-        before = apart[use & (wall < link.cut[0])[:, None]]
-        limit = max(1.0, float(np.percentile(before, 99.0)))
-        after = (wall > link.cut[1]) & (wall < link.cut[1] + 5.0)
-        first = live.received[after][0] / NANOSECONDS - link.cut[1] if after.any() else float("inf")
-        # of each message after the link is back: the RMS over the angles
-        each = np.array([_rms(apart[i, certain[i]]) if certain[i].any() else np.inf for i in np.flatnonzero(after)])
-        bad = np.flatnonzero(each > limit)
-        index = np.flatnonzero(after)
-        back = index[bad[-1] + 1] if len(bad) and bad[-1] + 1 < len(index) else (index[0] if not len(bad) else None)
-        result["first_angles_after_s"] = round(float(first), 3)
-        result["recovery_limit_deg"] = round(limit, 2)
-        result["recovery_s"] = (
-            round(float(live.received[back] / NANOSECONDS - link.cut[1]), 3) if back is not None else None
-        )
+        result |= recovery(live.received / NANOSECONDS, wall, np.where(certain, apart, np.nan), start, link)
     return result
 
 
+def recovery(received: FloatArray, wall: FloatArray, apart: FloatArray, start: float, link: Link) -> dict[str, Any]:
+    """Seconds from the end of the cut until the first angles, and until half a second of them is as before the cut.
+
+    As before: together as near to what they should be as 99 of 100 half seconds were before it, or within a degree.
+    """
+
+    def half_second(at: float) -> float:
+        found = apart[(wall >= at) & (wall < at + 0.5)]
+        return _rms(found) if np.isfinite(found).any() else float("inf")
+
+    before = [half_second(at) for at in np.arange(start + SETTLE, link.cut[0] - 0.5, 0.1)]
+    limit = max(1.0, float(np.percentile([each for each in before if np.isfinite(each)], 99.0)))
+    after = np.flatnonzero(wall > link.cut[1])
+    good = next((k for k in after if half_second(wall[k]) <= limit), None)
+    return {
+        "first_angles_after_s": round(float(received[after[0]] - link.cut[1]), 3) if len(after) else None,
+        "recovery_limit_deg": round(limit, 2),
+        "recovery_s": None if good is None else round(float(received[good] - link.cut[1]), 3),
+    }
+
+
 def _rms(values: FloatArray) -> float:
-    return round(float(np.sqrt((np.asarray(values) ** 2).mean())), 3) if np.size(values) else 0.0
+    finite = values[np.isfinite(values)]
+    return round(float(np.sqrt((finite**2).mean())), 3) if len(finite) else 0.0
 
 
 def last_values(bag: Path) -> dict[str, dict[str, str]]:
@@ -499,7 +508,7 @@ def show(result: dict[str, Any]) -> None:
     if result["cut_s"]:
         print(
             f"  after the cut: first angles {angles['first_angles_after_s']} s, within "
-            f"{angles['recovery_limit_deg']} deg for good {angles['recovery_s']} s"
+            f"{angles['recovery_limit_deg']} deg from {angles['recovery_s']} s on"
         )
     print(f"  restarts: {result['restarts']}")
     for name, met in result["bars"].items():

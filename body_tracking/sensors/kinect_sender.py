@@ -217,11 +217,12 @@ class Sender:
         except OSError as error:
             self._failed(error)
             return
-        if not self._key and not ipaddress.ip_address(address[0]).is_loopback:
+        loopback = ipaddress.ip_address(address[0]).is_loopback
+        if not self._key and not loopback:
             raise SenderError(f"{self._host} is another computer: frames for it are signed; give --key-file")
         old = self._socket
         made = socket.socket(family, kind, number)
-        made.bind(("", 0))
+        made.bind((address[0] if loopback else "", 0))
         with self._lock:
             self._socket, self._address = made, address
         if old is not None:
@@ -380,6 +381,9 @@ def main() -> int:
         return 2
     try:
         stream(sender, source)
+    except SenderError as error:
+        print(f"kinect_sender: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         pass
     finally:

@@ -270,17 +270,21 @@ class NetworkSource:
             ``key_file`` and ``least_delay`` count.
 
     Raises:
-        SourceError: no key for an address beyond this computer, a key file that is none, an address or port that
-            cannot be had.
+        SensorNameError: a name that cannot be a sensor's.
+        SourceError: likewise, as packets hold it; no key for an address beyond this computer, a key file that is none,
+            an address or port that cannot be had.
     """
 
     def __init__(self, settings: SourceSettings) -> None:
         check_sensor_name(settings.sensor)
+        sent_as = settings.device or settings.sensor
+        try:
+            protocol.sensor_bytes(sent_as)
+        except ProtocolError as error:
+            raise SourceError(str(error)) from None
         self._sensor = settings.sensor
         self._where = f"{settings.address} port {settings.port}"
-        self._receiver = Receiver(
-            settings.device or settings.sensor, _key(settings), round(settings.least_delay * NANOSECONDS)
-        )
+        self._receiver = Receiver(sent_as, _key(settings), round(settings.least_delay * NANOSECONDS))
         self._closed = threading.Event()
         family = socket.AF_INET6 if ":" in settings.address else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)

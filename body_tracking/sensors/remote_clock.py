@@ -14,8 +14,11 @@ import numpy as np
 
 from body_tracking.skeleton import NANOSECONDS
 
-WINDOW = 60.0
-"""Seconds of round trips that count."""
+WINDOW = 60
+"""Seconds with round trips that count, the latest ones; those of a cut of the link between them do not."""
+
+LONGEST = 300.0
+"""Seconds after which a round trip counts no more."""
 
 DRIFT_PRIOR = 50e-6
 """Standard deviation of the drift of one computer's clock against another's: crystals keep 50 ppm."""
@@ -28,7 +31,8 @@ _STEP = 0.01
 """Seconds beyond its own bounds by which a round trip must contradict the others for a clock to have been set."""
 _CONTRADICTIONS = 3
 
-_LAG_WINDOW = 10 * NANOSECONDS
+_LAG_WINDOW = 300
+"""Frames, ten seconds of a Kinect's: after a cut of the link the first frames need not be fast ones."""
 _SLEW = 100
 """The correction of a stamp changes by at most a hundredth of the time that has passed."""
 _SET_NS = NANOSECONDS // 4
@@ -103,7 +107,7 @@ class RoundTrips:
                 return True
             self._bins.pop()
         self._bins.append((remote, offset, trip))
-        while remote - self._bins[0][0] > WINDOW * NANOSECONDS:
+        while len(self._bins) > WINDOW or remote - self._bins[0][0] > LONGEST * NANOSECONDS:
             self._bins.popleft()
         self._fit()
         return True
@@ -128,8 +132,8 @@ class CaptureClock:
     """Capture times in the local clock, ever later.
 
     A frame is sent some time after its capture, the sensor's delay, never less than the least one. So the least of
-    sending time minus sensor's time over some seconds is the difference of the two clocks plus that least delay. The
-    correction of the stamps follows what is known by and by, so that their distances stay those of the sensor.
+    sending time minus sensor's time over some hundred frames is the difference of the two clocks plus that least delay.
+    The correction of the stamps follows what is known by and by, so that their distances stay those of the sensor.
 
     Args:
         least_delay_ns: what the sensor takes at least from capture until its frame can be sent.
@@ -138,6 +142,7 @@ class CaptureClock:
     def __init__(self, least_delay_ns: int = 0) -> None:
         self._least_delay_ns = least_delay_ns
         self._lags: deque[tuple[int, int]] = deque()
+        self._frames = 0
         self._last_sensor_ns = 0
         self._correction_ns = 0
         self._last_stamp_ns: int | None = None
@@ -160,8 +165,9 @@ class CaptureClock:
             self._lags.clear()
         while self._lags and self._lags[-1][1] >= lag:
             self._lags.pop()
-        self._lags.append((sent_ns, lag))
-        while sent_ns - self._lags[0][0] > _LAG_WINDOW:
+        self._frames += 1
+        self._lags.append((self._frames, lag))
+        while self._frames - self._lags[0][0] >= _LAG_WINDOW:
             self._lags.popleft()
         target = self._lags[0][1] + offset_ns - self._least_delay_ns
         error = target - self._correction_ns

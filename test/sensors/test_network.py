@@ -331,6 +331,7 @@ def test_coordinates_are_those_of_the_optical_frame_and_damaged_ones_are_not_tra
         ({"address": "192.0.2.7"}, "needs the parameter 'key_file'"),
         ({"address": "lab-pc"}, "expected an IP address"),
         ({"key_file": "/nowhere"}, "/nowhere: cannot be read"),
+        ({"device": "a/b"}, "sensor name 'a/b'"),
     ],
 )
 def test_what_is_not_safe_or_not_there_is_refused(settings: dict[str, str], said: str) -> None:

@@ -126,6 +126,21 @@ def test_stamps_keep_the_distances_of_the_sensor_whatever_the_delay_of_its_frame
     assert np.ptp(np.diff(stamps)[150:]) <= 2 * FRAME_NS // 100
 
 
+def test_after_a_cut_of_half_a_minute_slow_frames_and_answers_do_not_move_the_stamps() -> None:
+    trips, clock = RoundTrips(), CaptureClock()
+    for k in range(900):
+        ask(trips, k * FRAME_NS, 300 * MS, 30e-6, MS, MS)
+    for k in [*range(900), *range(1800, 1830)]:
+        captured = k * FRAME_NS
+        slow = 40 * MS if k >= 1800 else 0
+        if slow:
+            ask(trips, captured, 300 * MS, 30e-6, MS, 9 * MS)
+        sent = captured + 20 * MS + slow  # by the sender's clock
+        stamp = clock.stamp(captured, sent, trips.offset_ns(sent))
+        true = true_offset(captured + 300 * MS, 300 * MS, 30e-6) + captured
+        assert abs(stamp - true - 20 * MS) < MS // 2
+
+
 def test_the_least_delay_is_taken_off() -> None:
     clock = CaptureClock(20 * MS)
     assert clock.stamp(0, 20 * MS, 5) == 5
