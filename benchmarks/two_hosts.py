@@ -332,6 +332,8 @@ def measure(options: Options) -> dict[str, Any]:
         result["sensors"][sensor] = {
             "recorded": len(delivered),
             "received": len(rows),
+            # a sender on a busy machine leaves out what is late by half a second
+            "not_sent": max(0, len(delivered) - len(rows) - int(values[f"{sensor}_skeleton"].get("lost", 0))),
             "lost_percent": round(100.0 * lost / max(1, int((~in_cut).sum())), 2),
             "stamp_rms_ms": round(float(np.sqrt((errors**2).mean())), 3),
             "stamp_max_ms": round(float(np.abs(errors).max()), 3),
@@ -496,7 +498,8 @@ def show(result: dict[str, Any]) -> None:
     )
     for name, row in result["sensors"].items():
         print(
-            f"  {name}: {row['received']} of {row['recorded']} frames, {row['lost_percent']} % lost beside the cut; "
+            f"  {name}: {row['received']} of {row['recorded']} frames, {row['lost_percent']} % lost beside the cut or "
+            f"not sent ({row['not_sent']}); "
             f"stamps {row['stamp_rms_ms']} ms RMS, at most {row['stamp_max_ms']} ms off; round trip "
             f"{row['round trip ms']} ms"
         )

@@ -39,6 +39,8 @@ SILENCE_NS = NANOSECONDS
 
 _REFUSAL_SHOWN_NS = 10 * NANOSECONDS
 _ANSWER_TIMEOUT_NS = 2 * NANOSECONDS
+_EARLIEST_NS, _LATEST_NS = NANOSECONDS, 5 * NANOSECONDS
+"""A frame that was sent earlier or later than so before its receipt is none to track anybody by."""
 _FIRST_ASKS, _ASK_FAST_NS, _ASK_NS = 20, NANOSECONDS // 20, NANOSECONDS // 4
 """A new session is asked every 50 ms at first, later four times a second."""
 
@@ -156,6 +158,9 @@ class Receiver:
         place = session.window.take(header.sequence)
         if place == "replayed":
             raise ProtocolError("replayed", "a frame that was there before")
+        offset_ns = session.trips.offset_ns(header.sent_ns)
+        if not -_EARLIEST_NS < now_ns - header.sent_ns - offset_ns < _LATEST_NS:
+            raise ProtocolError("wrong time", "a frame that was sent long ago, or later than now")
         frame = protocol.read_frame(packet)
         session.address, session.last_ns, self._last_frame_ns = source, now_ns, now_ns
         if place == "late":
@@ -166,8 +171,8 @@ class Receiver:
             return None
         self.counters["accepted"] += 1
         self.floor = frame.floor or self.floor
-        offset_ns = session.trips.offset_ns(header.sent_ns) + wall_offset_ns
-        return ReceivedFrame(frame, session.clock.stamp(frame.time_ns, header.sent_ns, offset_ns))
+        stamp_ns = session.clock.stamp(frame.time_ns, header.sent_ns, offset_ns + wall_offset_ns)
+        return ReceivedFrame(frame, stamp_ns)
 
     # --- sessions and clocks
 

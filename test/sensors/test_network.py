@@ -153,6 +153,19 @@ def test_answers_to_questions_that_were_not_asked_or_long_ago_do_not_count() -> 
     assert receiver.counters["rejected, late answer"] == 1
 
 
+@pytest.mark.parametrize("sent", [-(2**63), 2**63 - 1, 0, -10 * NANOSECONDS, 10 * NANOSECONDS])
+def test_frames_of_an_impossible_time_are_refused_and_change_nothing(sent: int) -> None:
+    receiver, partner, now = settled()
+    when = now + partner.ahead_ns + sent if abs(sent) < 2**60 and sent else sent
+    header = Header(protocol.FRAME, "kinect1", partner.session, partner.sequence + 1, when)
+    assert partner.give(protocol.pack_frame(Frame(2**62, (body(),)), header, KEY), now) is None
+    assert receiver.counters["rejected, wrong time"] == 1
+    partner.sequence += 1
+    result = partner.give(partner.frame(now), now)
+    assert result is not None
+    assert abs(result.stamp_ns - now) < 100_000
+
+
 def attacks(numbers: random.Random, partner: Partner, now: int) -> Iterator[tuple[str, bytes]]:
     """Packets of every kind that should not be taken, and what they are."""
     good = partner.sent[numbers.randrange(len(partner.sent))]
