@@ -347,9 +347,7 @@ def measure(options: Options) -> dict[str, Any]:
         }
     reference, rows = next(iter(came.items()))
     # the reference sensor's clock and this machine's, by the frames that both stamped
-    slope, base = np.polyfit(
-        (rows[:, 1] - rows[0, 1]) / NANOSECONDS, (truth[reference][rows[:, 0], 1] - rows[:, 1] - 0.0), 1
-    )
+    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, (truth[reference][rows[:, 0], 1] - rows[:, 1]), 1)
     stamps = live.stamps + base + slope * (live.stamps - rows[0, 1]) / NANOSECONDS
     result["angles"] = compare(live, stamps, whole, lossy, start, link)
     return result
