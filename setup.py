@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 NAME = "body_tracking"
 NODES = [
     "kinect_skeleton",
+    "skeleton_adapter",
     "imu_skeleton",
     "calibration",
     "fusion",
@@ -86,6 +87,7 @@ setup(
     entry_points={
         "console_scripts": [
             "body_tracking = body_tracking.cli:main",
+            "kinect_sender = body_tracking.sensors.kinect_sender:main",
             *(f"{node} = body_tracking.nodes.{node}:main" for node in NODES),
         ]
     },

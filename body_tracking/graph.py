@@ -395,6 +395,7 @@ SERVICES: tuple[tuple[str, str, str], ...] = (
 
 EXECUTABLES: tuple[str, ...] = (
     "kinect_skeleton",
+    "skeleton_adapter",
     "imu_skeleton",
     "calibration",
     "fusion",
@@ -463,6 +464,7 @@ class GraphOptions:
         imu_topics: of the bag, those that are played for these.
         robot: mapping file of a robot that follows; empty for none.
         external: live, somebody else publishes the sensors' skeletons.
+        adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -479,6 +481,7 @@ class GraphOptions:
     imu_topics: tuple[str, ...] = ()
     robot: str = ""
     external: bool = False
+    adapted: tuple[str, ...] = ()
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -527,16 +530,32 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         listeners = 2 + int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders
         specs.append(_player(options, sensors, listeners, after))
     elif not options.external:
+        adapted = _adapted(options.adapted, sensors)
         specs += [
             NodeSpec(
                 f"{sensor}_skeleton",
-                "kinect_skeleton",
-                parameters={"sensor": sensor, **common, **skeletons},
+                "skeleton_adapter" if sensor in adapted else "kinect_skeleton",
+                parameters={"sensor": sensor, **adapted.get(sensor, {}), **common, **skeletons},
                 after=after,
             )
             for sensor in sensors
         ]
     return tuple(specs)
+
+
+def _adapted(entries: Iterable[str], sensors: Collection[str]) -> dict[str, dict[str, Value]]:
+    """Of each sensor that another driver's topic is adapted for, the adapter's parameters.
+
+    Raises:
+        GraphError: a sensor that is none of the graph's.
+    """
+    found: dict[str, dict[str, Value]] = {}
+    for entry in entries:
+        sensor, _, topic = entry.partition(":")
+        if sensor not in sensors:
+            raise GraphError(f"adapted sensor {sensor!r} is none of {', '.join(sensors)}")
+        found[sensor] = {"topic": topic} if topic else {}
+    return found
 
 
 def role_of(options: GraphOptions) -> FilterRole:

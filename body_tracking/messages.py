@@ -258,6 +258,21 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
     )
 
 
+def markers_to_points(message: Any) -> tuple[int, list[int], FloatArray]:
+    """The markers of one ``visualization_msgs/MarkerArray`` that are there to be shown: stamp, ids, (n, 3) positions.
+
+    Raises:
+        MessageError: no such marker, or markers of several times.
+    """
+    shown = [marker for marker in message.markers if marker.action == 0]  # ADD
+    stamps = {to_nanoseconds(marker.header.stamp) for marker in shown}
+    if len(stamps) != 1:
+        raise MessageError(f"{len(shown)} markers of {len(stamps)} times, expected those of one")
+    places = [marker.pose.position for marker in shown]
+    points = np.array([(place.x, place.y, place.z) for place in places])
+    return stamps.pop(), [int(marker.id) for marker in shown], points
+
+
 def _columns(row: Any, names: Sequence[str]) -> FloatArray:
     return np.stack([row[name] for name in names], axis=1).astype(np.float64)
 

@@ -162,6 +162,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         reliable=args.reliable,
         robot=str(args.robot) if args.robot else "",
         external=args.external,
+        adapted=tuple(args.adapt or ()),
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -504,6 +505,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--external", action="store_true", help="start no sensor nodes: somebody else publishes /<sensor>/skeleton"
+    )
+    parser.add_argument(
+        "--adapt",
+        action="append",
+        metavar="SENSOR[:/TOPIC]",
+        help="this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
     )
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"

@@ -26,6 +26,7 @@ from body_tracking.recording.rosbag2 import BagReader
 
 ARGUMENTS = {
     "sensors": (",".join(DEFAULT_SENSORS), "names of the sensors, the reference first"),
+    "adapt": ("", "sensors that an Azure Kinect's ROS driver tells of: A,B or A:/topic,B:/topic"),
     "bag": ("", "play this bag in place of the sensors"),
     "rate": ("1.0", "play it this many times as fast"),
     "record": ("", "record everything into this new folder"),
@@ -70,6 +71,7 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         convention=convention,
         calibration_file=given["calibration"],
         robot=given["robot"],
+        adapted=tuple(entry for entry in given["adapt"].split(",") if entry),
     )
     file = Path(given["params_file"]) if given["params_file"] else None
     options = with_file(options, file)

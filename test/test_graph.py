@@ -27,6 +27,7 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
     GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
+    GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
 ]
 
 
@@ -127,8 +128,18 @@ def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
     specs = nodes_for(options)
     assert len(named(specs)) == len(specs)
     assert {spec.executable for spec in specs} <= set(EXECUTABLES)
-    assert specs[-1].executable in ("bag_player", "kinect_skeleton")
+    assert specs[-1].executable in ("bag_player", "kinect_skeleton", "skeleton_adapter")
     assert set(named(specs)) <= set(named(all_nodes_for(options)))
+
+
+def test_another_cameras_driver_takes_the_place_of_a_sensors_node() -> None:
+    specs = named(nodes_for(GraphOptions(sensors=("a", "b", "c"), adapted=("b:/k4a/bodies", "c"))))
+    assert specs["a_skeleton"].executable == "kinect_skeleton"
+    assert specs["b_skeleton"].executable == specs["c_skeleton"].executable == "skeleton_adapter"
+    assert specs["b_skeleton"].parameters == {"sensor": "b", "topic": "/k4a/bodies", "use_sim_time": False}
+    assert "topic" not in specs["c_skeleton"].parameters
+    with pytest.raises(graph.GraphError, match="adapted sensor 'd' is none of a, b"):
+        nodes_for(GraphOptions(sensors=("a", "b"), adapted=("d",)))
 
 
 @pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
