@@ -17,6 +17,8 @@ NODES = [
     "robot_commands",
     "bag_player",
     "bag_recorder",
+    "body_markers",
+    "viewer",
 ]
 
 MANIFEST = ElementTree.parse("package.xml")
@@ -43,6 +45,7 @@ setup(
         share("config/robots", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
+        share("foxglove", "*.json"),
         *(share(bag.as_posix(), "*.*") for bag in sorted(Path("bags").iterdir()) if bag.is_dir()),
     ],
     install_requires=[
@@ -63,6 +66,7 @@ setup(
             "ros-jazzy-common-interfaces==5.3.6",
             "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
         ],
+        "viewer": ["viser>=1.1,<2"],
         "test": [
             "pytest>=8",
             "pytest-xdist>=3.6",
@@ -78,6 +82,7 @@ setup(
             "setuptools>=77",
             "ezc3d>=1.7",
             "mujoco-core>=4",
+            "playwright>=1.50",
         ],
         "c3d": ["ezc3d>=1.7"],
         "bench": ["psutil"],

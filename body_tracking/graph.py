@@ -22,6 +22,7 @@ from body_tracking.messages import (
     IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
+    MARKERS,
     POINT_CLOUD,
     SEGMENTS,
     STRING,
@@ -55,6 +56,7 @@ TRUE_CALIBRATION = "/ground_truth/calibration"
 TRUE_CLOCK = f"{TRUE_CALIBRATION}/clock"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 CLOCK_TOPIC = "/clock"
+TF = "/tf"
 TF_STATIC = "/tf_static"
 START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
@@ -152,6 +154,17 @@ def joint_states_topic(body: str) -> str:
 def joint_states_stddev_topic(body: str) -> str:
     """Where the standard deviations of a person's joint angles are published."""
     return f"{joint_states_topic(body)}_stddev"
+
+
+def bodies_among(topics: Iterable[str]) -> tuple[str, ...]:
+    """The persons whose joint angles are among these topics, by name."""
+    found = (re.fullmatch(r"/humans/bodies/([A-Za-z]\w*)/joint_states", topic) for topic in topics)
+    return tuple(sorted(match[1] for match in found if match))
+
+
+def markers_topic(body: str) -> str:
+    """Where a person's markers for RViz and Foxglove are published."""
+    return f"/humans/bodies/{body}/markers"
 
 
 def urdf_topic(body: str) -> str:
@@ -371,6 +384,21 @@ TOPICS: tuple[TopicSpec, ...] = (
         "stopped",
     ),
     TopicSpec(
+        markers_topic("<id>"),
+        MARKERS,
+        RELIABLE,
+        "body_markers",
+        "what the sensors see, the fused and the filtered skeleton, 95 % ellipsoids of its joints, and the sensors, in "
+        "`world`",
+    ),
+    TopicSpec(
+        TF,
+        "tf2_msgs/msg/TFMessage",
+        RELIABLE,
+        "body_markers",
+        "`ekf`: the pose of each segment in `world`, named as the links of the URDF, where tf2_msgs is installed",
+    ),
+    TopicSpec(
         DIAGNOSTICS_TOPIC,
         DIAGNOSTICS,
         RELIABLE,
@@ -379,7 +407,7 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
@@ -404,6 +432,8 @@ EXECUTABLES: tuple[str, ...] = (
     "robot_commands",
     "bag_player",
     "bag_recorder",
+    "body_markers",
+    "viewer",
 )
 
 
@@ -465,6 +495,8 @@ class GraphOptions:
         robot: mapping file of a robot that follows; empty for none.
         external: live, somebody else publishes the sensors' skeletons.
         adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
+        viewer: show it on a live page, with a recorder that waits for its button where nothing is recorded anyway.
+        markers: publish markers for RViz and Foxglove.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -482,6 +514,8 @@ class GraphOptions:
     robot: str = ""
     external: bool = False
     adapted: tuple[str, ...] = ()
+    viewer: bool = False
+    markers: bool = False
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -520,14 +554,22 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
+    elif options.viewer:
+        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **common}))
+    # These listen to every skeleton.
+    watchers = [name for name, wanted in (("body_markers", options.markers), ("viewer", options.viewer)) if wanted]
+    specs += [NodeSpec(name, name, parameters={"sensors": sensors, **common}) for name in watchers]
     recorders = int(bool(options.record))
     # Besides the next node and the recorder nobody is waited for; inertial sensors take their world from the fusion.
-    to_filter = {FUSED: int(role.input == FUSED_INPUT) + int(bool(worn))}
-    to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    to_filter = {FUSED: len(watchers) + int(role.input == FUSED_INPUT) + int(bool(worn))}
+    to_angles = (
+        {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    )
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
-        # Calibration, fusion and, maybe, the filter, the robot's commands and the recorder.
-        listeners = 2 + int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders
+        # Calibration, fusion and, maybe, the filter, the robot's commands, the recorder and those who show.
+        others = int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders + len(watchers)
+        listeners = 2 + others
         specs.append(_player(options, sensors, listeners, after))
     elif not options.external:
         adapted = _adapted(options.adapted, sensors)
@@ -645,8 +687,15 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag, a recorder, inertial sensors and a robot."""
-    more = replace(options, record="recording", imus=options.imus or SOME_IMUS, robot=options.robot or "robot.yaml")
+    """The nodes of a graph, and those that it would have live, with a bag and with everything that may be added."""
+    more = replace(
+        options,
+        record="recording",
+        imus=options.imus or SOME_IMUS,
+        robot=options.robot or "robot.yaml",
+        viewer=True,
+        markers=True,
+    )
     variants = [options] + [replace(more, bag=bag) for bag in ("", options.bag or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 

@@ -163,6 +163,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         robot=str(args.robot) if args.robot else "",
         external=args.external,
         adapted=tuple(args.adapt or ()),
+        viewer=args.viewer,
+        markers=args.markers,
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -521,6 +523,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--reliable", action="store_true", help="transport skeletons reliably: nothing is lost, whatever it takes"
     )
+    parser.add_argument(
+        "--viewer", action="store_true", help="show it on a live page in a browser, and take its buttons"
+    )
+    parser.add_argument("--markers", action="store_true", help="publish markers for RViz and Foxglove")
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
 

@@ -34,6 +34,8 @@ ARGUMENTS = {
     "convention": ("", "of the joint angles; overrides the parameters file"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
     "robot": ("", "mapping file of a robot that is to follow; see share/body_tracking/config/robots"),
+    "viewer": ("false", "show it on a live page in a browser"),
+    "markers": ("false", "publish markers for RViz and Foxglove"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
 
@@ -72,6 +74,8 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         calibration_file=given["calibration"],
         robot=given["robot"],
         adapted=tuple(entry for entry in given["adapt"].split(",") if entry),
+        viewer=given["viewer"].lower() == "true",
+        markers=given["markers"].lower() == "true",
     )
     file = Path(given["params_file"]) if given["params_file"] else None
     options = with_file(options, file)

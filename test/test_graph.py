@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -14,6 +16,7 @@ from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
+from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.recording.rosbag2 import is_known
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -28,6 +31,8 @@ VARIANTS = [
     GraphOptions(filter_name="schlagenhauf_ekf"),
     GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
     GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
+    GraphOptions(bag="bag", viewer=True, markers=True),
+    GraphOptions(viewer=True, record="somewhere"),
 ]
 
 
@@ -104,6 +109,22 @@ def test_the_convention_is_the_robots() -> None:
         graph.convention_of_robot(ROOT / "nowhere.yaml", "")
 
 
+def test_a_bag_waits_for_those_who_show_it_and_a_page_has_a_recorder_for_its_button() -> None:
+    shown = named(nodes_for(GraphOptions(bag="bag", viewer=True, markers=True)))
+    assert {"viewer", "body_markers", "bag_recorder"} <= set(shown)
+    assert shown["bag_recorder"].parameters["start_recording"] is False
+    # Calibration, fusion and the two that show it; the recorder does not listen yet.
+    assert shown["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:4", "/kinect2/skeleton:4")
+    assert shown["bag_player"].after == {graph.FUSED: 3, graph.FILTERED: 3}
+    recorded = named(nodes_for(GraphOptions(viewer=True, record="r")))["bag_recorder"]
+    assert recorded.parameters == {"folder": "r", "use_sim_time": False}
+
+
+def test_persons_are_found_among_topics() -> None:
+    topics = ["/humans/bodies/b/joint_states", "/humans/bodies/a/joint_states", "/humans/bodies/a/joint_states_stddev"]
+    assert graph.bodies_among(topics) == ("a", "b")
+
+
 def test_angles_of_positions_need_no_model() -> None:
     options = GraphOptions(filter_name="ekf", convention="positional")
     assert named(nodes_for(options))["joint_angles"].parameters["input"] == "skeleton"
@@ -156,7 +177,7 @@ def test_sensors_are_found_among_topics() -> None:
 def test_topics_have_known_types_and_publishers() -> None:
     assert len({topic.name for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
-        assert is_known(topic.type_name) or topic.name == graph.TF_STATIC
+        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC)
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 
@@ -199,10 +220,41 @@ def test_the_launch_file_takes_its_nodes_from_the_table() -> None:
     assert not strings & {topic.name for topic in TOPICS}
 
 
+def test_the_foxglove_layout_shows_topics_of_the_graph() -> None:
+    """The format in which the application exports layouts: panels by id, and a tree that places every one of them."""
+    layout = json.loads((ROOT / "foxglove" / "body_tracking.json").read_text(encoding="utf-8"))
+    assert {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"} == set(layout)
+    panels = layout["configById"]
+
+    def placed(tree: Any) -> list[str]:
+        return [tree] if isinstance(tree, str) else placed(tree["first"]) + placed(tree["second"])
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)
+    assert {panel.partition("!")[0] for panel in panels} == {"3D", "Plot", "DiagnosticSummary"}
+    body = graph.DEFAULT_BODY
+    known = {topic.name.replace("<id>", body) for topic in TOPICS} | {
+        graph.skeleton_topic(sensor) for sensor in graph.DEFAULT_SENSORS
+    }
+    for name, panel in panels.items():
+        shown = {*panel.get("topics", {}), panel.get("topicToRender", graph.DIAGNOSTICS_TOPIC)}
+        shown |= {path["value"].partition(".")[0] for path in panel.get("paths", [])}
+        assert shown <= known, name
+    scene = panels["3D!bodies"]
+    assert scene["topics"][graph.markers_topic(body)]["visible"]
+    assert scene["followTf"] == "world"
+    assert {path["value"].partition(".")[2] for path in panels["Plot!angles"]["paths"]} == {
+        f"position[{ANGLE_NAMES.index(name)}]"
+        for name in ("elbow_flexion_left", "elbow_flexion_right", "shoulder_elevation_left", "shoulder_elevation_right")
+    }
+
+
 def test_the_rviz_view_shows_topics_of_the_graph() -> None:
     view = yaml.safe_load((ROOT / "rviz" / "body_tracking.rviz").read_text(encoding="utf-8"))
     displays = view["Visualization Manager"]["Displays"]
     shown = {display["Topic"]["Value"] for display in displays if "Topic" in display}
     sensors = {graph.skeleton_topic(sensor) for sensor in graph.DEFAULT_SENSORS}
-    assert shown == sensors | {graph.FUSED, graph.FILTERED}
+    robots = {display["Description Topic"]["Value"] for display in displays if "Description Topic" in display}
+    body = graph.DEFAULT_BODY
+    assert shown == sensors | {graph.FUSED, graph.FILTERED, graph.markers_topic(body)}
+    assert robots == {graph.urdf_topic(body)}
     assert view["Visualization Manager"]["Global Options"]["Fixed Frame"] == "world"
