@@ -332,8 +332,6 @@ class Follower:
         """What is wrong now, or would be by the next command; empty for nothing."""
         limits, angles, age = self._limits, self._angles, expected.age
         allowed_ns = round((limits.silence - self._period) * NANOSECONDS)
-        if elapsed > limits.silence:
-            return f"the commands themselves stood still for {elapsed:.2f} s"
         if self._wrong or angles is None:
             return self._wrong or "no angles yet"
         if steady_ns - angles.steady_ns >= allowed_ns:
@@ -345,6 +343,8 @@ class Follower:
                 return f"no frame of {listed} yet"
             if steady_ns - max(heard) >= allowed_ns:
                 return f"no frame of {listed} for {(steady_ns - max(heard)) / NANOSECONDS:.2f} s"
+        if elapsed > limits.silence:
+            return f"the commands themselves stood still for {elapsed:.2f} s"
         if age > limits.max_age:
             return f"angles are {age:.2f} s old, limit {limits.max_age:g} s"
         if age < -_AHEAD:

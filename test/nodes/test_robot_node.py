@@ -236,6 +236,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.diagnostics
             for robot in BODIES:
                 reasons[robot].append(robots.said(robot)[""])
+            robots.until(lambda: False, timeout=1.0)  # commands that were on their way
             quiet.append({robot: len(arm.told) for robot, arm in robots.arms.items()})
             robots.until(lambda: False, timeout=0.5)
             assert quiet[-1] == {robot: len(arm.told) for robot, arm in robots.arms.items()}
