@@ -154,6 +154,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         convention=args.convention or "",
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
+        subject=args.subject or "",
+        people=args.people,
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -500,6 +502,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--reliable", action="store_true", help="transport skeletons reliably: nothing is lost, whatever it takes"
     )
+    graph.add_people(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
 
@@ -547,7 +550,7 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    monitor = GraphMonitor(str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)))
+    monitor = GraphMonitor(options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

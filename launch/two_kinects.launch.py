@@ -23,6 +23,8 @@ ARGUMENTS = {
     "record": ("", "record everything into this new folder"),
     "filter": ("", "which filter; overrides the parameters file"),
     "convention": ("", "of the joint angles; overrides the parameters file"),
+    "subject": ("", "whom to track: nearest, first or all; overrides the parameters file"),
+    "people": ("0", "with subject all: how many at most; overrides the parameters file, but for 0"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
@@ -57,6 +59,8 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         filter_name=given["filter"],
         convention=given["convention"],
         calibration_file=given["calibration"],
+        subject=given["subject"],
+        people=int(given["people"]),
     )
     file = Path(given["params_file"]) if given["params_file"] else None
     options = with_file(options, file)
