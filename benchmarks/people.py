@@ -385,7 +385,7 @@ def main() -> int:
         else:
             print(f"the real recording is absent ({args.data})", file=sys.stderr)
     if args.only in (None, "live"):
-        play = Play(crossing(0, 2, args.people))
+        play = Play(crossing(0, 2, args.people, seconds=10.0))
         result["live"] = [live(name, play, args.people, args.seconds) for name in args.filters.split(",")]
     print(json.dumps(result, indent=2))
     return int(any(row["switches while all were visible to a sensor"] for row in result.get("crossings", ())))
