@@ -44,6 +44,16 @@ class PeopleFusion:
         self.world = world
 
     @property
+    def parameters(self) -> FusionParameters:
+        """Of each fusion."""
+        return self._fusions[0].parameters
+
+    @parameters.setter
+    def parameters(self, parameters: FusionParameters) -> None:
+        for fusion in self._fusions:
+            fusion.parameters = parameters
+
+    @property
     def counters(self) -> dict[str, int]:
         """What happened since the construction."""
         total: Counter[str] = Counter()

@@ -26,7 +26,15 @@ from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (SENSORS, REFERENCE, WORLD_FRAME, *PEOPLE, *parameters_from(FusionParameters), RELIABLE)
+_FIXED = {"turned_hold": "a body that is held reversed is held for as long as was said when it was seen"}
+PARAMETERS = (
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    *PEOPLE,
+    *parameters_from(FusionParameters, live=True, fixed=_FIXED),
+    RELIABLE,
+)
 
 
 class FusionNode(GraphNode):
@@ -38,10 +46,14 @@ class FusionNode(GraphNode):
     def configure(self, values: Mapping[str, Value]) -> None:
         """Make the fusion."""
         given: dict[str, Any] = dict(values)
-        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         parameters = FusionParameters(**fields_of(FusionParameters, values))
+        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         people = people_from(values)
         self.fusion = PeopleFusion(self.sensors, parameters, people, given["reference"] or None, given["world_frame"])
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """From the next frame on."""
+        self.fusion.parameters = FusionParameters(**fields_of(FusionParameters, values))
 
     def start(self) -> None:
         """Connect."""
