@@ -6,6 +6,7 @@ Knows no ROS library.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -15,6 +16,7 @@ from typing import Any, Final
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.fusion.subject import ALL, MAX_PEOPLE, SUBJECTS
 from body_tracking.messages import (
     CLOCK,
     DIAGNOSTICS,
@@ -48,6 +50,7 @@ FILTERED = "/filtered/skeleton"
 MODEL_STATE = "/filtered/model_state"
 MODEL_STATE_STDDEV = f"{MODEL_STATE}_stddev"
 MODEL_COVARIANCE = "/filtered/model_covariance"
+TRACKED = "/humans/bodies/tracked"
 IMU_SKELETON = "/imu/skeleton"
 TRUE_SKELETON = "/ground_truth/skeleton"
 TRUE_MODEL_STATE = "/ground_truth/model_state"
@@ -175,6 +178,44 @@ def urdf_topic(body: str) -> str:
 def segments_topic(body: str) -> str:
     """Where the poses of a person's segments are published."""
     return f"/humans/bodies/{body}/segments"
+
+
+@dataclass(frozen=True, slots=True)
+class ModelTopics:
+    """Where the filter publishes the model of a person.
+
+    Attributes:
+        state: coordinates and rates.
+        stddev: their standard deviations.
+        covariance: the whole of it.
+        segments: poses.
+        urdf: the model with the person's lengths.
+    """
+
+    state: str
+    stddev: str
+    covariance: str
+    segments: str
+    urdf: str
+
+    def types(self) -> dict[str, str]:
+        """The type of each."""
+        topics = (self.state, self.stddev, self.covariance, self.segments, self.urdf)
+        return dict(zip(topics, (JOINT_STATE, JOINT_STATE, IMAGE, SEGMENTS, STRING), strict=True))
+
+
+def model_topics(body: str, several: bool = False) -> ModelTopics:
+    """The topics of a person's model; those of the only subject are not below the person's name, where they can."""
+    own = segments_topic(body), urdf_topic(body)
+    if not several:
+        return ModelTopics(MODEL_STATE, MODEL_STATE_STDDEV, MODEL_COVARIANCE, *own)
+    state = f"/humans/bodies/{body}/model_state"
+    return ModelTopics(state, f"{state}_stddev", f"/humans/bodies/{body}/model_covariance", *own)
+
+
+def bodies(count: int) -> tuple[str, ...]:
+    """The ids of several people, by their numbers from 1 on."""
+    return tuple(f"body{number}" for number in range(1, count + 1))
 
 
 URDF_QOS = Qos(durability="transient_local", depth=1)
@@ -313,7 +354,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         POINT_CLOUD,
         SKELETON,
         "fusion",
-        "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`",
+        "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`; with "
+        "`subject: all` everybody, with the person's number in `body`",
     ),
     TopicSpec(
         FILTERED,
@@ -345,6 +387,21 @@ TOPICS: tuple[TopicSpec, ...] = (
         "skeleton_filter",
         "`ekf`: the whole covariance of these coordinates (rows 0 to 31) and of their rates (rows 32 to 63), `32FC1`, "
         "with the stamp of the state",
+    ),
+    TopicSpec(
+        model_topics("<id>", several=True).state,
+        JOINT_STATE,
+        SKELETON,
+        "skeleton_filter",
+        "`ekf`, of each of several people (`subject: all`) what `/filtered/model_state` is of one; so are "
+        "`.../model_state_stddev` and `.../model_covariance`",
+    ),
+    TopicSpec(
+        TRACKED,
+        "hri_msgs/msg/IdsList",
+        RELIABLE,
+        "skeleton_filter",
+        "the ids of the people who are tracked (REP-155), where hri_msgs is installed",
     ),
     TopicSpec(
         segments_topic("<id>"),
@@ -407,7 +464,8 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, ``TRACKED`` where ``hri_msgs``
+is."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
@@ -492,6 +550,8 @@ class GraphOptions:
         reliable: transport every skeleton reliably.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
+        subject: overrides the parameters file; empty for not: whom to track.
+        people: likewise, 0 for not: how many at most.
         robot: mapping file of a robot that follows; empty for none.
         external: live, somebody else publishes the sensors' skeletons.
         adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
@@ -511,11 +571,18 @@ class GraphOptions:
     reliable: bool = False
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
+    subject: str = ""
+    people: int = 0
     robot: str = ""
     external: bool = False
     adapted: tuple[str, ...] = ()
     viewer: bool = False
     markers: bool = False
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The ids of those who may be tracked, of several people; empty with one subject."""
+        return bodies(self.people or MAX_PEOPLE) if self.subject == ALL else ()
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -538,17 +605,24 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     asked = {"filter": options.filter_name, "input": options.filter_input}
     chosen: dict[str, Value] = {name: value for name, value in asked.items() if value}
     angles: dict[str, Value] = {"convention": role.convention, "input": role.angles_input}
+    asked_of_people: dict[str, Value] = {"subject": options.subject, "people": options.people}
+    people = {name: value for name, value in asked_of_people.items() if value}
+    subject: dict[str, Value] = {"subject": options.subject} if options.subject else {}
     worn = imu_topics(options.imus)
     orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
     specs = [
-        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles}),
-        NodeSpec("skeleton_filter", "skeleton_filter", defaults=orientations, parameters={**several, **chosen}),
-        NodeSpec("fusion", "fusion", parameters=several),
+        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles, **people}),
+        NodeSpec(
+            "skeleton_filter", "skeleton_filter", defaults=orientations, parameters={**several, **chosen, **people}
+        ),
+        NodeSpec("fusion", "fusion", parameters={**several, **people}),
         NodeSpec("calibration", "calibration", parameters={**several, **calibration}),
     ]
     if worn:
         specs.append(
-            NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons})
+            NodeSpec(
+                "imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons, **subject}
+            )
         )
     if options.robot:
         specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))
@@ -562,9 +636,9 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     recorders = int(bool(options.record))
     # Besides the next node and the recorder nobody is waited for; inertial sensors take their world from the fusion.
     to_filter = {FUSED: len(watchers) + int(role.input == FUSED_INPUT) + int(bool(worn))}
-    to_angles = (
-        {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
-    )
+    models = [model_topics(body, several=True) for body in options.bodies] or [model_topics(DEFAULT_BODY)]
+    states = {topic: 1 for each in models for topic in (each.state, each.covariance)}
+    to_angles = {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else states
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
         # Calibration, fusion and, maybe, the filter, the robot's commands, the recorder and those who show.
@@ -659,10 +733,13 @@ _FROM_FILE: Final = (
     ("filter_input", "skeleton_filter", "input"),
     ("convention", "joint_angles", "convention"),
     ("angles_input", "joint_angles", "input"),
+    ("subject", "skeleton_filter", "subject"),
 )
 """(option, node, parameter) by which the nodes must know of each other, whoever says it."""
 _IMUS_FROM_FILE: Final = ("imus", "imu_skeleton", "segments")
 """The same, of a list."""
+_PEOPLE_FROM_FILE: Final = ("people", "skeleton_filter", "people")
+"""The same, of a number."""
 
 
 def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
@@ -683,6 +760,10 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
         listed = values.get(parameter)
         if isinstance(listed, list) and not getattr(options, option) and matches(pattern, f"/{node}"):
             found[option] = tuple(entry for entry in listed if isinstance(entry, str) and entry)
+        option, node, parameter = _PEOPLE_FROM_FILE
+        count = values.get(parameter)
+        if type(count) is int and not getattr(options, option) and matches(pattern, f"/{node}"):
+            found[option] = count
     return replace(options, **found)
 
 
@@ -700,6 +781,18 @@ def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 
 
+def add_people(command: argparse.ArgumentParser) -> None:
+    """The options of a command that say whom to track."""
+    command.add_argument(
+        "--subject",
+        choices=SUBJECTS,
+        help="whom to track: one, who is the nearest or is seen first, or all (default: nearest)",
+    )
+    command.add_argument(
+        "--people", type=int, default=0, metavar="N", help=f"with --subject all: how many at most ({MAX_PEOPLE})"
+    )
+
+
 CONFIG_HEADER = """\
 # Every parameter of every node at its default. Written by `make docs` from the code; copy it, keep what you change:
 #   body_tracking up --params-file my_parameters.yaml
@@ -713,7 +806,9 @@ def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
     sections = {}
     for spec in sorted(all_nodes_for(GraphOptions()), key=lambda spec: EXECUTABLES.index(spec.executable)):
-        shown = {parameter for _, node, parameter in (*_FROM_FILE, _IMUS_FROM_FILE) if node == spec.name}
+        shown = {
+            parameter for _, node, parameter in (*_FROM_FILE, _IMUS_FROM_FILE, _PEOPLE_FROM_FILE) if node == spec.name
+        }
         hidden = spec.parameters.keys() - shown
         sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
     return f"{CONFIG_HEADER}\n{as_yaml(sections)}"

@@ -160,6 +160,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         convention=convention,
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
+        subject=args.subject or "",
+        people=args.people,
         robot=str(args.robot) if args.robot else "",
         external=args.external,
         adapted=tuple(args.adapt or ()),
@@ -527,6 +529,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--viewer", action="store_true", help="show it on a live page in a browser, and take its buttons"
     )
     parser.add_argument("--markers", action="store_true", help="publish markers for RViz and Foxglove")
+    graph.add_people(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
 
@@ -574,7 +577,7 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    monitor = GraphMonitor(str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)))
+    monitor = GraphMonitor(options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

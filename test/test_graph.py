@@ -29,6 +29,7 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
+    GraphOptions(filter_name="ekf", subject="all", people=3, imus=("forearm_left",)),
     GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
     GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
     GraphOptions(bag="bag", viewer=True, markers=True),
@@ -89,6 +90,29 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         )
         assert all(after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_those_who_track_know_of_each_other_whom() -> None:
+    options = GraphOptions(filter_name="ekf", subject="all", people=2, imus=("forearm_left",))
+    specs = named(nodes_for(options))
+    for name in ("fusion", "skeleton_filter", "joint_angles"):
+        assert (specs[name].parameters["subject"], specs[name].parameters["people"]) == ("all", 2)
+    assert specs["imu_skeleton"].parameters["subject"] == "all"
+    topics = [graph.model_topics(body, several=True) for body in ("body1", "body2")]
+    assert options.bodies == ("body1", "body2")
+    after = specs["kinect1_skeleton"].after
+    assert {topic.state for topic in topics} | {topic.covariance for topic in topics} <= set(after)
+    alone = graph.model_topics("body1")
+    assert (alone.state, alone.covariance) == (graph.MODEL_STATE, graph.MODEL_COVARIANCE)
+    assert GraphOptions().bodies == () and not named(nodes_for(GraphOptions()))["fusion"].parameters.get("subject")
+
+
+def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "people.yaml"
+    file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
+    assert graph.with_file(GraphOptions(), file).bodies == graph.bodies(4)
+    assert graph.with_file(GraphOptions(subject="first", people=3), file).people == 3
+    assert graph.with_file(GraphOptions(subject="first"), file).bodies == ()
 
 
 def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
@@ -177,7 +201,7 @@ def test_sensors_are_found_among_topics() -> None:
 def test_topics_have_known_types_and_publishers() -> None:
     assert len({topic.name for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
-        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC)
+        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC, graph.TRACKED)
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 

@@ -6,6 +6,7 @@ node receives, in any convention; :class:`LengthChanges` tells when a person's l
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -163,6 +164,7 @@ class AngleStream:
 
     Args:
         convention: one of ``ALL_CONVENTIONS``.
+        forget_after: seconds without the person after which the next frame is of somebody else.
 
     Attributes:
         model: the body.
@@ -172,13 +174,14 @@ class AngleStream:
         ConventionError: another one.
     """
 
-    def __init__(self, convention: str) -> None:
+    def __init__(self, convention: str, forget_after: float = math.inf) -> None:
         if convention not in ALL_CONVENTIONS:
             raise ConventionError(f"angle convention {convention!r}: not one of {', '.join(ALL_CONVENTIONS)}")
         self.convention = convention
         self.model = UpperBody()
         self.fit = SkeletonFit(self.model)
         self._previous: JointAngles | None = None
+        self._forget_after_ns = forget_after * NANOSECONDS
 
     def reset(self) -> None:
         """Forget the person."""
@@ -189,6 +192,7 @@ class AngleStream:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
         if self.convention == POSITIONAL:
             return positional_angles(skeleton)
+        self._forget_who_is_gone(skeleton.stamp_ns)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)
 
@@ -198,9 +202,14 @@ class AngleStream:
         Raises:
             ConventionError: the convention is made of positions.
         """
+        self._forget_who_is_gone(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)
         self._previous = angles
         return angles
+
+    def _forget_who_is_gone(self, stamp_ns: int) -> None:
+        if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:
+            self.reset()
 
 
 class LengthChanges:

@@ -39,6 +39,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking import graph
+from body_tracking.backlog import Backlog, Sequences
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics
@@ -63,7 +64,8 @@ RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FRAMES_KEPT = 16
-"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none."""
+"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
+that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
 _ALARM_NS = NANOSECONDS // 200, NANOSECONDS // 10
 """For at least so long, as simulated time may stand still, and at most, as it may run fast, a timer is set by it."""
 
@@ -243,6 +245,10 @@ class GraphNode(Node):
     def __init__(self) -> None:
         super().__init__(self.NAME)
         self.monitor = Monitor()
+        self.backlog = Backlog()
+        self.sequences = Sequences()
+        self._droppable: dict[Subscription, str] = {}
+        self._told_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         self.configure(self.values)
@@ -336,6 +342,7 @@ class GraphNode(Node):
         """
 
         def callback(message: Any, info: dict[str, int]) -> None:
+            self.sequences.note(topic, info["publication_sequence_number"])
             self.monitor.arrived(topic)
             try:
                 handle(message, info["source_timestamp"])
@@ -359,7 +366,29 @@ class GraphNode(Node):
 
         qos = self.skeleton_qos()
         qos.depth = max(qos.depth, _FRAMES_KEPT)
-        return self.listen(topic, PointCloud2, qos, convert, raw=True)
+        subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
+        if not self.values["reliable"]:
+            self._droppable[subscription] = topic
+        return subscription
+
+    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """All messages but frames that are too late where the node is too slow; called by the executor."""
+        frames = [place for place, (subscription, _) in enumerate(messages) if subscription in self._droppable]
+        if not frames:
+            self.backlog.late((), time.time_ns())
+            return messages
+        taken = [(self._droppable[messages[place][0]], messages[place][1][1]) for place in frames]
+        arrived = [(topic, info["received_timestamp"]) for topic, info in taken]
+        late = {frames[each] for each in self.backlog.late(arrived, time.time_ns())}
+        for place in late:
+            subscription, (_, info) = messages[place]
+            self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
+        return [each for place, each in enumerate(messages) if place not in late] if late else messages
+
+    def messages_handled(self) -> None:
+        """Note how long that took; called by the executor."""
+        if self._droppable:
+            self.backlog.done(time.time_ns())
 
     def time_jumped_back(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""
@@ -406,6 +435,14 @@ class GraphNode(Node):
     def _report(self) -> None:
         level, text, values = self.state()
         values = {**self.monitor.values(), **self._listeners(), **values}
+        values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
+        values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
+        dropped = self.backlog.dropped - self._told_dropped
+        if dropped:
+            self._told_dropped = Counter(self.backlog.dropped)
+            said = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
+            level, text = max(level, 1), f"too slow: dropped {said}" + (f"; {text}" if text else "")
+            self.log_seldom("dropped", text)
         if self.monitor.totals["malformed"] and level == 0:
             text = text or f"{self.monitor.totals['malformed']} malformed messages"
         message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)
