@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
+    GraphOptions(filter_name="ekf", subject="all", people=3, imus=("forearm_left",)),
+    GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
+    GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
     GraphOptions(bag="bag", viewer=True, markers=True),
     GraphOptions(viewer=True, record="somewhere"),
 ]
@@ -59,6 +63,13 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
 
 
+def test_sensors_of_somebody_else_need_no_nodes() -> None:
+    own, external = nodes_for(GraphOptions()), nodes_for(GraphOptions(external=True))
+    assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
+    played = GraphOptions(bag="bag")
+    assert nodes_for(replace(played, external=True)) == nodes_for(played)
+
+
 def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
     assert set(graph.ROLES) == set(FILTERS)
     for name, role in graph.ROLES.items():
@@ -79,6 +90,47 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         )
         assert all(after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_those_who_track_know_of_each_other_whom() -> None:
+    options = GraphOptions(filter_name="ekf", subject="all", people=2, imus=("forearm_left",))
+    specs = named(nodes_for(options))
+    for name in ("fusion", "skeleton_filter", "joint_angles"):
+        assert (specs[name].parameters["subject"], specs[name].parameters["people"]) == ("all", 2)
+    assert specs["imu_skeleton"].parameters["subject"] == "all"
+    topics = [graph.model_topics(body, several=True) for body in ("body1", "body2")]
+    assert options.bodies == ("body1", "body2")
+    after = specs["kinect1_skeleton"].after
+    assert {topic.state for topic in topics} | {topic.covariance for topic in topics} <= set(after)
+    alone = graph.model_topics("body1")
+    assert (alone.state, alone.covariance) == (graph.MODEL_STATE, graph.MODEL_COVARIANCE)
+    assert GraphOptions().bodies == () and not named(nodes_for(GraphOptions()))["fusion"].parameters.get("subject")
+
+
+def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "people.yaml"
+    file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
+    assert graph.with_file(GraphOptions(), file).bodies == graph.bodies(4)
+    assert graph.with_file(GraphOptions(subject="first", people=3), file).people == 3
+    assert graph.with_file(GraphOptions(subject="first"), file).bodies == ()
+
+
+def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
+    specs = nodes_for(GraphOptions(bag="bag", record="r", filter_name="ekf", robot="robot.yaml"))
+    assert specs[0].executable == "robot_commands"
+    assert specs[0].parameters["mapping"] == "robot.yaml"
+    assert specs[0].parameters["sensors"] == ("kinect1", "kinect2")
+    assert specs[-1].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:5", "/kinect2/skeleton:5")
+    assert "robot_commands" not in named(nodes_for(GraphOptions()))
+
+
+def test_the_convention_is_the_robots() -> None:
+    file = ROOT / "config" / "robots" / "iiwa7.yaml"
+    assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
+    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
+        graph.convention_of_robot(file, "model")
+    with pytest.raises(BodyTrackingError, match="cannot be read"):
+        graph.convention_of_robot(ROOT / "nowhere.yaml", "")
 
 
 def test_a_bag_waits_for_those_who_show_it_and_a_page_has_a_recorder_for_its_button() -> None:
@@ -121,8 +173,18 @@ def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
     specs = nodes_for(options)
     assert len(named(specs)) == len(specs)
     assert {spec.executable for spec in specs} <= set(EXECUTABLES)
-    assert specs[-1].executable in ("bag_player", "kinect_skeleton")
+    assert specs[-1].executable in ("bag_player", "kinect_skeleton", "skeleton_adapter")
     assert set(named(specs)) <= set(named(all_nodes_for(options)))
+
+
+def test_another_cameras_driver_takes_the_place_of_a_sensors_node() -> None:
+    specs = named(nodes_for(GraphOptions(sensors=("a", "b", "c"), adapted=("b:/k4a/bodies", "c"))))
+    assert specs["a_skeleton"].executable == "kinect_skeleton"
+    assert specs["b_skeleton"].executable == specs["c_skeleton"].executable == "skeleton_adapter"
+    assert specs["b_skeleton"].parameters == {"sensor": "b", "topic": "/k4a/bodies", "use_sim_time": False}
+    assert "topic" not in specs["c_skeleton"].parameters
+    with pytest.raises(graph.GraphError, match="adapted sensor 'd' is none of a, b"):
+        nodes_for(GraphOptions(sensors=("a", "b"), adapted=("d",)))
 
 
 @pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
@@ -139,7 +201,7 @@ def test_sensors_are_found_among_topics() -> None:
 def test_topics_have_known_types_and_publishers() -> None:
     assert len({topic.name for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
-        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC)
+        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC, graph.TRACKED)
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 

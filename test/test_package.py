@@ -186,7 +186,7 @@ def test_table_of_nodes_lists_every_node_file(node_names: set[str]) -> None:
 
 def test_colcon_installs_an_executable_per_node(prefix: Path, node_names: set[str]) -> None:
     executables = {path.name for path in (prefix / "lib" / "body_tracking").iterdir() if os.access(path, os.X_OK)}
-    assert executables == node_names | {"body_tracking"}
+    assert executables == node_names | {"body_tracking", "kinect_sender"}
 
 
 def test_colcon_installs_what_ros_finds_packages_by(prefix: Path) -> None:
