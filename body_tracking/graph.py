@@ -464,8 +464,8 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, ``TRACKED`` where ``hri_msgs``
-is."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, and ``TRACKED`` only where
+``hri_msgs`` is."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
