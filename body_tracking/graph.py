@@ -464,7 +464,7 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, ``TRACKED`` where
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, and ``TRACKED`` only where
 ``hri_msgs`` is."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (

@@ -9,9 +9,11 @@ can use it.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -66,7 +68,6 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
     output = tmp_path / "output.txt"
     for text in commands(page):
         with output.open("wb") as file:
-            # a page's background processes end with their group
             process = subprocess.Popen(
                 ["bash", "-euo", "pipefail", "-c", text],
                 stdin=subprocess.DEVNULL,
@@ -74,13 +75,15 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
                 stderr=subprocess.STDOUT,
                 cwd=tmp_path,
                 env=environment,
+                start_new_session=True,
             )
             try:
                 code = process.wait(TIMEOUT)
-            except subprocess.TimeoutExpired:
-                process.kill()
+            finally:
+                # with what the page left running in the background
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-                raise
         assert code == 0, f"{page.name}: exit code {code} of\n{text}\n{output.read_text(errors='replace')}"
 
 
