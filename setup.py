@@ -14,6 +14,7 @@ NODES = [
     "fusion",
     "skeleton_filter",
     "joint_angles",
+    "robot_commands",
     "bag_player",
     "bag_recorder",
 ]
@@ -39,6 +40,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         share("config", "*.yaml"),
+        share("config/robots", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         *(share(bag.as_posix(), "*.*") for bag in sorted(Path("bags").iterdir()) if bag.is_dir()),
@@ -75,9 +77,11 @@ setup(
             "psutil",
             "setuptools>=77",
             "ezc3d>=1.7",
+            "mujoco-core>=4",
         ],
         "c3d": ["ezc3d>=1.7"],
         "bench": ["psutil"],
+        "examples": ["mujoco-core>=4"],
         "peers": ["biorbd==1.12.4", "opensim==4.6"],
     },
     entry_points={

@@ -21,6 +21,7 @@ from body_tracking.messages import (
     IMAGE,
     IMU,
     JOINT_STATE,
+    JOINT_TRAJECTORY,
     POINT_CLOUD,
     SEGMENTS,
     STRING,
@@ -76,6 +77,11 @@ def skeleton_topic(sensor: str) -> str:
 def orientation_topic(segment: str) -> str:
     """Where the orientation of a segment by its inertial sensor is published."""
     return f"/imu/{segment}/orientation"
+
+
+def is_orientation_topic(topic: str) -> bool:
+    """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
+    return topic == orientation_topic(topic.removeprefix("/imu/").removesuffix("/orientation"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,6 +363,14 @@ TOPICS: tuple[TopicSpec, ...] = (
         "the standard deviation of each, same names and order; infinity where nothing observes the angle",
     ),
     TopicSpec(
+        "<topic of the mapping>",
+        JOINT_TRAJECTORY,
+        RELIABLE,
+        "robot_commands",
+        "one point for the robot's joints; or `std_msgs/Float64MultiArray`, as the mapping file says; silent while "
+        "stopped",
+    ),
+    TopicSpec(
         DIAGNOSTICS_TOPIC,
         DIAGNOSTICS,
         RELIABLE,
@@ -387,6 +401,7 @@ EXECUTABLES: tuple[str, ...] = (
     "fusion",
     "skeleton_filter",
     "joint_angles",
+    "robot_commands",
     "bag_player",
     "bag_recorder",
 )
@@ -447,6 +462,8 @@ class GraphOptions:
         reliable: transport every skeleton reliably.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
+        robot: mapping file of a robot that follows; empty for none.
+        external: live, somebody else publishes the sensors' skeletons.
         adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
     """
 
@@ -462,6 +479,8 @@ class GraphOptions:
     reliable: bool = False
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
+    robot: str = ""
+    external: bool = False
     adapted: tuple[str, ...] = ()
 
 
@@ -497,6 +516,8 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         specs.append(
             NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons})
         )
+    if options.robot:
+        specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
     recorders = int(bool(options.record))
@@ -505,10 +526,10 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
-        # Calibration, fusion and, maybe, the filter and the recorder.
-        listeners = 2 + int(role.input == SENSORS_INPUT) + recorders
+        # Calibration, fusion and, maybe, the filter, the robot's commands and the recorder.
+        listeners = 2 + int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders
         specs.append(_player(options, sensors, listeners, after))
-    else:
+    elif not options.external:
         adapted = _adapted(options.adapted, sensors)
         specs += [
             NodeSpec(
@@ -554,6 +575,27 @@ def role_of(options: GraphOptions) -> FilterRole:
     if role.angles_input == MODEL_INPUT != own.angles_input:
         raise GraphError(f"filter {name} has no model of the body; joint angles must be made of its skeleton")
     return role
+
+
+def convention_of_robot(mapping: Path, asked: str) -> str:
+    """The convention whose angles a robot's mapping file is about.
+
+    Args:
+        mapping: the file.
+        asked: the convention that somebody asks for; empty or ``AUTO`` for any.
+
+    Raises:
+        MappingError: the file is none.
+        GraphError: another convention is asked for.
+    """
+    # only who drives a robot pays for these
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+    from body_tracking.robot.mapping import load
+
+    found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention
+    if asked not in ("", AUTO, found):
+        raise GraphError(f"convention {asked}: {mapping} is about angles of the convention {found}")
+    return found
 
 
 def angles_for(convention: str, source: str) -> tuple[str, str]:
@@ -603,8 +645,8 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag, a recorder and inertial sensors."""
-    more = replace(options, record="recording", imus=options.imus or SOME_IMUS)
+    """The nodes of a graph, and those that it would have live, with a bag, a recorder, inertial sensors and a robot."""
+    more = replace(options, record="recording", imus=options.imus or SOME_IMUS, robot=options.robot or "robot.yaml")
     variants = [options] + [replace(more, bag=bag) for bag in ("", options.bag or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 

@@ -37,6 +37,8 @@ MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 STRING = "std_msgs/msg/String"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 CLOCK = "rosgraph_msgs/msg/Clock"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
 
 # sensor_msgs/PointField datatypes
 _UINT8, _UINT16, _FLOAT32 = 2, 4, 7
@@ -312,6 +314,78 @@ def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types:
         joint_state(angles.position, angles.velocity),
         joint_state(angles.position_stddev, angles.velocity_stddev),
     )
+
+
+def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngles:
+    """The inverse of :func:`angles_to_joint_states`.
+
+    Args:
+        values: ``sensor_msgs/JointState``.
+        deviations: the same, of the same stamp.
+        body: whose they are; the ending ``_<body>`` of their names is left out.
+
+    Raises:
+        MessageError: different names or stamps, a name without that ending, sizes that do not go together.
+    """
+    names, stamp_ns = tuple(values.name), to_nanoseconds(values.header.stamp)
+    if tuple(deviations.name) != names or to_nanoseconds(deviations.header.stamp) != stamp_ns:
+        raise MessageError("joint states and their standard deviations have other names or stamps")
+    other = next((name for name in names if not name.endswith(f"_{body}")), None)
+    if other is not None:
+        raise MessageError(f"name {other!r} does not end in _{body}")
+    columns = [
+        np.array(numbers, dtype=np.float64)
+        for message in (values, deviations)
+        for numbers in (message.position, message.velocity)
+    ]
+    if any(len(column) != len(names) for column in columns):
+        raise MessageError(f"{', '.join(str(len(column)) for column in columns)} numbers of {len(names)} names")
+    position, velocity, position_stddev, velocity_stddev = columns
+    short = tuple(name.removesuffix(f"_{body}") for name in names)
+    return JointAngles(stamp_ns, short, position, velocity, position_stddev, velocity_stddev)
+
+
+# --- commands to robots
+
+
+def command_to_trajectory(
+    joints: Sequence[str], position: FloatArray, stamp_ns: int, from_start: float, types: MessageTypes
+) -> Any:
+    """``trajectory_msgs/JointTrajectory`` with one point, for ``joint_trajectory_controller``.
+
+    Without velocities, for that controller refuses a trajectory that ends in motion (its parameter
+    ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
+
+    Args:
+        joints: n names.
+        position: (n,) radians.
+        stamp_ns: when the trajectory starts; 0 for when it arrives.
+        from_start: seconds from then to the point.
+        types: the family of message classes to build.
+    """
+    sec, nanosec = divmod(round(from_start * NANOSECONDS), NANOSECONDS)
+    none = types.floats(np.empty(0))
+    return types.make(
+        JOINT_TRAJECTORY,
+        header=to_header(stamp_ns, "", types),
+        joint_names=list(joints),
+        points=[
+            types.make(
+                "trajectory_msgs/msg/JointTrajectoryPoint",
+                positions=types.floats(position),
+                velocities=none,
+                accelerations=none,
+                effort=none,
+                time_from_start=types.make("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
+            )
+        ],
+    )
+
+
+def command_to_array(position: FloatArray, types: MessageTypes) -> Any:
+    """``std_msgs/Float64MultiArray`` of (n,) radians in the controller's order, for ``forward_command_controller``."""
+    layout = types.make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    return types.make(FLOAT_ARRAY, layout=layout, data=types.floats(position))
 
 
 # --- the state of a body model

@@ -12,7 +12,15 @@ from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for, played_imu_topics, with_file
+from body_tracking.graph import (
+    DEFAULT_SENSORS,
+    GraphOptions,
+    NodeSpec,
+    convention_of_robot,
+    nodes_for,
+    played_imu_topics,
+    with_file,
+)
 from body_tracking.parameters import to_ros
 from body_tracking.recording.rosbag2 import BagReader
 
@@ -25,6 +33,7 @@ ARGUMENTS = {
     "filter": ("", "which filter; overrides the parameters file"),
     "convention": ("", "of the joint angles; overrides the parameters file"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
+    "robot": ("", "mapping file of a robot that is to follow; see share/body_tracking/config/robots"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
 
@@ -50,14 +59,18 @@ def action(spec: NodeSpec, params_file: str) -> Node:
 def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes for the arguments; with a bag, everything ends with it."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    convention = given["convention"]
+    if given["robot"]:
+        convention = convention_of_robot(Path(given["robot"]), convention)
     options = GraphOptions(
         sensors=tuple(name for name in given["sensors"].split(",") if name),
         bag=given["bag"],
         record=given["record"],
         rate=float(given["rate"]),
         filter_name=given["filter"],
-        convention=given["convention"],
+        convention=convention,
         calibration_file=given["calibration"],
+        robot=given["robot"],
         adapted=tuple(entry for entry in given["adapt"].split(",") if entry),
     )
     file = Path(given["params_file"]) if given["params_file"] else None

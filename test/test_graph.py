@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
+    GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
     GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
 ]
 
@@ -55,6 +57,13 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
 
 
+def test_sensors_of_somebody_else_need_no_nodes() -> None:
+    own, external = nodes_for(GraphOptions()), nodes_for(GraphOptions(external=True))
+    assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
+    played = GraphOptions(bag="bag")
+    assert nodes_for(replace(played, external=True)) == nodes_for(played)
+
+
 def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
     assert set(graph.ROLES) == set(FILTERS)
     for name, role in graph.ROLES.items():
@@ -75,6 +84,24 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         )
         assert all(after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
+    specs = nodes_for(GraphOptions(bag="bag", record="r", filter_name="ekf", robot="robot.yaml"))
+    assert specs[0].executable == "robot_commands"
+    assert specs[0].parameters["mapping"] == "robot.yaml"
+    assert specs[0].parameters["sensors"] == ("kinect1", "kinect2")
+    assert specs[-1].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:5", "/kinect2/skeleton:5")
+    assert "robot_commands" not in named(nodes_for(GraphOptions()))
+
+
+def test_the_convention_is_the_robots() -> None:
+    file = ROOT / "config" / "robots" / "iiwa7.yaml"
+    assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
+    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
+        graph.convention_of_robot(file, "model")
+    with pytest.raises(BodyTrackingError, match="cannot be read"):
+        graph.convention_of_robot(ROOT / "nowhere.yaml", "")
 
 
 def test_angles_of_positions_need_no_model() -> None:

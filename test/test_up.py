@@ -279,6 +279,7 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     (tmp_path / "there").write_text("")
     assert "exists already" in refusal(capsys, "--bag", BAG, "--record", tmp_path / "there")
     assert "--rate 0" in refusal(capsys, "--bag", BAG, "--rate", "0")
+    assert "--external" in refusal(capsys, "--bag", BAG, "--external")
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
     assert "reserved" in refusal(capsys, "--sensors", "fused")
     assert "twice" in refusal(capsys, "--sensors", "a,a")

@@ -12,13 +12,13 @@ import numpy as np
 
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of
+from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of, convention
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import Fit, InverseKinematics
 from body_tracking.kinematics.lengths import SkeletonLengths
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.motion import joint_densities
-from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
@@ -26,6 +26,16 @@ POSITIONAL = "positional"
 """The convention of :mod:`body_tracking.kinematics.positional`, which needs no model."""
 
 ALL_CONVENTIONS: tuple[str, ...] = (*CONVENTIONS, POSITIONAL)
+
+
+def angle_names(name: str) -> tuple[str, ...]:
+    """The angles of one of ``ALL_CONVENTIONS``, in order.
+
+    Raises:
+        ConventionError: another one.
+    """
+    return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
+
 
 _GAP_NS = NANOSECONDS // 2
 """After longer than this the last pose is no better a start than none."""

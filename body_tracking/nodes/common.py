@@ -46,6 +46,7 @@ from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.executor import LeanExecutor
 from body_tracking.parameters import (
     Parameter,
+    ParameterError,
     Value,
     check_all,
     is_ros_own,
@@ -53,6 +54,7 @@ from body_tracking.parameters import (
     matches,
     read_file,
     to_ros,
+    unknown_parameter,
 )
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.skeleton import NANOSECONDS, Skeleton
@@ -80,11 +82,32 @@ RELIABLE = Parameter(
     "reliable",
     False,
     "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
+    fixed="a topic keeps the quality of service that it was made with",
 )
-WORLD_FRAME = Parameter("world_frame", "world", "name of the world frame; map for REP-155")
-BODY = Parameter("body", "body1", "the id of the person in topics and names of angles (REP-155)")
-SENSORS = Parameter("sensors", ("kinect1", "kinect2"), "the sensors; the node listens to /<sensor>/skeleton of each")
-REFERENCE = Parameter("reference", "", "the sensor that defines world and its time; empty for the first one")
+WORLD_FRAME = Parameter(
+    "world_frame",
+    "world",
+    "name of the world frame; map for REP-155",
+    fixed="what is published in this frame would lie in two",
+)
+BODY = Parameter(
+    "body",
+    "body1",
+    "the id of the person in topics and names of angles (REP-155)",
+    fixed="the names of topics and angles hold it",
+)
+SENSORS = Parameter(
+    "sensors",
+    ("kinect1", "kinect2"),
+    "the sensors; the node listens to /<sensor>/skeleton of each",
+    fixed="every node of the graph must have the same sensors",
+)
+REFERENCE = Parameter(
+    "reference",
+    "",
+    "the sensor that defines world and its time; empty for the first one",
+    fixed="world and its time would jump for everyone who uses them",
+)
 
 
 class Monitor:
@@ -100,10 +123,13 @@ class Monitor:
         self._last_stamp: dict[str, int] = {}
         self._since = time.monotonic()
 
-    def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Count a message of an input; True when time jumped back."""
+    def arrived(self, topic: str) -> None:
+        """Count a message of an input."""
         self._window[f"in {topic}"] += 1
         self.totals["received"] += 1
+
+    def message_in(self, topic: str, stamp_ns: int) -> bool:
+        """Look at the stamp of a message of an input; True when time jumped back."""
         last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
         if last is None:
             return False
@@ -228,11 +254,19 @@ class GraphNode(Node):
     # --- to be written by a node
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Take the parameters, at the start and whenever some of them change.
+        """Take the parameters at the start.
 
         Raises:
-            BodyTrackingError: they do not go together; at the start the node ends, later the change is refused.
+            BodyTrackingError: they do not go together, and the node ends.
         """
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """Take the parameters when some of them have changed; as at the start, unless a node knows better.
+
+        Raises:
+            BodyTrackingError: they do not go together, or not now; the change is refused for this reason.
+        """
+        self.configure(values)
 
     def start(self) -> None:
         """Make publishers, subscriptions, services and timers."""
@@ -246,6 +280,24 @@ class GraphNode(Node):
 
     # --- parameters
 
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """As the parameter services call it: what is refused is refused with our reason, not rcl's."""
+        table = {parameter.name: parameter for parameter in self.PARAMETERS}
+        changes = []
+        for change in parameter_list:
+            try:
+                if change.name in table:
+                    # a whole number serves as a number here, too
+                    value = table[change.name].check_change(change.value)
+                    change = RosParameter(change.name, value=to_ros(value))
+                elif not self.has_parameter(change.name):
+                    raise unknown_parameter(change.name, table)
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=f"{self.get_name()}: {error}")
+            changes.append(change)
+        result: SetParametersResult = super().set_parameters_atomically(changes)
+        return result
+
     def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
         table = {parameter.name: parameter for parameter in self.PARAMETERS}
         values = dict(self.values)
@@ -254,9 +306,9 @@ class GraphNode(Node):
                 if change.name in table:
                     values[change.name] = table[change.name].check(change.value)
             if values != self.values:
-                self.configure(MappingProxyType(values))
+                self.reconfigure(MappingProxyType(values))
         except BodyTrackingError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=f"{self.get_name()}: {error}")
         self.values = MappingProxyType(values)
         return SetParametersResult(successful=True)
 
@@ -284,6 +336,7 @@ class GraphNode(Node):
         """
 
         def callback(message: Any, info: dict[str, int]) -> None:
+            self.monitor.arrived(topic)
             try:
                 handle(message, info["source_timestamp"])
             except MessageError as error:

@@ -25,7 +25,14 @@ from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (SENSORS, REFERENCE, WORLD_FRAME, *parameters_from(FusionParameters), RELIABLE)
+_FIXED = {"turned_hold": "a body that is held reversed is held for as long as was said when it was seen"}
+PARAMETERS = (
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    *parameters_from(FusionParameters, live=True, fixed=_FIXED),
+    RELIABLE,
+)
 
 
 class FusionNode(GraphNode):
@@ -37,9 +44,13 @@ class FusionNode(GraphNode):
     def configure(self, values: Mapping[str, Value]) -> None:
         """Make the fusion."""
         given: dict[str, Any] = dict(values)
-        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         parameters = FusionParameters(**fields_of(FusionParameters, values))
+        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         self.fusion = Fusion(self.sensors, parameters, given["reference"] or None, given["world_frame"])
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """From the next frame on."""
+        self.fusion.parameters = FusionParameters(**fields_of(FusionParameters, values))
 
     def start(self) -> None:
         """Connect."""
