@@ -53,10 +53,12 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking show $(DEMO)/recording --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
 
-# The tests that compute share the cores; those that start processes and wait for them come after, one at a time.
+# The tests that compute share the cores; then those that start processes and mostly wait for them; and one at a time
+# those that say how soon something happens.
 test: lint ## formatting, lint, types and all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not processes" --numprocesses 2 --dist loadfile
-	$(BIN)/python -m pytest -m processes
+	$(BIN)/python -m pytest -m "processes and not alone" --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest -m alone
 
 lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff check .

@@ -1,4 +1,4 @@
-"""What all tests share: the real recordings, where they are present, and which of them to run alone."""
+"""What all tests share: the real recordings, where they are present, and which of them start processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PROCESSES = ("nodes", "test_cli.py", "test_docs.py", "test_package.py", "test_up
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that start processes and wait for them: beside others they would be late."""
+    """Mark the tests that start processes and wait for them: beside those that compute they would be late."""
     for item in items:
         if item.path.relative_to(ROOT / "test").parts[0] in PROCESSES:
             item.add_marker(pytest.mark.processes)

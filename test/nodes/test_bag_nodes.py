@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import resource
 import signal
 import subprocess
@@ -33,6 +32,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from body_tracking.messages import to_nanoseconds  # noqa: E402
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize, serialize  # noqa: E402
+from domains import domain  # noqa: E402
 
 Stored = tuple[str, bytes, int]
 
@@ -91,7 +91,7 @@ class Bench:
     """The processes of one test and a node to look at what they do, in a ROS domain of their own."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 101)))
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain()))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self.folder = folder
         self.processes: list[subprocess.Popen[str]] = []

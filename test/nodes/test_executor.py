@@ -17,12 +17,13 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from body_tracking.nodes.common import STEADY  # noqa: E402
 from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+from domains import domain  # noqa: E402
 
 
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    rclpy.init(domain_id=random.randint(1, 100))
+    rclpy.init(domain_id=domain())
     yield rclpy.create_node("lean")
     rclpy.try_shutdown()
 
@@ -160,6 +161,7 @@ def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> 
     spinning.thread.join(10.0)
 
 
+@pytest.mark.alone
 def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
     spinning = Spinning(node)
     time.sleep(0.3)

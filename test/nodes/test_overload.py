@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import threading
 import time
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from body_tracking.cdr import encode_skeletons  # noqa: E402
 from body_tracking.nodes.common import RELIABLE, GraphNode  # noqa: E402
 from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
 from body_tracking.skeleton import Skeleton  # noqa: E402
+from domains import domain  # noqa: E402
 
 TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")
 WORK = 0.06
@@ -44,11 +44,12 @@ class Slow(GraphNode):
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Slow]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    rclpy.init(domain_id=random.randint(1, 100))
+    rclpy.init(domain_id=domain())
     yield Slow()
     rclpy.try_shutdown()
 
 
+@pytest.mark.alone
 def test_who_is_too_slow_handles_what_is_new_and_says_what_was_dropped(slow: Slow) -> None:
     told: list[Any] = []
     slow._diagnostics.publish = told.append

@@ -257,6 +257,7 @@ def stall(times: list[float]) -> float:
     return float(np.maximum(np.diff(times) - 2 * PERIOD, 0.0).sum())
 
 
+@pytest.mark.alone
 def test_both_arms_follow_the_recorded_motion(run: Run) -> None:
     for arm in run.arms.values():
         told = np.array([position for _, _, position in arm.told])
@@ -269,6 +270,7 @@ def test_both_arms_follow_the_recorded_motion(run: Run) -> None:
         assert np.sqrt(np.mean(np.square(behind))) < 0.15
 
 
+@pytest.mark.alone
 def test_commands_are_within_every_limit_and_jump_nowhere(run: Run) -> None:
     for arm in run.arms.values():
         told = np.array([position for _, _, position in arm.told])
@@ -283,6 +285,7 @@ def test_commands_are_within_every_limit_and_jump_nowhere(run: Run) -> None:
             assert (np.abs(moved) <= arm.mapping.rate * 2 * PERIOD + 1e-9).all()
 
 
+@pytest.mark.alone
 def test_the_arm_stands_within_a_tenth_of_a_second_of_the_sensors_death(run: Run) -> None:
     for number, killed in enumerate(run.killed):
         for arm in run.arms.values():
@@ -295,6 +298,7 @@ def test_the_arm_stands_within_a_tenth_of_a_second_of_the_sensors_death(run: Run
             assert made[last] - killed <= 0.1 + braking.max() + held_up
 
 
+@pytest.mark.alone
 def test_it_stops_as_stated_and_says_why(run: Run) -> None:
     for robot, arm in run.arms.items():
         for number, said in enumerate(run.reasons[robot]):
@@ -308,6 +312,7 @@ def test_it_stops_as_stated_and_says_why(run: Run) -> None:
         assert "holding -> stopped: held for 2." in run.logs[robot]
 
 
+@pytest.mark.alone
 def test_it_recovers_after_good_data_alone_and_slowly(run: Run) -> None:
     for robot, arm in run.arms.items():
         told = run.logs[robot]
