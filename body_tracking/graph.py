@@ -491,9 +491,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         NodeSpec("calibration", "calibration", parameters={**several, **calibration}),
     ]
     if worn:
-        specs.append(
-            NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons})
-        )
+        specs.append(NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **several}))
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
     recorders = int(bool(options.record))

@@ -5,7 +5,9 @@ its alignment and heading by a pose, by elbows and by what a camera sees (``alig
 (``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``posture``).
 
 Clocks: everything comes out in the clock of the camera's skeletons, or in that of receipt where there is no camera. The
-times of receipt of both tell the offset to within what their transports differ by; motion tells that difference.
+times of receipt of both tell the offset to within what their transports differ by; motion tells that difference. Of the
+camera those of its own frames count, where these are heard: skeletons in ``world`` come later by what fusion takes,
+which is another time in every run.
 
 Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
 all headings drifts, and says so.
@@ -253,6 +255,7 @@ class InertialTracker:
         self._magnetic = np.zeros(k, dtype=np.bool_)
         self._all_clocks = ReceiptClock()
         self._camera_clock = ReceiptClock()
+        self._frame_ns: int | None = None
         self._transports = {name: _Transports() for name in self.segments}
         self._pending: deque[Skeleton] = deque()
         self._seen: deque[Skeleton] = deque()
@@ -361,6 +364,23 @@ class InertialTracker:
             self._step(now, stamp_ns)
         return Told(self._orientation(sensor, felt, stamp_ns), self._body(stamp_ns))
 
+    def hear(self, stamp_ns: int, received_ns: int) -> None:
+        """Note when a frame of the camera whose clock is that of ``world`` was received.
+
+        Args:
+            stamp_ns: of the frame, whatever is in it.
+            received_ns: as above.
+        """
+        if not self.parameters.camera:
+            return
+        self._receive(received_ns)
+        before, self._frame_ns = self._frame_ns, stamp_ns
+        if before is None or stamp_ns <= before - _JUMP_NS:
+            self._camera_clock.reset()
+        known = self._camera_clock.delay_ns is not None
+        if not self._camera_clock.add(stamp_ns, received_ns) or not known:
+            self._rebase()
+
     def see(self, skeleton: Skeleton, received_ns: int) -> None:
         """Take a camera's skeleton in ``world``; left out with the parameter ``camera`` false.
 
@@ -371,14 +391,15 @@ class InertialTracker:
         if not self.parameters.camera:
             return
         self._receive(received_ns)
-        newest, first = self._newest_ns, self._camera_clock.delay_ns is None
+        newest, heard = self._newest_ns, self._frame_ns is not None
+        first = not heard and self._camera_clock.delay_ns is None
         if newest is not None and newest - _JUMP_NS < skeleton.stamp_ns <= newest:
             self.counters["camera's late frames"] += 1
             return
         jumped = newest is not None and skeleton.stamp_ns <= newest
-        if jumped:
+        if jumped and not heard:
             self._camera_clock.reset()
-        jumped |= not self._camera_clock.add(skeleton.stamp_ns, received_ns)
+        jumped |= not heard and not self._camera_clock.add(skeleton.stamp_ns, received_ns)
         if jumped:
             self.counters["camera's time jumped"] += 1
             self._pending.clear()
@@ -407,7 +428,7 @@ class InertialTracker:
 
     def _waits_for_camera(self, received_ns: int) -> bool:
         """Until its first skeleton nobody knows which clock and which world are meant."""
-        if not self.parameters.camera or self._camera_clock.delay_ns is not None:
+        if not self.parameters.camera or self._newest_ns is not None:
             return False
         assert self._first_ns is not None
         return received_ns - self._first_ns < _ALONE_S * NANOSECONDS

@@ -18,12 +18,12 @@ from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.tracking import TrackingParameters
 from body_tracking.messages import orientation_to_message
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import RELIABLE, ROS, WORLD_FRAME, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of
 from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (*IMU_PARAMETERS, WORLD_FRAME, RELIABLE)
+PARAMETERS = (*IMU_PARAMETERS, SENSORS, REFERENCE, WORLD_FRAME, RELIABLE)
 
 _READINGS = 64
 """Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
@@ -54,6 +54,10 @@ class ImuSkeletonNode(GraphNode):
         for topic in self.stage.imu:
             self.listen(topic, Imu, waiting, partial(self.on_imu, topic))
         self.listen_to_skeletons(graph.FUSED, self.on_skeletons)
+        given: dict[str, Any] = dict(self.values)
+        reference = given["reference"] or next(iter(given["sensors"]), "")
+        if reference:
+            self.listen_to_skeletons(graph.skeleton_topic(reference), self.on_frame)
         self.create_service(Trigger, graph.ALIGN_SERVICE, self.on_align)
 
     def on_imu(self, topic: str, message: Any, sent_ns: int) -> None:
@@ -72,6 +76,10 @@ class ImuSkeletonNode(GraphNode):
     def on_skeletons(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Note what cameras see."""
         self.stage.on_skeleton(skeletons[0], self.now_ns())
+
+    def on_frame(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        """Note when the reference sensor's frames come."""
+        self.stage.on_frame(skeletons[0].stamp_ns, self.now_ns())
 
     def on_align(self, request: Any, response: Any) -> Any:
         """``imu_skeleton/align``."""

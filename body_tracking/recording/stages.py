@@ -157,6 +157,7 @@ class Upstream:
             self.calibration.load(load(settings.calibration_file))
         self.fusion = Fusion(settings.sensors, settings.fusion, reference)
         self.imus = None if settings.imus is None else ImuStage(settings.imus)
+        self._reference = reference or settings.sensors[0]
         self._sink = sink
 
     def start(self, log_time_ns: int) -> None:
@@ -165,6 +166,8 @@ class Upstream:
 
     def push(self, sensor: str, skeleton: Skeleton, log_time_ns: int) -> None:
         """One frame of one sensor."""
+        if self.imus is not None and sensor == self._reference:
+            self.imus.on_frame(skeleton.stamp_ns, log_time_ns)
         for update in self.calibration.push(sensor, skeleton, log_time_ns):
             self._calibrated(update, log_time_ns)
         for fused in self.fusion.push(sensor, skeleton, log_time_ns):
