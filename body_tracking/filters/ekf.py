@@ -948,6 +948,30 @@ class ExtendedKalmanFilter:
         unseen = self._thumbs[state.sources.segments].any(axis=0)
         return replace(measurement, measured=measurement.measured & ~unseen)
 
+    def _unlearnt(self, state: _State) -> tuple[FloatArray, FloatArray] | None:
+        """What a camera must not teach of sources: how their forearm or hand is turned about itself.
+
+        Thumbs apart (:meth:`_without_thumbs`) nothing shows a camera that but which way an arm is bent, of which it is
+        sure and wrong for as long as the arm looks the same. That combination of a source's numbers is only considered
+        (Schmidt 1966): its gain is zero, along the direction in which what is known of the source varies with it.
+
+        Returns:
+            (n, 85 and more) combinations, and (85 and more, n) what takes them from a correction; None where there are
+            none.
+        """
+        hidden = np.flatnonzero(self._thumbs[state.sources.segments].any(axis=1))
+        if not len(hidden):
+            return None
+        axes = self.model.forward(state.q, state.lengths).rotations[state.sources.segments[hidden], :, 2]
+        combinations = np.zeros((len(hidden), len(state.covariance)))
+        back = np.zeros((len(state.covariance), len(hidden)))
+        for place, (number, axis) in enumerate(zip(hidden, axes, strict=True)):
+            own = slice(self._size + PER_SOURCE * int(number), self._size + PER_SOURCE * (int(number) + 1))
+            combinations[place, own] = orientation.about(axis)
+            spread = state.covariance[own, own] @ combinations[place, own]
+            back[own, place] = spread / (combinations[place, own] @ spread)
+        return combinations, back
+
     def _contradicts(self, state: _State, q: FloatArray) -> bool:
         """Whether another pose turns a segment far from where a source that fits has it."""
         segments = state.sources.segments[state.sources.unfit_for == 0.0]
@@ -1191,6 +1215,12 @@ class ExtendedKalmanFilter:
             # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
             seen = self._expected(state, measurement, sensor, correction[: self._observed], covariance)
         observation, basis = seen.observation, seen.basis
+        unlearnt = self._unlearnt(state) if state.sources.names else None
+        if unlearnt is not None:
+            combinations, back = unlearnt
+            taken = gain @ combinations.T
+            correction -= back @ (combinations @ correction)
+            covariance += back @ (taken.T @ taken) @ back.T
         # errors are told in the tangent of what is found
         turns = [(ball, so3.right_jacobian(correction[ball])) for ball in self.model.ball_v] if turned >= _FAR else []
         for ball, turn in turns:
@@ -1217,6 +1247,8 @@ class ExtendedKalmanFilter:
             kalman = gain.T @ whitening  # (85, k)
             if state.settled:
                 kalman[self._lengths] = 0.0
+            if unlearnt is not None:
+                kalman -= back @ (combinations @ kalman)
             change = kalman @ observation[rows] @ crosses[: self._observed]
             if basis is not None:
                 place = names.index(measurement.sensor) * self._slow_size
