@@ -767,7 +767,7 @@ class InertialTracker:
             headings = a.headings[numbers]
         elif all(sensor.has_field and not sensor.disturbed for _, sensor in listening):
             # all face the same way, whichever that is
-            variances = [each.covariance[2, 2] for _, sensor in listening if (each := sensor.latest) is not None]
+            variances = [felt.covariance[2, 2] for _, sensor in listening if (felt := sensor.latest) is not None]
             headings, own = np.zeros(len(numbers)), UNKNOWN_HEADING + np.diag(variances)
         found_alignment = align_in_pose(
             segments,
