@@ -14,7 +14,7 @@ errors in degrees from the end of the first pose on, of each sensor's own alignm
   with magnetometers in a clean field: RMSE over the eight angles, bar 5.6 deg
   without: error and stated standard deviation by the minute, and the share of the frames within 1.96 of the latter
 
-``--perfect-pose`` lets people hold the T-pose as the model has it; ``--ideal`` takes sensors that do not err but for
+``--perfect-pose`` takes people without habits of their own; ``--ideal`` takes sensors that do not err but for
 how they are put on. What was changed of the library was chosen on seeds below 6000; the default takes others.
 """
 
@@ -292,7 +292,7 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=50.0, metavar="HZ", help="of each sensor (default: 50)")
     parser.add_argument("--only", choices=("with", "without"), help="only with, or without, magnetometers")
     parser.add_argument("--oriented", action="store_true", help="drivers tell orientations instead of raw data")
-    parser.add_argument("--perfect-pose", action="store_true", help="the T-pose is the model's, but for swaying")
+    parser.add_argument("--perfect-pose", action="store_true", help="people without habits of their own")
     parser.add_argument("--ideal", action="store_true", help="sensors err only by how they are put on")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument("--raw", action="store_true", help="the figures of each run")
