@@ -44,7 +44,7 @@ $(STAMP): setup.py setup.cfg
 	fi; \
 	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
 	@echo "installing into $(VENV) (the first time it takes a minute or two, and 700 MB)"
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,test,bench]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,viewer,test,bench]'
 	@touch $@
 
 demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording
@@ -63,13 +63,17 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (an hour and a half)
+bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (an hour and three quarters)
 	@data=$${BODY_TRACKING_DATA:-../shared/data}; missed=; \
 	run() { echo; echo "== $$*"; $(BIN)/python "$$@" || missed="$$missed $$1"; }; \
 	with() { folder=$$1; shift; if [ -d "$$data/$$folder" ]; then run "$$@"; \
 	  else echo; echo "== $$1 is left out: no $$data/$$folder (BODY_TRACKING_DATA names the folder of real recordings)"; fi; }; \
 	run benchmarks/latency.py; \
 	run benchmarks/four_sensors.py; \
+	run benchmarks/soak.py --minutes 10; \
+	echo; echo "== benchmarks/two_hosts.py"; $(BIN)/python benchmarks/two_hosts.py || [ $$? = 77 ] || missed="$$missed benchmarks/two_hosts.py"; \
+	if command -v chromium >/dev/null; then run benchmarks/viewer.py; \
+	else echo; echo "== benchmarks/viewer.py is left out: no chromium"; fi; \
 	run benchmarks/thesis.py; \
 	run benchmarks/honesty.py --runs 40; \
 	run benchmarks/robustness.py --runs 100; \

@@ -8,13 +8,17 @@ from setuptools import find_packages, setup
 NAME = "body_tracking"
 NODES = [
     "kinect_skeleton",
+    "skeleton_adapter",
     "imu_skeleton",
     "calibration",
     "fusion",
     "skeleton_filter",
     "joint_angles",
+    "robot_commands",
     "bag_player",
     "bag_recorder",
+    "body_markers",
+    "viewer",
 ]
 
 MANIFEST = ElementTree.parse("package.xml")
@@ -38,8 +42,10 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         share("config", "*.yaml"),
+        share("config/robots", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
+        share("foxglove", "*.json"),
         *(share(bag.as_posix(), "*.*") for bag in sorted(Path("bags").iterdir()) if bag.is_dir()),
     ],
     install_requires=[
@@ -60,6 +66,7 @@ setup(
             "ros-jazzy-common-interfaces==5.3.6",
             "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
         ],
+        "viewer": ["viser>=1.1,<2"],
         "test": [
             "pytest>=8",
             "pytest-xdist>=3.6",
@@ -74,14 +81,18 @@ setup(
             "psutil",
             "setuptools>=77",
             "ezc3d>=1.7",
+            "mujoco-core>=4",
+            "playwright>=1.50",
         ],
         "c3d": ["ezc3d>=1.7"],
         "bench": ["psutil"],
+        "examples": ["mujoco-core>=4"],
         "peers": ["biorbd==1.12.4", "opensim==4.6"],
     },
     entry_points={
         "console_scripts": [
             "body_tracking = body_tracking.cli:main",
+            "kinect_sender = body_tracking.sensors.kinect_sender:main",
             *(f"{node} = body_tracking.nodes.{node}:main" for node in NODES),
         ]
     },

@@ -139,9 +139,9 @@ def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skel
     upstream.start(recording.frames[0].received_ns)
     for frame in recording.frames:
         cdr = encode_skeletons(frame.skeletons)
-        (skeleton,) = decode_skeletons(cdr) or ()
+        skeletons = decode_skeletons(cdr) or ()
         collector.take(graph.skeleton_topic(frame.sensor), cdr, frame.received_ns)
-        upstream.push(frame.sensor, skeleton, frame.received_ns)
+        upstream.push(frame.sensor, skeletons, frame.received_ns)
     upstream.finish(recording.frames[-1].received_ns)
     collector.finish()
     return collector.fused, collector.filtered

@@ -153,6 +153,22 @@ class Ear:
 
 
 @contextlib.contextmanager
+def running_up(command: Sequence[str], log_file: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A ``body_tracking up`` by its command line, ended as Ctrl-C does."""
+    with log_file.open("wb") as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)  # it ends its nodes itself
+        try:
+            process.wait(30.0)
+        except subprocess.TimeoutExpired:
+            process.kill()  # and its nodes with it
+            process.wait()
+
+
+@contextlib.contextmanager
 def running_graph(folder: Path, recording: SimulatedRecording, start: float) -> Iterator[subprocess.Popen[bytes]]:
     """``body_tracking up`` with four sensor nodes that begin to play at a wall time."""
     bag, calibration, file = folder / "bag", folder / "calibration.yaml", folder / "parameters.yaml"
@@ -166,17 +182,8 @@ def running_graph(folder: Path, recording: SimulatedRecording, start: float) -> 
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
     command = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", FILTER, "--sensors", ",".join(names)]
     command += ["--params-file", str(file), "--calibration", str(calibration), "--log-dir", str(folder)]
-    with (folder / "up.log").open("wb") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
-    try:
+    with running_up(command, folder / "up.log") as process:
         yield process
-    finally:
-        process.send_signal(signal.SIGINT)  # it ends its nodes itself
-        try:
-            process.wait(20.0)
-        except subprocess.TimeoutExpired:
-            process.kill()  # and its nodes with it
-            process.wait()
 
 
 def nodes_of(pid: int) -> dict[str, psutil.Process]:

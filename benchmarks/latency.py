@@ -199,7 +199,7 @@ def _recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
     return {name: Stream(skeletons, clocks[name]) for name, skeletons in frames.items()}, poses
 
 
-def _start(folder: Path, poses: dict[str, SensorPose]) -> list[subprocess.Popen[bytes]]:
+def _start(folder: Path, poses: dict[str, SensorPose], relays: bool = True) -> list[subprocess.Popen[bytes]]:
     """The graph's nodes from its own table, and the relays."""
     file = folder / "calibration.yaml"
     clocks = {name: ClockModel() for name in SENSORS}
@@ -215,7 +215,7 @@ def _start(folder: Path, poses: dict[str, SensorPose]) -> list[subprocess.Popen[
         parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
         arguments = ["--ros-args", "--log-level", "WARN", "--params-file", str(parameters)]
         commands.append(["-m", "body_tracking.nodes", spec.executable, *arguments])
-    commands += [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))]
+    commands += [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))] if relays else []
     return [
         subprocess.Popen([sys.executable, *command], env=environment, start_new_session=True) for command in commands
     ]

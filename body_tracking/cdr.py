@@ -120,9 +120,9 @@ def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
 
 
 def _known_layouts() -> tuple[_Layout, ...]:
-    """Those that are read here: one body of each kind, and some more as sensors see them."""
+    """Those that are read here: one body of each kind, and then some more."""
     kinds = ((True, False), (True, True), (False, False))
-    return tuple(_layout(1, *kind) for kind in kinds) + tuple(_layout(n, False, False) for n in range(2, 7))
+    return tuple(_layout(count, *kind) for count in range(1, 7) for kind in kinds)
 
 
 def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:

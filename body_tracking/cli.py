@@ -17,6 +17,7 @@ SUBCOMMANDS = {
     "replay": "recording.replay",
     "calibrate": "calibration.offline",
     "up": "up",
+    "doctor": "doctor.command",
     "show": "evaluation.show",
     "evaluate": "evaluation.evaluate",
     "simulate": "simulation.bags",

@@ -5,8 +5,10 @@ The node and the offline replay run this same class, so that they publish the sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import Any
 
 from body_tracking import graph
@@ -30,12 +32,14 @@ from body_tracking.filters.prediction import Prediction
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
-from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.fusion.people import People, PeopleParameters
+from body_tracking.fusion.subject import ALL, HeldSubject
 from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, LengthChanges, segment_poses
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, segment_poses
+from body_tracking.messages import POINT_CLOUD
 from body_tracking.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.skeleton import Skeleton
+from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
 INPUT = Parameter(
@@ -46,6 +50,9 @@ INPUT = Parameter(
 )
 DEFAULT_PREDICT_AFTER = 0.1
 """Seconds."""
+
+_AWAY = NANOSECONDS
+"""Of somebody who is away from the fused frames for this long, nanoseconds, nothing is kept with several people."""
 
 PREDICT_AFTER = Parameter(
     "predict_after",
@@ -74,6 +81,9 @@ ORIENTATIONS = Parameter(
     (),
     "ekf: segments whose orientations by inertial sensors it takes, from /imu/<segment>/orientation",
 )
+PEOPLE = parameters_from(PeopleParameters)
+"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
+
 ANGLES = (
     Parameter(
         "convention",
@@ -106,9 +116,10 @@ class FilterSettings:
         sensors: for ``graph.SENSORS_INPUT``.
         reference: likewise: whose clock is that of ``world``; the first one where empty.
         world: likewise: the frame of the output.
-        body: the person's id in topics.
+        body: the person's id in topics, of one subject.
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: seconds that a sensor's frame waits at most for an older one.
+        people: whom to filter.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -120,6 +131,7 @@ class FilterSettings:
     body: str = graph.DEFAULT_BODY
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
+    people: PeopleParameters = field(default_factory=PeopleParameters)
 
 
 def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
@@ -133,6 +145,16 @@ def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
         known = ", ".join(SEGMENT_NUMBER)
         raise OrientationError(f"parameter 'orientations': {', '.join(unknown)}: expected some of {known}")
     return {graph.orientation_topic(segment): segment for segment in segments}
+
+
+def people_from(values: Mapping[str, Value]) -> PeopleParameters:
+    """Whom to track, of the values of :data:`PEOPLE`.
+
+    Raises:
+        ParameterError: one of them is out of its range.
+    """
+    given = {item.name: item.check(values[item.name]) for item in PEOPLE}
+    return PeopleParameters(**fields_of(PeopleParameters, given))
 
 
 def filter_table() -> tuple[Parameter, ...]:
@@ -150,6 +172,37 @@ def filter_parameters(name: str, values: Mapping[str, Value]) -> dict[str, Any]:
     return fields_of(parameter_classes()[prefix], values, prefix=prefix)
 
 
+def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[str, AngleStream]:
+    """Joint angles in one convention, of each person who may be tracked, by id.
+
+    Args:
+        convention: one of ``ALL_CONVENTIONS``.
+        body: the id of one subject.
+        people: whom to track.
+
+    Raises:
+        ConventionError: another one.
+    """
+    if people.subject != ALL:
+        return {body: AngleStream(convention)}
+    return {each: AngleStream(convention, _AWAY / NANOSECONDS) for each in graph.bodies(people.people)}
+
+
+def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: bool) -> Iterator[tuple[str, Skeleton]]:
+    """The skeletons of one message, each with the id of its person.
+
+    Args:
+        skeletons: as ``/filtered/skeleton`` has them.
+        ids: of those who may be in it, in the order of their numbers.
+        several: whether ``body`` is the number of a person; else the first skeleton is that of the only one.
+    """
+    for number, body in enumerate(ids, 1):
+        if not several:
+            yield body, skeletons[0]
+            return
+        yield from ((body, skeleton) for skeleton in skeletons if skeleton.body == number)
+
+
 class FilterStage:
     """Feeds a filter and publishes what it makes.
 
@@ -158,6 +211,8 @@ class FilterStage:
         publish: takes a topic, a serialised message and its capture time.
         wanted: whether to make messages of a topic at all; always when None.
         steady: the clock, nanoseconds, by which frames wait; when None, that of ``now_ns``, which may stand still.
+        one_of_several: gets the filtered skeletons instead of ``publish``, of one of several people; frames are of this
+            person alone then, and topics below the person's name.
 
     Attributes:
         by_sensor: it takes sensors' frames, not fused ones.
@@ -176,26 +231,30 @@ class FilterStage:
         publish: Callable[[str, bytes, int], None],
         wanted: Callable[[str], bool] | None = None,
         steady: Callable[[], int] | None = None,
+        one_of_several: Callable[[Skeleton], None] | None = None,
     ) -> None:
         self._filter = make_filter(settings.filter_name, **settings.parameters)
         role = graph.role_of(graph.GraphOptions(filter_name=settings.filter_name, filter_input=settings.input))
         self.by_sensor = role.input == graph.SENSORS_INPUT
         self.alignment: SensorAlignment | None = None
+        self.people: People | None = None
         if self.by_sensor:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
+            if one_of_several is None:
+                self.people = People(settings.sensors, settings.people, self.alignment.reference)
         self._steady = steady
         self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
-        self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
         self._prediction = Prediction(settings.predict_after)
         self._lengths = LengthChanges()
-        self._segments_topic = graph.segments_topic(settings.body)
-        self._urdf_topic = graph.urdf_topic(settings.body)
+        self._topics = graph.model_topics(settings.body, one_of_several is not None)
         self._body = settings.body
         self._publish = publish
+        self._skeleton = one_of_several or self._publish_skeleton
         self._wanted = wanted if wanted is not None else lambda topic: True
         self._predicted = 0
+        self._present = False
         self._received = dict.fromkeys(settings.sensors, 0)
 
     @property
@@ -206,32 +265,57 @@ class FilterStage:
             counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
             counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
             counters |= {f"waited {name}": count for name, count in self._ordering.counters.items()}
+        if self.people is not None:
+            counters |= {f"association {name}": count for name, count in self.people.counters.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
         return counters
 
     def set_pose(self, pose: SensorPose) -> None:
         """A sensor's pose, in force from its time on."""
+        if self.people is not None:
+            self.people.set_pose(pose)
         if self.alignment is not None:
             self.alignment.set_pose(pose)
 
     def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
         """A sensor's clock, in force from a reference time on."""
+        if self.people is not None:
+            self.people.set_clock(sensor, valid_from_ns, clock)
         if self.alignment is not None:
             self.alignment.set_clock(sensor, valid_from_ns, clock)
 
-    def on_fused(self, skeleton: Skeleton, now_ns: int) -> None:
+    def inherit(self, before: FilterStage | PeopleStage) -> None:
+        """Take over what is known of the sensors from the stage that was there before: latched poses come once."""
+        if self.by_sensor and before.by_sensor and isinstance(before, FilterStage):
+            self.alignment, self.people = before.alignment, before.people
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """What it publishes, and of which type."""
+        topics = {graph.FILTERED: POINT_CLOUD}
+        return topics | self._topics.types() if self.models else topics
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """The ids of the people who are there."""
+        there = self._present if self.people is None else bool(self.people.tracked)
+        return (self._body,) if there else ()
+
+    def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """One fused frame.
 
         Args:
-            skeleton: in world.
+            skeletons: in world; with one subject the first of them counts.
             now_ns: when it arrived, in a clock that goes on.
         """
         self.poll(now_ns)
+        skeleton = skeletons[0]
+        self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
         elif (filtered := self._filter.update(skeleton)) is not None:
-            self._publish(graph.FILTERED, encode_skeletons([filtered]), filtered.stamp_ns)
+            self._skeleton(filtered)
 
     def on_sensor(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """One frame of one sensor.
@@ -261,8 +345,13 @@ class FilterStage:
     def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
         """The person in ``world``; None where the sensor is not calibrated, or shows nobody."""
         self._received[sensor] += 1
-        subject = self._subjects[sensor].pick(skeletons)
-        return None if subject is None or self.alignment is None else self.alignment.push(sensor, subject)
+        if self.people is None:
+            subject = skeletons[0]
+        elif found := self.people.sort(sensor, skeletons):
+            ((_, subject),) = found
+        else:
+            return None
+        return None if self.alignment is None else self.alignment.push(sensor, subject)
 
     def _waiting_ns(self, now_ns: int) -> int:
         """The time in the clock by which frames wait."""
@@ -321,10 +410,13 @@ class FilterStage:
         self._ordering.flush()
         self._prediction.stop()
         self._lengths.reset()
+        self._present = False
 
-    def sensor_jumped_back(self, sensor: str) -> None:
-        """Forget who was picked of a sensor; the alignment finds out by itself."""
-        self._subjects[sensor].reset()
+    def forget(self) -> None:
+        """Forget the person, because the next frames are of somebody else."""
+        self.reset()
+        if self.alignment is not None:
+            self.alignment.forget()
 
     def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
         """Filter frames, and publish what is known after each that does not come after newer ones."""
@@ -340,7 +432,10 @@ class FilterStage:
                 from body_tracking.kinematics.urdf import urdf
 
                 text = urdf(self._model_filter.model, estimate.lengths, self._body)
-                self._publish(self._urdf_topic, encode_string(text), estimate.stamp_ns)
+                self._publish(self._topics.urdf, encode_string(text), estimate.stamp_ns)
+
+    def _publish_skeleton(self, skeleton: Skeleton) -> None:
+        self._publish(graph.FILTERED, encode_skeletons([skeleton]), skeleton.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
         """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""
@@ -349,16 +444,176 @@ class FilterStage:
         if self._wanted(graph.FILTERED):
             skeleton = skeleton or self._model_filter.filtered
             assert skeleton is not None
-            self._publish(graph.FILTERED, encode_skeletons([skeleton]), stamp_ns)
-        state_wanted, stddev_wanted = self._wanted(graph.MODEL_STATE), self._wanted(graph.MODEL_STATE_STDDEV)
+            self._skeleton(skeleton)
+        topics = self._topics
+        state_wanted, stddev_wanted = self._wanted(topics.state), self._wanted(topics.stddev)
         if state_wanted or stddev_wanted:
             state, stddev = encode_model_state(estimate, model)
             if state_wanted:
-                self._publish(graph.MODEL_STATE, state, stamp_ns)
+                self._publish(topics.state, state, stamp_ns)
             if stddev_wanted:
-                self._publish(graph.MODEL_STATE_STDDEV, stddev, stamp_ns)
-        if self._wanted(graph.MODEL_COVARIANCE):
-            self._publish(graph.MODEL_COVARIANCE, encode_covariance(estimate), stamp_ns)
-        if self._wanted(self._segments_topic):
+                self._publish(topics.stddev, stddev, stamp_ns)
+        if self._wanted(topics.covariance):
+            self._publish(topics.covariance, encode_covariance(estimate), stamp_ns)
+        if self._wanted(topics.segments):
             placed = segment_poses(estimate, model)
-            self._publish(self._segments_topic, encode_segments(estimate, model.segment_names, *placed), stamp_ns)
+            self._publish(topics.segments, encode_segments(estimate, model.segment_names, *placed), stamp_ns)
+
+
+class PeopleStage:
+    """A :class:`FilterStage` of each person; each gives what it would give if there were nobody else.
+
+    Arguments and errors as there.
+
+    Attributes:
+        by_sensor: as there.
+        models: as there.
+    """
+
+    def __init__(
+        self,
+        settings: FilterSettings,
+        publish: Callable[[str, bytes, int], None],
+        wanted: Callable[[str], bool] | None = None,
+        steady: Callable[[], int] | None = None,
+    ) -> None:
+        ids = graph.bodies(settings.people.people)
+        self._stages = [FilterStage(replace(settings, body=body), publish, wanted, steady, self._told) for body in ids]
+        first = self._stages[0]
+        self.by_sensor, self.models = first.by_sensor, first.models
+        self._ids = ids
+        self._publish = publish
+        self._filtered: list[Skeleton] = []
+        self._last_ns: dict[int, int] = {}
+        self._wearer = HeldSubject(settings.people.hold)
+        self.people: People | None = None
+        if first.alignment is not None:
+            self.people = People(settings.sensors, settings.people, first.alignment.reference, self._gone)
+
+    def inherit(self, before: FilterStage | PeopleStage) -> None:
+        """Take over what is known of the sensors from the stage that was there before: latched poses come once."""
+        if isinstance(before, PeopleStage) and self.people is not None and before.people is not None:
+            self.people, self.people.gone = before.people, self._gone
+            for stage, former in zip(self._stages, before._stages, strict=True):
+                stage.inherit(former)
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """What it publishes, and of which type."""
+        return {topic: kind for stage in self._stages for topic, kind in stage.topics.items()}
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """The ids of the people who are there."""
+        if self.people is not None:
+            return tuple(self._ids[number - 1] for number in self.people.tracked)
+        return tuple(body for stage in self._stages for body in stage.tracked)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What happened since the construction, to all together."""
+        total: Counter[str] = Counter()
+        for stage in self._stages:
+            total.update(stage.counters)
+        if self.people is not None:
+            total.update({f"association {name}": count for name, count in self.people.counters.items()})
+        return dict(total)
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """A sensor's pose, in force from its time on."""
+        if self.people is not None:
+            self.people.set_pose(pose)
+        for stage in self._stages:
+            stage.set_pose(pose)
+
+    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
+        """A sensor's clock, in force from a reference time on."""
+        if self.people is not None:
+            self.people.set_clock(sensor, valid_from_ns, clock)
+        for stage in self._stages:
+            stage.set_clock(sensor, valid_from_ns, clock)
+
+    def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """One fused frame.
+
+        Args:
+            skeletons: in world, each with the person's number; others than those that there are do not count.
+            now_ns: when it arrived, in a clock that goes on.
+        """
+        self._wearer.pick(skeletons)
+        stamp_ns = skeletons[0].stamp_ns
+        for number, last_ns in list(self._last_ns.items()):
+            if stamp_ns - last_ns > _AWAY:  # somebody else may have the number now
+                self._gone(number)
+        for skeleton in skeletons:
+            if 1 <= skeleton.body <= len(self._stages):
+                self._last_ns[skeleton.body] = stamp_ns
+                self._stages[skeleton.body - 1].on_fused([skeleton], now_ns)
+        self.poll(now_ns)
+
+    def on_sensor(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """One frame of one sensor, with all bodies in it; arguments as of :meth:`FilterStage.on_sensor`."""
+        assert self.people is not None
+        for number, body in self.people.sort(sensor, skeletons):
+            self._stages[number - 1].on_sensor(sensor, [replace(body, body=number)], now_ns)
+        self.poll(now_ns)
+
+    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """The same for one of several frames that are here; see :meth:`FilterStage.hold`."""
+        assert self.people is not None
+        for number, body in self.people.sort(sensor, skeletons):
+            self._stages[number - 1].hold(sensor, [replace(body, body=number)], now_ns)
+
+    def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
+        """The orientation of one segment of the one who wears the sensors: who is nearest to the reference sensor."""
+        wearer = self._wearer.body if self.people is None else self.people.nearest
+        if wearer is not None and wearer <= len(self._stages):
+            self._stages[wearer - 1].on_orientation(measurement, now_ns)
+            self._flush()
+
+    def poll(self, now_ns: int) -> None:
+        """Take the frames that have waited long enough, and publish the predicted ones that are due."""
+        for stage in self._stages:
+            stage.poll(now_ns)
+        self._flush()
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """As of :class:`FilterStage`, of whoever comes first."""
+        return min((at for stage in self._stages if (at := stage.deadline_ns) is not None), default=None)
+
+    @property
+    def due_ns(self) -> int | None:
+        """As of :class:`FilterStage`, of whoever comes first."""
+        return min((at for stage in self._stages if (at := stage.due_ns) is not None), default=None)
+
+    def reset(self) -> None:
+        """Forget everybody, because time jumped back; poses and clocks stay."""
+        self._last_ns.clear()
+        for stage in self._stages:
+            stage.reset()
+
+    def _gone(self, number: int) -> None:
+        self._last_ns.pop(number, None)
+        self._stages[number - 1].forget()
+
+    def _told(self, skeleton: Skeleton) -> None:
+        self._filtered.append(skeleton)
+
+    def _flush(self) -> None:
+        """Publish the skeletons of one time together."""
+        filtered, self._filtered = self._filtered, []
+        filtered.sort(key=lambda each: (each.stamp_ns, each.body))
+        for stamp_ns, together in groupby(filtered, key=lambda each: each.stamp_ns):
+            self._publish(graph.FILTERED, encode_skeletons(list(together)), stamp_ns)
+
+
+def make_stage(
+    settings: FilterSettings,
+    publish: Callable[[str, bytes, int], None],
+    wanted: Callable[[str], bool] | None = None,
+    steady: Callable[[], int] | None = None,
+) -> FilterStage | PeopleStage:
+    """The stage that the settings ask for; arguments and errors as of :class:`FilterStage`."""
+    stage = PeopleStage if settings.people.subject == ALL else FilterStage
+    return stage(settings, publish, wanted, steady)

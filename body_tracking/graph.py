@@ -6,6 +6,7 @@ Knows no ROS library.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -15,12 +16,15 @@ from typing import Any, Final
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.fusion.subject import ALL, MAX_PEOPLE, SUBJECTS
 from body_tracking.messages import (
     CLOCK,
     DIAGNOSTICS,
     IMAGE,
     IMU,
     JOINT_STATE,
+    JOINT_TRAJECTORY,
+    MARKERS,
     POINT_CLOUD,
     SEGMENTS,
     STRING,
@@ -46,6 +50,7 @@ FILTERED = "/filtered/skeleton"
 MODEL_STATE = "/filtered/model_state"
 MODEL_STATE_STDDEV = f"{MODEL_STATE}_stddev"
 MODEL_COVARIANCE = "/filtered/model_covariance"
+TRACKED = "/humans/bodies/tracked"
 IMU_SKELETON = "/imu/skeleton"
 TRUE_SKELETON = "/ground_truth/skeleton"
 TRUE_MODEL_STATE = "/ground_truth/model_state"
@@ -54,6 +59,7 @@ TRUE_CALIBRATION = "/ground_truth/calibration"
 TRUE_CLOCK = f"{TRUE_CALIBRATION}/clock"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 CLOCK_TOPIC = "/clock"
+TF = "/tf"
 TF_STATIC = "/tf_static"
 START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
@@ -76,6 +82,11 @@ def skeleton_topic(sensor: str) -> str:
 def orientation_topic(segment: str) -> str:
     """Where the orientation of a segment by its inertial sensor is published."""
     return f"/imu/{segment}/orientation"
+
+
+def is_orientation_topic(topic: str) -> bool:
+    """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
+    return topic == orientation_topic(topic.removeprefix("/imu/").removesuffix("/orientation"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +159,17 @@ def joint_states_stddev_topic(body: str) -> str:
     return f"{joint_states_topic(body)}_stddev"
 
 
+def bodies_among(topics: Iterable[str]) -> tuple[str, ...]:
+    """The persons whose joint angles are among these topics, by name."""
+    found = (re.fullmatch(r"/humans/bodies/([A-Za-z]\w*)/joint_states", topic) for topic in topics)
+    return tuple(sorted(match[1] for match in found if match))
+
+
+def markers_topic(body: str) -> str:
+    """Where a person's markers for RViz and Foxglove are published."""
+    return f"/humans/bodies/{body}/markers"
+
+
 def urdf_topic(body: str) -> str:
     """Where the model of a person with measured segment lengths is published."""
     return f"/humans/bodies/{body}/urdf"
@@ -156,6 +178,44 @@ def urdf_topic(body: str) -> str:
 def segments_topic(body: str) -> str:
     """Where the poses of a person's segments are published."""
     return f"/humans/bodies/{body}/segments"
+
+
+@dataclass(frozen=True, slots=True)
+class ModelTopics:
+    """Where the filter publishes the model of a person.
+
+    Attributes:
+        state: coordinates and rates.
+        stddev: their standard deviations.
+        covariance: the whole of it.
+        segments: poses.
+        urdf: the model with the person's lengths.
+    """
+
+    state: str
+    stddev: str
+    covariance: str
+    segments: str
+    urdf: str
+
+    def types(self) -> dict[str, str]:
+        """The type of each."""
+        topics = (self.state, self.stddev, self.covariance, self.segments, self.urdf)
+        return dict(zip(topics, (JOINT_STATE, JOINT_STATE, IMAGE, SEGMENTS, STRING), strict=True))
+
+
+def model_topics(body: str, several: bool = False) -> ModelTopics:
+    """The topics of a person's model; those of the only subject are not below the person's name, where they can."""
+    own = segments_topic(body), urdf_topic(body)
+    if not several:
+        return ModelTopics(MODEL_STATE, MODEL_STATE_STDDEV, MODEL_COVARIANCE, *own)
+    state = f"/humans/bodies/{body}/model_state"
+    return ModelTopics(state, f"{state}_stddev", f"/humans/bodies/{body}/model_covariance", *own)
+
+
+def bodies(count: int) -> tuple[str, ...]:
+    """The ids of several people, by their numbers from 1 on."""
+    return tuple(f"body{number}" for number in range(1, count + 1))
 
 
 URDF_QOS = Qos(durability="transient_local", depth=1)
@@ -294,7 +354,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         POINT_CLOUD,
         SKELETON,
         "fusion",
-        "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`",
+        "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`; with "
+        "`subject: all` everybody, with the person's number in `body`",
     ),
     TopicSpec(
         FILTERED,
@@ -328,6 +389,21 @@ TOPICS: tuple[TopicSpec, ...] = (
         "with the stamp of the state",
     ),
     TopicSpec(
+        model_topics("<id>", several=True).state,
+        JOINT_STATE,
+        SKELETON,
+        "skeleton_filter",
+        "`ekf`, of each of several people (`subject: all`) what `/filtered/model_state` is of one; so are "
+        "`.../model_state_stddev` and `.../model_covariance`",
+    ),
+    TopicSpec(
+        TRACKED,
+        "hri_msgs/msg/IdsList",
+        RELIABLE,
+        "skeleton_filter",
+        "the ids of the people who are tracked (REP-155), where hri_msgs is installed",
+    ),
+    TopicSpec(
         segments_topic("<id>"),
         SEGMENTS,
         RELIABLE,
@@ -357,6 +433,29 @@ TOPICS: tuple[TopicSpec, ...] = (
         "the standard deviation of each, same names and order; infinity where nothing observes the angle",
     ),
     TopicSpec(
+        "<topic of the mapping>",
+        JOINT_TRAJECTORY,
+        RELIABLE,
+        "robot_commands",
+        "one point for the robot's joints; or `std_msgs/Float64MultiArray`, as the mapping file says; silent while "
+        "stopped",
+    ),
+    TopicSpec(
+        markers_topic("<id>"),
+        MARKERS,
+        RELIABLE,
+        "body_markers",
+        "what the sensors see, the fused and the filtered skeleton, 95 % ellipsoids of its joints, and the sensors, in "
+        "`world`",
+    ),
+    TopicSpec(
+        TF,
+        "tf2_msgs/msg/TFMessage",
+        RELIABLE,
+        "body_markers",
+        "`ekf`: the pose of each segment in `world`, named as the links of the URDF, where tf2_msgs is installed",
+    ),
+    TopicSpec(
         DIAGNOSTICS_TOPIC,
         DIAGNOSTICS,
         RELIABLE,
@@ -365,7 +464,8 @@ TOPICS: tuple[TopicSpec, ...] = (
     ),
     TopicSpec(CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),
 )
-"""Every topic of the graph; ``TF_STATIC`` only where ``tf2_msgs`` is installed."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, and ``TRACKED`` only where
+``hri_msgs`` is."""
 
 SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
@@ -381,13 +481,17 @@ SERVICES: tuple[tuple[str, str, str], ...] = (
 
 EXECUTABLES: tuple[str, ...] = (
     "kinect_skeleton",
+    "skeleton_adapter",
     "imu_skeleton",
     "calibration",
     "fusion",
     "skeleton_filter",
     "joint_angles",
+    "robot_commands",
     "bag_player",
     "bag_recorder",
+    "body_markers",
+    "viewer",
 )
 
 
@@ -446,6 +550,13 @@ class GraphOptions:
         reliable: transport every skeleton reliably.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         imu_topics: of the bag, those that are played for these.
+        subject: overrides the parameters file; empty for not: whom to track.
+        people: likewise, 0 for not: how many at most.
+        robot: mapping file of a robot that follows; empty for none.
+        external: live, somebody else publishes the sensors' skeletons.
+        adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
+        viewer: show it on a live page, with a recorder that waits for its button where nothing is recorded anyway.
+        markers: publish markers for RViz and Foxglove.
     """
 
     sensors: tuple[str, ...] = DEFAULT_SENSORS
@@ -460,6 +571,18 @@ class GraphOptions:
     reliable: bool = False
     imus: tuple[str, ...] = ()
     imu_topics: tuple[str, ...] = ()
+    subject: str = ""
+    people: int = 0
+    robot: str = ""
+    external: bool = False
+    adapted: tuple[str, ...] = ()
+    viewer: bool = False
+    markers: bool = False
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The ids of those who may be tracked, of several people; empty with one subject."""
+        return bodies(self.people or MAX_PEOPLE) if self.subject == ALL else ()
 
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
@@ -482,38 +605,71 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     asked = {"filter": options.filter_name, "input": options.filter_input}
     chosen: dict[str, Value] = {name: value for name, value in asked.items() if value}
     angles: dict[str, Value] = {"convention": role.convention, "input": role.angles_input}
+    asked_of_people: dict[str, Value] = {"subject": options.subject, "people": options.people}
+    people = {name: value for name, value in asked_of_people.items() if value}
+    subject: dict[str, Value] = {"subject": options.subject} if options.subject else {}
     worn = imu_topics(options.imus)
     orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
     specs = [
-        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles}),
-        NodeSpec("skeleton_filter", "skeleton_filter", defaults=orientations, parameters={**several, **chosen}),
-        NodeSpec("fusion", "fusion", parameters=several),
+        NodeSpec("joint_angles", "joint_angles", parameters={**common, **skeletons, **angles, **people}),
+        NodeSpec(
+            "skeleton_filter", "skeleton_filter", defaults=orientations, parameters={**several, **chosen, **people}
+        ),
+        NodeSpec("fusion", "fusion", parameters={**several, **people}),
         NodeSpec("calibration", "calibration", parameters={**several, **calibration}),
     ]
     if worn:
-        specs.append(NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **several}))
+        specs.append(
+            NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **several, **subject})
+        )
+    if options.robot:
+        specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))
     if options.record:
         specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
+    elif options.viewer:
+        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **common}))
+    # These listen to every skeleton.
+    watchers = [name for name, wanted in (("body_markers", options.markers), ("viewer", options.viewer)) if wanted]
+    specs += [NodeSpec(name, name, parameters={"sensors": sensors, **common}) for name in watchers]
     recorders = int(bool(options.record))
     # Besides the next node and the recorder nobody is waited for; inertial sensors take their world from the fusion.
-    to_filter = {FUSED: int(role.input == FUSED_INPUT) + int(bool(worn))}
-    to_angles = {FILTERED: 1} if role.angles_input == SKELETON_INPUT else {MODEL_STATE: 1, MODEL_COVARIANCE: 1}
+    to_filter = {FUSED: len(watchers) + int(role.input == FUSED_INPUT) + int(bool(worn))}
+    models = [model_topics(body, several=True) for body in options.bodies] or [model_topics(DEFAULT_BODY)]
+    states = {topic: 1 for each in models for topic in (each.state, each.covariance)}
+    to_angles = {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else states
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
     if options.bag:
-        # Calibration, fusion and, maybe, the filter and the recorder.
-        listeners = 2 + int(role.input == SENSORS_INPUT) + recorders
+        # Calibration, fusion and, maybe, the filter, the robot's commands, the recorder and those who show.
+        others = int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders + len(watchers)
+        listeners = 2 + others
         specs.append(_player(options, sensors, listeners, after))
-    else:
+    elif not options.external:
+        adapted = _adapted(options.adapted, sensors)
         specs += [
             NodeSpec(
                 f"{sensor}_skeleton",
-                "kinect_skeleton",
-                parameters={"sensor": sensor, **common, **skeletons},
+                "skeleton_adapter" if sensor in adapted else "kinect_skeleton",
+                parameters={"sensor": sensor, **adapted.get(sensor, {}), **common, **skeletons},
                 after=after,
             )
             for sensor in sensors
         ]
     return tuple(specs)
+
+
+def _adapted(entries: Iterable[str], sensors: Collection[str]) -> dict[str, dict[str, Value]]:
+    """Of each sensor that another driver's topic is adapted for, the adapter's parameters.
+
+    Raises:
+        GraphError: a sensor that is none of the graph's.
+    """
+    found: dict[str, dict[str, Value]] = {}
+    for entry in entries:
+        sensor, _, topic = entry.partition(":")
+        if sensor not in sensors:
+            raise GraphError(f"adapted sensor {sensor!r} is none of {', '.join(sensors)}")
+        found[sensor] = {"topic": topic} if topic else {}
+    return found
 
 
 def role_of(options: GraphOptions) -> FilterRole:
@@ -535,6 +691,27 @@ def role_of(options: GraphOptions) -> FilterRole:
     return role
 
 
+def convention_of_robot(mapping: Path, asked: str) -> str:
+    """The convention whose angles a robot's mapping file is about.
+
+    Args:
+        mapping: the file.
+        asked: the convention that somebody asks for; empty or ``AUTO`` for any.
+
+    Raises:
+        MappingError: the file is none.
+        GraphError: another convention is asked for.
+    """
+    # only who drives a robot pays for these
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+    from body_tracking.robot.mapping import load
+
+    found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention
+    if asked not in ("", AUTO, found):
+        raise GraphError(f"convention {asked}: {mapping} is about angles of the convention {found}")
+    return found
+
+
 def angles_for(convention: str, source: str) -> tuple[str, str]:
     """The convention and the input of ``joint_angles`` by its parameters; what is not said is as the default filter's.
 
@@ -554,10 +731,13 @@ _FROM_FILE: Final = (
     ("filter_input", "skeleton_filter", "input"),
     ("convention", "joint_angles", "convention"),
     ("angles_input", "joint_angles", "input"),
+    ("subject", "skeleton_filter", "subject"),
 )
 """(option, node, parameter) by which the nodes must know of each other, whoever says it."""
 _IMUS_FROM_FILE: Final = ("imus", "imu_skeleton", "segments")
 """The same, of a list."""
+_PEOPLE_FROM_FILE: Final = ("people", "skeleton_filter", "people")
+"""The same, of a number."""
 
 
 def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
@@ -578,14 +758,37 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
         listed = values.get(parameter)
         if isinstance(listed, list) and not getattr(options, option) and matches(pattern, f"/{node}"):
             found[option] = tuple(entry for entry in listed if isinstance(entry, str) and entry)
+        option, node, parameter = _PEOPLE_FROM_FILE
+        count = values.get(parameter)
+        if type(count) is int and not getattr(options, option) and matches(pattern, f"/{node}"):
+            found[option] = count
     return replace(options, **found)
 
 
 def all_nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag, a recorder and inertial sensors."""
-    more = replace(options, record="recording", imus=options.imus or SOME_IMUS)
+    """The nodes of a graph, and those that it would have live, with a bag and with everything that may be added."""
+    more = replace(
+        options,
+        record="recording",
+        imus=options.imus or SOME_IMUS,
+        robot=options.robot or "robot.yaml",
+        viewer=True,
+        markers=True,
+    )
     variants = [options] + [replace(more, bag=bag) for bag in ("", options.bag or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
+
+
+def add_people(command: argparse.ArgumentParser) -> None:
+    """The options of a command that say whom to track."""
+    command.add_argument(
+        "--subject",
+        choices=SUBJECTS,
+        help="whom to track: one, who is the nearest or is seen first, or all (default: nearest)",
+    )
+    command.add_argument(
+        "--people", type=int, default=0, metavar="N", help=f"with --subject all: how many at most ({MAX_PEOPLE})"
+    )
 
 
 CONFIG_HEADER = """\
@@ -601,7 +804,9 @@ def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
     sections = {}
     for spec in sorted(all_nodes_for(GraphOptions()), key=lambda spec: EXECUTABLES.index(spec.executable)):
-        shown = {parameter for _, node, parameter in (*_FROM_FILE, _IMUS_FROM_FILE) if node == spec.name}
+        shown = {
+            parameter for _, node, parameter in (*_FROM_FILE, _IMUS_FROM_FILE, _PEOPLE_FROM_FILE) if node == spec.name
+        }
         hidden = spec.parameters.keys() - shown
         sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
     return f"{CONFIG_HEADER}\n{as_yaml(sections)}"

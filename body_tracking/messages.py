@@ -25,6 +25,8 @@ from body_tracking.kinematics.model import BodyModel
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample, check_magnetic_field
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+from body_tracking.viewing.colours import Colour
+from body_tracking.viewing.shapes import Ellipsoids, Figure
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -37,6 +39,10 @@ MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 STRING = "std_msgs/msg/String"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 CLOCK = "rosgraph_msgs/msg/Clock"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+TF = "tf2_msgs/msg/TFMessage"
 
 # sensor_msgs/PointField datatypes
 _UINT8, _UINT16, _FLOAT32 = 2, 4, 7
@@ -256,6 +262,21 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
     )
 
 
+def markers_to_points(message: Any) -> tuple[int, list[int], FloatArray]:
+    """The markers of one ``visualization_msgs/MarkerArray`` that are there to be shown: stamp, ids, (n, 3) positions.
+
+    Raises:
+        MessageError: no such marker, or markers of several times.
+    """
+    shown = [marker for marker in message.markers if marker.action == 0]  # ADD
+    stamps = {to_nanoseconds(marker.header.stamp) for marker in shown}
+    if len(stamps) != 1:
+        raise MessageError(f"{len(shown)} markers of {len(stamps)} times, expected those of one")
+    places = [marker.pose.position for marker in shown]
+    points = np.array([(place.x, place.y, place.z) for place in places])
+    return stamps.pop(), [int(marker.id) for marker in shown], points
+
+
 def _columns(row: Any, names: Sequence[str]) -> FloatArray:
     return np.stack([row[name] for name in names], axis=1).astype(np.float64)
 
@@ -297,6 +318,90 @@ def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types:
         joint_state(angles.position, angles.velocity),
         joint_state(angles.position_stddev, angles.velocity_stddev),
     )
+
+
+def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngles:
+    """The inverse of :func:`angles_to_joint_states`.
+
+    Args:
+        values: ``sensor_msgs/JointState``.
+        deviations: the same, of the same stamp.
+        body: whose they are; the ending ``_<body>`` of their names is left out.
+
+    Raises:
+        MessageError: different names or stamps, a name without that ending, sizes that do not go together.
+    """
+    names, stamp_ns = tuple(values.name), to_nanoseconds(values.header.stamp)
+    if tuple(deviations.name) != names or to_nanoseconds(deviations.header.stamp) != stamp_ns:
+        raise MessageError("joint states and their standard deviations have other names or stamps")
+    other = next((name for name in names if not name.endswith(f"_{body}")), None)
+    if other is not None:
+        raise MessageError(f"name {other!r} does not end in _{body}")
+    columns = [
+        np.array(numbers, dtype=np.float64)
+        for message in (values, deviations)
+        for numbers in (message.position, message.velocity)
+    ]
+    if any(len(column) != len(names) for column in columns):
+        raise MessageError(f"{', '.join(str(len(column)) for column in columns)} numbers of {len(names)} names")
+    position, velocity, position_stddev, velocity_stddev = columns
+    short = tuple(name.removesuffix(f"_{body}") for name in names)
+    return JointAngles(stamp_ns, short, position, velocity, position_stddev, velocity_stddev)
+
+
+# --- commands to robots
+
+
+def command_to_trajectory(
+    joints: Sequence[str], position: FloatArray, stamp_ns: int, from_start: float, types: MessageTypes
+) -> Any:
+    """``trajectory_msgs/JointTrajectory`` with one point, for ``joint_trajectory_controller``.
+
+    Without velocities, for that controller refuses a trajectory that ends in motion (its parameter
+    ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
+
+    Args:
+        joints: n names.
+        position: (n,) radians.
+        stamp_ns: when the trajectory starts; 0 for when it arrives.
+        from_start: seconds from then to the point.
+        types: the family of message classes to build.
+    """
+    sec, nanosec = divmod(round(from_start * NANOSECONDS), NANOSECONDS)
+    none = types.floats(np.empty(0))
+    return types.make(
+        JOINT_TRAJECTORY,
+        header=to_header(stamp_ns, "", types),
+        joint_names=list(joints),
+        points=[
+            types.make(
+                "trajectory_msgs/msg/JointTrajectoryPoint",
+                positions=types.floats(position),
+                velocities=none,
+                accelerations=none,
+                effort=none,
+                time_from_start=types.make("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
+            )
+        ],
+    )
+
+
+def command_to_array(position: FloatArray, types: MessageTypes) -> Any:
+    """``std_msgs/Float64MultiArray`` of (n,) radians in the controller's order, for ``forward_command_controller``."""
+    layout = types.make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    return types.make(FLOAT_ARRAY, layout=layout, data=types.floats(position))
+
+
+def joint_state_values(message: Any) -> tuple[int, tuple[str, ...], FloatArray]:
+    """Stamp in nanoseconds, n names and (n,) positions of a ``sensor_msgs/JointState``.
+
+    Raises:
+        MessageError: another number of positions than of names.
+    """
+    names, values = tuple(message.name), np.array(message.position, dtype=np.float64)
+    if len(values) != len(names):
+        raise MessageError(f"{len(values)} positions for {len(names)} names")
+    return to_nanoseconds(message.header.stamp), names, values
 
 
 # --- the state of a body model
@@ -470,6 +575,31 @@ def segments_to_joint_state(
         twist=[],
         wrench=[],
     )
+
+
+def joint_state_to_segments(message: Any) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """The inverse of :func:`segments_to_joint_state`.
+
+    Returns:
+        Names of s segments, (s, 3) origins in metres, (s, 4) unit quaternions xyzw.
+
+    Raises:
+        MessageError: another number of transforms than of names, or numbers that are no pose.
+    """
+    names = tuple(message.joint_names)
+    if len(message.transforms) != len(names):
+        raise MessageError(f"{len(message.transforms)} transforms for {len(names)} segments")
+    rows = np.array(
+        [
+            (t.translation.x, t.translation.y, t.translation.z, t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w)
+            for t in message.transforms
+        ]
+    ).reshape(-1, 7)
+    lengths = np.linalg.norm(rows[:, 3:], axis=1)
+    unsound = ~np.isfinite(rows).all(axis=1) | (np.abs(lengths - 1.0) > 1e-3)
+    if unsound.any():
+        raise MessageError(f"the pose of {names[int(unsound.argmax())]} is {rows[int(unsound.argmax())]}")
+    return names, rows[:, :3], rows[:, 3:] / lengths[:, None]
 
 
 # --- inertial sensors
@@ -735,3 +865,134 @@ def diagnostics(
         values=[types.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()],
     )
     return types.make(DIAGNOSTICS, header=to_header(stamp_ns, "", types), status=[status])
+
+
+# --- markers
+
+# visualization_msgs/Marker types
+_SPHERE, _LINE_LIST, _SPHERE_LIST, _TEXT = 2, 5, 7, 9
+MARKER_LIFETIME_NS = NANOSECONDS // 2
+"""Markers vanish by themselves when nobody sends them anew for so long."""
+
+
+class Markers:
+    """The markers of one message, in one frame at one time.
+
+    Args:
+        stamp_ns: of all of them; 0 for whatever is the latest transform.
+        frame_id: of all of them.
+        types: the family of message classes to build.
+    """
+
+    def __init__(self, stamp_ns: int, frame_id: str, types: MessageTypes) -> None:
+        self._types = types
+        self._header = to_header(stamp_ns, frame_id, types)
+        self._markers: list[Any] = []
+
+    def figure(self, name: str, shape: Figure, colour: Colour, radius: float, thickness: float) -> None:
+        """Skeletons: joints as balls in their colours, bones as lines of one colour."""
+        types = self._types
+        colours = [self._colour(rgb) for rgb in shape.joint_colours.tolist()]
+        points, ends = self._points(shape.joints), self._points(shape.bones.reshape(-1, 3))
+        size = types.make("geometry_msgs/msg/Vector3", x=2 * radius, y=2 * radius, z=2 * radius)
+        self._add(f"{name}/joints", 0, _SPHERE_LIST, size, self._colour(colour), points=points, colors=colours)
+        width = types.make("geometry_msgs/msg/Vector3", x=thickness, y=0.0, z=0.0)
+        self._add(f"{name}/bones", 0, _LINE_LIST, width, self._colour(colour), points=ends)
+
+    def ellipsoids(self, name: str, shape: Ellipsoids, colour: Colour, opacity: float) -> None:
+        """Each an ellipsoid of its own."""
+        quats = so3.matrix_to_quat(shape.rotations)
+        for number, (centre, quat, radii) in enumerate(zip(shape.centres, quats, shape.radii, strict=True)):
+            size = _vector(2.0 * np.maximum(radii, 1e-4), self._types)
+            self._add(name, number, _SPHERE, size, self._colour(colour, opacity), self._pose(centre, quat))
+
+    def lines(self, name: str, number: int, ends: FloatArray, pose: SensorPose, colour: Colour) -> None:
+        """(n, 2, 3) lines in a sensor's own frame, and its name."""
+        width = self._types.make("geometry_msgs/msg/Vector3", x=0.008, y=0.0, z=0.0)
+        placed = self._pose(pose.translation, pose.quat_xyzw)
+        self._add(
+            name, number, _LINE_LIST, width, self._colour(colour), placed, points=self._points(ends.reshape(-1, 3))
+        )
+        above = self._pose(pose.translation + np.array([0.0, 0.0, 0.12]), np.array([0.0, 0.0, 0.0, 1.0]))
+        height = self._types.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.08)
+        self._add(f"{name}/names", number, _TEXT, height, self._colour(colour), above, text=pose.sensor)
+
+    def message(self) -> Any:
+        """``visualization_msgs/MarkerArray``."""
+        return self._types.make(MARKERS, markers=self._markers)
+
+    def _add(
+        self,
+        name: str,
+        number: int,
+        kind: int,
+        scale: Any,
+        colour: Any,
+        pose: Any = None,
+        points: Sequence[Any] = (),
+        colors: Sequence[Any] = (),
+        text: str = "",
+    ) -> None:
+        types = self._types
+        lifetime = types.make("builtin_interfaces/msg/Duration", sec=0, nanosec=MARKER_LIFETIME_NS)
+        self._markers.append(
+            types.make(
+                "visualization_msgs/msg/Marker",
+                header=self._header,
+                ns=name,
+                id=number,
+                type=kind,
+                action=0,
+                pose=self._pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) if pose is None else pose,
+                scale=scale,
+                color=colour,
+                lifetime=lifetime,
+                frame_locked=False,
+                points=list(points),
+                colors=list(colors),
+                texture_resource="",
+                texture=types.make(
+                    "sensor_msgs/msg/CompressedImage", header=self._header, format="", data=types.octets(b"")
+                ),
+                uv_coordinates=[],
+                text=text,
+                mesh_resource="",
+                mesh_file=types.make("visualization_msgs/msg/MeshFile", filename="", data=types.octets(b"")),
+                mesh_use_embedded_materials=False,
+            )
+        )
+
+    def _points(self, points: FloatArray) -> list[Any]:
+        return [self._types.make("geometry_msgs/msg/Point", x=x, y=y, z=z) for x, y, z in points.tolist()]
+
+    def _colour(self, rgb: Sequence[int], opacity: float = 1.0) -> Any:
+        r, g, b = (value / 255.0 for value in rgb)
+        return self._types.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=opacity)
+
+    def _pose(self, position: FloatArray, quat_xyzw: FloatArray) -> Any:
+        x, y, z = position.tolist()
+        qx, qy, qz, qw = quat_xyzw.tolist()
+        return self._types.make(
+            "geometry_msgs/msg/Pose",
+            position=self._types.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=self._types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+
+
+def segments_to_transforms(message: Any, body: str, segments: Sequence[str], types: MessageTypes) -> Any:
+    """``tf2_msgs/TFMessage`` that places a person's segments.
+
+    Args:
+        message: ``sensor_msgs/MultiDOFJointState`` of :func:`segments_to_joint_state`.
+        body: the id of the person; frames are named ``<segment>_<body>``, as the links of the person's URDF.
+        segments: those to place; the others are left out.
+        types: the family of message classes to build.
+    """
+    return types.make(
+        TF,
+        transforms=[
+            types.make(TRANSFORM, header=message.header, child_frame_id=f"{name}_{body}", transform=transform)
+            for name, transform in zip(message.joint_names, message.transforms, strict=True)
+            if name in segments
+        ],
+    )

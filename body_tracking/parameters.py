@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import yaml
@@ -41,6 +42,7 @@ class Parameter:
         max: the greatest value, of a number.
         choices: the allowed values, of a string; empty for any.
         live: whether it may change while the node runs.
+        fixed: why it may not, where there is more to it than that it is read at the start.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Parameter:
     max: float | None = None
     choices: tuple[str, ...] = ()
     live: bool = False
+    fixed: str = ""
 
     @property
     def type_name(self) -> str:
@@ -88,6 +91,21 @@ class Parameter:
             raise ParameterError(f"parameter {self.name!r}: {value!r}, expected one of {self.constraint}")
         return checked
 
+    def check_change(self, value: object) -> Value:
+        """As :meth:`check`, of a node that runs.
+
+        Raises:
+            ParameterError: not allowed at all, or not while the node runs, with the reason and what to do instead.
+        """
+        checked = self.check(value)
+        if not self.live:
+            why = self.fixed or "it is read at the start"
+            raise ParameterError(
+                f"parameter {self.name!r} cannot change while the node runs: {why}. "
+                f"Start it anew with the value in --params-file, or with -p {self.name}:=VALUE"
+            )
+        return checked
+
     def _typed(self, value: object) -> Value | None:
         if isinstance(self.default, tuple):
             if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
@@ -106,7 +124,9 @@ def number_field(default: float, doc: str, unit: str, low: float, high: float) -
     return result
 
 
-def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: str = "") -> tuple[Parameter, ...]:
+def parameters_from(
+    parameter_class: type[Any], *, live: bool = False, prefix: str = "", fixed: Mapping[str, str] = MappingProxyType({})
+) -> tuple[Parameter, ...]:
     """A parameter per field of a library's parameter dataclass.
 
     Args:
@@ -114,6 +134,7 @@ def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: s
             ``min``, ``max`` and ``choices``.
         live: whether they may change while the node runs.
         prefix: of the parameters' names, such as ``ekf.``.
+        fixed: those that may not even so, and why not; empty for the usual reason.
     """
     table = []
     for item in fields(parameter_class):
@@ -121,7 +142,8 @@ def parameters_from(parameter_class: type[Any], *, live: bool = False, prefix: s
         known = {key: item.metadata[key] for key in ("unit", "min", "max") if key in item.metadata}
         choices = tuple(item.metadata.get("choices", ()))
         name, doc = f"{prefix}{item.name}", item.metadata.get("doc", "")
-        table.append(Parameter(name, default, doc, choices=choices, live=live, **known))
+        known |= {"live": live and item.name not in fixed, "fixed": fixed.get(item.name, "")}
+        table.append(Parameter(name, default, doc, choices=choices, **known))
     return tuple(table)
 
 
@@ -156,12 +178,17 @@ def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[s
     """
     known = {parameter.name: parameter for parameter in table}
     for name in sorted(given.keys() - known.keys()):
-        similar = get_close_matches(name, known, n=1)
-        hint = f"did you mean {similar[0]!r}?" if similar else f"known: {', '.join(sorted(known))}"
-        raise ParameterError(f"unknown parameter {name!r}; {hint}")
+        raise unknown_parameter(name, known)
     return {
         name: parameter.check(given[name]) if name in given else parameter.default for name, parameter in known.items()
     }
+
+
+def unknown_parameter(name: str, known: Collection[str]) -> ParameterError:
+    """The error of a name that is none of those that are known."""
+    similar = get_close_matches(name, known, n=1)
+    hint = f"did you mean {similar[0]!r}?" if similar else f"known: {', '.join(sorted(known))}"
+    return ParameterError(f"unknown parameter {name!r}; {hint}")
 
 
 # --- files

@@ -120,7 +120,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
     """The graph that the command line asks for.
 
     Raises:
-        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already.
+        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already, the robot's
+            mapping is none or is about angles of another convention.
     """
     sensors = tuple(name for name in args.sensors.split(",") if name) if args.sensors else ()
     topics: frozenset[str] = frozenset()
@@ -128,6 +129,8 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         raise UpError("--sensors: no name")
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
+    if args.external and args.bag is not None:
+        raise UpError("--external: a bag is played in place of the sensors; give one of the two")
     if args.bag is None:
         if args.rate != 1.0:
             raise UpError("--rate is the rate of a bag; give --bag too")
@@ -145,15 +148,25 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
                 f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
             )
         sensors = sensors or there
+    convention = args.convention or ""
+    if args.robot is not None:
+        convention = graph.convention_of_robot(args.robot, convention)
     options = GraphOptions(
         sensors=sensors or graph.DEFAULT_SENSORS,
         bag=str(args.bag) if args.bag else "",
         record=str(args.record) if args.record else "",
         rate=args.rate,
         filter_name=args.filter or "",
-        convention=args.convention or "",
+        convention=convention,
         calibration_file=str(args.calibration) if args.calibration else "",
         reliable=args.reliable,
+        subject=args.subject or "",
+        people=args.people,
+        robot=str(args.robot) if args.robot else "",
+        external=args.external,
+        adapted=tuple(args.adapt or ()),
+        viewer=args.viewer,
+        markers=args.markers,
     )
     options = graph.with_file(options, args.params_file)
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
@@ -495,11 +508,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
     )
     parser.add_argument(
+        "--external", action="store_true", help="start no sensor nodes: somebody else publishes /<sensor>/skeleton"
+    )
+    parser.add_argument(
+        "--adapt",
+        action="append",
+        metavar="SENSOR[:/TOPIC]",
+        help="this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
+    )
+    parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"
+    )
+    parser.add_argument(
+        "--robot", type=Path, metavar="FILE", help="mapping file of a robot that is to follow; see docs/robots.md"
     )
     parser.add_argument(
         "--reliable", action="store_true", help="transport skeletons reliably: nothing is lost, whatever it takes"
     )
+    parser.add_argument(
+        "--viewer", action="store_true", help="show it on a live page in a browser, and take its buttons"
+    )
+    parser.add_argument("--markers", action="store_true", help="publish markers for RViz and Foxglove")
+    graph.add_people(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
 
@@ -547,7 +577,7 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    monitor = GraphMonitor(str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)))
+    monitor = GraphMonitor(options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

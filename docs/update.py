@@ -12,9 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from body_tracking import cli, graph
-from body_tracking.kinematics.conventions import CONVENTIONS, convention
-from body_tracking.kinematics.positional import ANGLE_NAMES
-from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import Qos
 from body_tracking.simulation import kinect
@@ -71,9 +69,7 @@ def services() -> str:
 
 def angles() -> str:
     """The names of the joint angles of each convention."""
-    model = UpperBody()
-    names = {name: convention(name, model).names for name in CONVENTIONS} | {graph.POSITIONAL: ANGLE_NAMES}
-    rows = [(f"`{name}`", ", ".join(f"`{angle}`" for angle in angles)) for name, angles in names.items()]
+    rows = [(f"`{name}`", ", ".join(f"`{angle}`" for angle in angle_names(name))) for name in ALL_CONVENTIONS]
     return table(("convention", "angles"), rows)
 
 

@@ -12,18 +12,32 @@ from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from body_tracking.graph import DEFAULT_SENSORS, GraphOptions, NodeSpec, nodes_for, played_imu_topics, with_file
+from body_tracking.graph import (
+    DEFAULT_SENSORS,
+    GraphOptions,
+    NodeSpec,
+    convention_of_robot,
+    nodes_for,
+    played_imu_topics,
+    with_file,
+)
 from body_tracking.parameters import to_ros
 from body_tracking.recording.rosbag2 import BagReader
 
 ARGUMENTS = {
     "sensors": (",".join(DEFAULT_SENSORS), "names of the sensors, the reference first"),
+    "adapt": ("", "sensors that an Azure Kinect's ROS driver tells of: A,B or A:/topic,B:/topic"),
     "bag": ("", "play this bag in place of the sensors"),
     "rate": ("1.0", "play it this many times as fast"),
     "record": ("", "record everything into this new folder"),
     "filter": ("", "which filter; overrides the parameters file"),
     "convention": ("", "of the joint angles; overrides the parameters file"),
+    "subject": ("", "whom to track: nearest, first or all; overrides the parameters file"),
+    "people": ("0", "with subject all: how many at most; overrides the parameters file, but for 0"),
     "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
+    "robot": ("", "mapping file of a robot that is to follow; see share/body_tracking/config/robots"),
+    "viewer": ("false", "show it on a live page in a browser"),
+    "markers": ("false", "publish markers for RViz and Foxglove"),
     "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
 }
 
@@ -49,14 +63,23 @@ def action(spec: NodeSpec, params_file: str) -> Node:
 def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes for the arguments; with a bag, everything ends with it."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    convention = given["convention"]
+    if given["robot"]:
+        convention = convention_of_robot(Path(given["robot"]), convention)
     options = GraphOptions(
         sensors=tuple(name for name in given["sensors"].split(",") if name),
         bag=given["bag"],
         record=given["record"],
         rate=float(given["rate"]),
         filter_name=given["filter"],
-        convention=given["convention"],
+        convention=convention,
         calibration_file=given["calibration"],
+        subject=given["subject"],
+        people=int(given["people"]),
+        robot=given["robot"],
+        adapted=tuple(entry for entry in given["adapt"].split(",") if entry),
+        viewer=given["viewer"].lower() == "true",
+        markers=given["markers"].lower() == "true",
     )
     file = Path(given["params_file"]) if given["params_file"] else None
     options = with_file(options, file)

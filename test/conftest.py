@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PROCESSES = ("nodes", "test_cli.py", "test_package.py", "test_up.py")
+PROCESSES = ("nodes", "test_cli.py", "test_docs.py", "test_package.py", "test_up.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from body_tracking import cli
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "show", "evaluate", "make-bags")
+COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "show", "evaluate", "make-bags")
 
 
 def test_the_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking import graph
 from body_tracking.calibration.result import level_pose
 from body_tracking.cdr import decode_skeletons
-from body_tracking.filtering import FilterSettings, FilterStage
+from body_tracking.filtering import FilterSettings, FilterStage, PeopleStage, make_stage
+from body_tracking.fusion.people import PeopleParameters
+from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.upper_body import SEGMENTS
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.simulation.random_people import (
@@ -128,6 +131,64 @@ def test_a_burst_after_a_stall_goes_back_once_and_its_frames_all_count(events: l
     late_frames, taken_again = (stage.counters[name] - smooth.counters[name] for name in ("late_frames", "taken_again"))
     assert late_frames >= 3 and 0 < taken_again <= len(newer)
     assert_allclose(late_ones[-1].positions, ordered[-1].positions, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["lkf_constant_velocity", "ekf"])
+def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], name: str) -> None:
+    """Two who stand 2 m apart, of whom the second is hidden for a while."""
+    whom = PeopleParameters(ALL, 3)
+    ids = graph.bodies(whom.people)
+    told: dict[str, list[tuple[str, bytes]]] = {"together": [], "alone 1": [], "alone 2": []}
+
+    def stage_of(who: str) -> PeopleStage:
+        settings = FilterSettings(name, sensors=SENSORS, people=whom)
+        made = make_stage(settings, lambda topic, cdr, stamp_ns: told[who].append((topic, cdr)))
+        assert isinstance(made, PeopleStage)
+        for sensor in SENSORS:
+            made.set_pose(level_pose(sensor))
+        return made
+
+    stages = {who: stage_of(who) for who in told}
+    by_sensor = stages["together"].by_sensor
+    taken = events[:70]
+    for number, (now_ns, sensor, one) in enumerate(taken):
+        shift = np.array([2.0, 0.0, 0.0])
+        two = replace(one, positions=one.positions + shift, body=1)
+        hidden = 30 <= number < 45
+        frames = {"together": [one] if hidden else [one, two], "alone 1": [one], "alone 2": [] if hidden else [two]}
+        for who, bodies in frames.items():
+            if not bodies:
+                stages[who].poll(now_ns)
+            elif by_sensor:
+                stages[who].on_sensor(sensor, bodies, now_ns)
+            elif sensor == SENSORS[0]:  # as the fusion has them
+                placed = [_fused(body) for body in bodies]
+                stages[who].on_fused(placed, now_ns)
+    filtered: dict[str, list[Skeleton]] = {
+        who: [each for topic, cdr in messages if topic == graph.FILTERED for each in decode_skeletons(cdr) or ()]
+        for who, messages in told.items()
+    }
+    assert any(len(decode_skeletons(cdr) or ()) == 2 for topic, cdr in told["together"] if topic == graph.FILTERED)
+    assert stages["together"].tracked == ids[:2]
+    for number in (1, 2):
+        mine = [each for each in filtered["together"] if each.body == number]
+        # whoever is alone is the first of those who are there
+        other = filtered[f"alone {number}"]
+        assert len(mine) == len(other) > 20
+        for one, same in zip(mine, other, strict=True):
+            assert one.stamp_ns == same.stamp_ns
+            assert_array_equal(one.positions, same.positions)
+        if by_sensor:
+            state = graph.model_topics(ids[number - 1], several=True).state
+            alone = graph.model_topics(ids[0], several=True).state
+            states = [cdr for topic, cdr in told["together"] if topic == state]
+            assert states == [cdr for topic, cdr in told[f"alone {number}"] if topic == alone] and len(states) > 20
+
+
+def _fused(seen: Skeleton) -> Skeleton:
+    """As the fusion tells of somebody: in world, with a number from 1 on and with covariances."""
+    covariances = np.broadcast_to(1e-4 * np.eye(3), (25, 3, 3))
+    return replace(seen, positions=level_pose("").apply(seen.positions), body=seen.body + 1, covariances=covariances)
 
 
 def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:

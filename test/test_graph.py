@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -13,6 +16,7 @@ from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
+from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.recording.rosbag2 import is_known
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,6 +29,11 @@ VARIANTS = [
     GraphOptions(bag="bag", record="somewhere", rate=2.0),
     GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
     GraphOptions(filter_name="schlagenhauf_ekf"),
+    GraphOptions(filter_name="ekf", subject="all", people=3, imus=("forearm_left",)),
+    GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
+    GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
+    GraphOptions(bag="bag", viewer=True, markers=True),
+    GraphOptions(viewer=True, record="somewhere"),
 ]
 
 
@@ -54,6 +63,13 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
 
 
+def test_sensors_of_somebody_else_need_no_nodes() -> None:
+    own, external = nodes_for(GraphOptions()), nodes_for(GraphOptions(external=True))
+    assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
+    played = GraphOptions(bag="bag")
+    assert nodes_for(replace(played, external=True)) == nodes_for(played)
+
+
 def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
     assert set(graph.ROLES) == set(FILTERS)
     for name, role in graph.ROLES.items():
@@ -74,6 +90,63 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         )
         assert all(after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+
+
+def test_those_who_track_know_of_each_other_whom() -> None:
+    options = GraphOptions(filter_name="ekf", subject="all", people=2, imus=("forearm_left",))
+    specs = named(nodes_for(options))
+    for name in ("fusion", "skeleton_filter", "joint_angles"):
+        assert (specs[name].parameters["subject"], specs[name].parameters["people"]) == ("all", 2)
+    assert specs["imu_skeleton"].parameters["subject"] == "all"
+    topics = [graph.model_topics(body, several=True) for body in ("body1", "body2")]
+    assert options.bodies == ("body1", "body2")
+    after = specs["kinect1_skeleton"].after
+    assert {topic.state for topic in topics} | {topic.covariance for topic in topics} <= set(after)
+    alone = graph.model_topics("body1")
+    assert (alone.state, alone.covariance) == (graph.MODEL_STATE, graph.MODEL_COVARIANCE)
+    assert GraphOptions().bodies == () and not named(nodes_for(GraphOptions()))["fusion"].parameters.get("subject")
+
+
+def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "people.yaml"
+    file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
+    assert graph.with_file(GraphOptions(), file).bodies == graph.bodies(4)
+    assert graph.with_file(GraphOptions(subject="first", people=3), file).people == 3
+    assert graph.with_file(GraphOptions(subject="first"), file).bodies == ()
+
+
+def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
+    specs = nodes_for(GraphOptions(bag="bag", record="r", filter_name="ekf", robot="robot.yaml"))
+    assert specs[0].executable == "robot_commands"
+    assert specs[0].parameters["mapping"] == "robot.yaml"
+    assert specs[0].parameters["sensors"] == ("kinect1", "kinect2")
+    assert specs[-1].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:5", "/kinect2/skeleton:5")
+    assert "robot_commands" not in named(nodes_for(GraphOptions()))
+
+
+def test_the_convention_is_the_robots() -> None:
+    file = ROOT / "config" / "robots" / "iiwa7.yaml"
+    assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
+    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
+        graph.convention_of_robot(file, "model")
+    with pytest.raises(BodyTrackingError, match="cannot be read"):
+        graph.convention_of_robot(ROOT / "nowhere.yaml", "")
+
+
+def test_a_bag_waits_for_those_who_show_it_and_a_page_has_a_recorder_for_its_button() -> None:
+    shown = named(nodes_for(GraphOptions(bag="bag", viewer=True, markers=True)))
+    assert {"viewer", "body_markers", "bag_recorder"} <= set(shown)
+    assert shown["bag_recorder"].parameters["start_recording"] is False
+    # Calibration, fusion and the two that show it; the recorder does not listen yet.
+    assert shown["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:4", "/kinect2/skeleton:4")
+    assert shown["bag_player"].after == {graph.FUSED: 3, graph.FILTERED: 3}
+    recorded = named(nodes_for(GraphOptions(viewer=True, record="r")))["bag_recorder"]
+    assert recorded.parameters == {"folder": "r", "use_sim_time": False}
+
+
+def test_persons_are_found_among_topics() -> None:
+    topics = ["/humans/bodies/b/joint_states", "/humans/bodies/a/joint_states", "/humans/bodies/a/joint_states_stddev"]
+    assert graph.bodies_among(topics) == ("a", "b")
 
 
 def test_angles_of_positions_need_no_model() -> None:
@@ -100,8 +173,18 @@ def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
     specs = nodes_for(options)
     assert len(named(specs)) == len(specs)
     assert {spec.executable for spec in specs} <= set(EXECUTABLES)
-    assert specs[-1].executable in ("bag_player", "kinect_skeleton")
+    assert specs[-1].executable in ("bag_player", "kinect_skeleton", "skeleton_adapter")
     assert set(named(specs)) <= set(named(all_nodes_for(options)))
+
+
+def test_another_cameras_driver_takes_the_place_of_a_sensors_node() -> None:
+    specs = named(nodes_for(GraphOptions(sensors=("a", "b", "c"), adapted=("b:/k4a/bodies", "c"))))
+    assert specs["a_skeleton"].executable == "kinect_skeleton"
+    assert specs["b_skeleton"].executable == specs["c_skeleton"].executable == "skeleton_adapter"
+    assert specs["b_skeleton"].parameters == {"sensor": "b", "topic": "/k4a/bodies", "use_sim_time": False}
+    assert "topic" not in specs["c_skeleton"].parameters
+    with pytest.raises(graph.GraphError, match="adapted sensor 'd' is none of a, b"):
+        nodes_for(GraphOptions(sensors=("a", "b"), adapted=("d",)))
 
 
 @pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
@@ -118,7 +201,7 @@ def test_sensors_are_found_among_topics() -> None:
 def test_topics_have_known_types_and_publishers() -> None:
     assert len({topic.name for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
-        assert is_known(topic.type_name) or topic.name == graph.TF_STATIC
+        assert is_known(topic.type_name) or topic.name in (graph.TF, graph.TF_STATIC, graph.TRACKED)
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 
@@ -161,10 +244,41 @@ def test_the_launch_file_takes_its_nodes_from_the_table() -> None:
     assert not strings & {topic.name for topic in TOPICS}
 
 
+def test_the_foxglove_layout_shows_topics_of_the_graph() -> None:
+    """The format in which the application exports layouts: panels by id, and a tree that places every one of them."""
+    layout = json.loads((ROOT / "foxglove" / "body_tracking.json").read_text(encoding="utf-8"))
+    assert {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"} == set(layout)
+    panels = layout["configById"]
+
+    def placed(tree: Any) -> list[str]:
+        return [tree] if isinstance(tree, str) else placed(tree["first"]) + placed(tree["second"])
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)
+    assert {panel.partition("!")[0] for panel in panels} == {"3D", "Plot", "DiagnosticSummary"}
+    body = graph.DEFAULT_BODY
+    known = {topic.name.replace("<id>", body) for topic in TOPICS} | {
+        graph.skeleton_topic(sensor) for sensor in graph.DEFAULT_SENSORS
+    }
+    for name, panel in panels.items():
+        shown = {*panel.get("topics", {}), panel.get("topicToRender", graph.DIAGNOSTICS_TOPIC)}
+        shown |= {path["value"].partition(".")[0] for path in panel.get("paths", [])}
+        assert shown <= known, name
+    scene = panels["3D!bodies"]
+    assert scene["topics"][graph.markers_topic(body)]["visible"]
+    assert scene["followTf"] == "world"
+    assert {path["value"].partition(".")[2] for path in panels["Plot!angles"]["paths"]} == {
+        f"position[{ANGLE_NAMES.index(name)}]"
+        for name in ("elbow_flexion_left", "elbow_flexion_right", "shoulder_elevation_left", "shoulder_elevation_right")
+    }
+
+
 def test_the_rviz_view_shows_topics_of_the_graph() -> None:
     view = yaml.safe_load((ROOT / "rviz" / "body_tracking.rviz").read_text(encoding="utf-8"))
     displays = view["Visualization Manager"]["Displays"]
     shown = {display["Topic"]["Value"] for display in displays if "Topic" in display}
     sensors = {graph.skeleton_topic(sensor) for sensor in graph.DEFAULT_SENSORS}
-    assert shown == sensors | {graph.FUSED, graph.FILTERED}
+    robots = {display["Description Topic"]["Value"] for display in displays if "Description Topic" in display}
+    body = graph.DEFAULT_BODY
+    assert shown == sensors | {graph.FUSED, graph.FILTERED, graph.markers_topic(body)}
+    assert robots == {graph.urdf_topic(body)}
     assert view["Visualization Manager"]["Global Options"]["Fixed Frame"] == "world"

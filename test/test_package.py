@@ -19,7 +19,7 @@ import body_tracking
 from body_tracking import graph
 
 ROOT = Path(__file__).resolve().parent.parent
-SHARED_FOLDERS = ("config", "launch", "rviz", "bags")
+SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
 
 # import name -> (distribution, rosdep key); None where rosdistro has no key and README.md gives the pip line.
 # What is not here is a ROS package, declared under its own name.
@@ -35,6 +35,8 @@ LIBRARIES = {
     "zstandard": ("zstandard", None),
     "rosbags": ("rosbags", None),
 }
+EXTRAS = {"viser": "viewer"}
+"""Import name -> extra; who imports these says what to install where they are absent."""
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
@@ -113,10 +115,16 @@ def test_every_import_is_a_declared_dependency(manifest: ElementTree.Element, wh
     declared = {str(depend.text) for depend in manifest.iter("exec_depend")}
     with zipfile.ZipFile(wheel) as archive:
         metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        required = set(re.findall(r"^Requires-Dist: ([\w-]+)[^;\n]*$", archive.read(metadata).decode(), re.MULTILINE))
+        text = archive.read(metadata).decode()
+    required = set(re.findall(r"^Requires-Dist: ([\w-]+)[^;\n]*$", text, re.MULTILINE))
     readme = (ROOT / "README.md").read_text()
     for module, where in set(imports()):
         if module in sys.stdlib_module_names or module == "body_tracking":
+            continue
+        if module in EXTRAS:
+            extra = EXTRAS[module]
+            assert re.search(rf"^Requires-Dist: {module}\b.*; extra == .{extra}.$", text, re.MULTILINE), "setup.py"
+            assert f"[{extra}]" in readme, f"{extra}: no pip line in README.md"
             continue
         if module not in LIBRARIES:
             assert module in declared, f"{where} imports {module}: package.xml does not declare it"
@@ -178,7 +186,7 @@ def test_table_of_nodes_lists_every_node_file(node_names: set[str]) -> None:
 
 def test_colcon_installs_an_executable_per_node(prefix: Path, node_names: set[str]) -> None:
     executables = {path.name for path in (prefix / "lib" / "body_tracking").iterdir() if os.access(path, os.X_OK)}
-    assert executables == node_names | {"body_tracking"}
+    assert executables == node_names | {"body_tracking", "kinect_sender"}
 
 
 def test_colcon_installs_what_ros_finds_packages_by(prefix: Path) -> None:
@@ -258,7 +266,7 @@ def test_picture_shows_every_node_and_topic() -> None:
     picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
     texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}
     # The picture shows two sensors where the table has a pattern.
-    topics = {topic.name.replace("<sensor>", "kinect1") for topic in graph.TOPICS} - {graph.TF_STATIC}
+    topics = {topic.name.replace("<sensor>", "kinect1") for topic in graph.TOPICS} - {graph.TF, graph.TF_STATIC}
     assert set(graph.EXECUTABLES) | topics <= texts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,12 +24,20 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from body_tracking import cli, graph  # noqa: E402
+from body_tracking.calibration.result import CalibrationResult, SensorQuality  # noqa: E402
+from body_tracking.calibration.storage import save  # noqa: E402
+from body_tracking.cdr import decode_skeletons  # noqa: E402
 from body_tracking.fusion.fusion import FusionParameters  # noqa: E402
+from body_tracking.fusion.people import PeopleParameters  # noqa: E402
+from body_tracking.fusion.subject import ALL  # noqa: E402
 from body_tracking.graph import GraphOptions  # noqa: E402
 from body_tracking.messages import to_nanoseconds  # noqa: E402
 from body_tracking.parameters import ParameterError  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
+from body_tracking.simulation.bags import write_bag  # noqa: E402
+from body_tracking.simulation.layouts import around  # noqa: E402
+from body_tracking.simulation.scene import Setup, lanes, simulate  # noqa: E402
 from body_tracking.up import parameters_for  # noqa: E402
 
 BAGS = Path(__file__).resolve().parent.parent / "bags"
@@ -166,6 +175,56 @@ def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
         assert reader.topics[graph.urdf_topic("body1")].count >= 1
 
 
+def two_people(folder: Path) -> tuple[Path, Path]:
+    """A simulated recording of two who walk past each other, and the calibration of its sensors."""
+    recording = simulate(
+        Setup(
+            "walking_and_turning",
+            around(np.radians([25.0, -35.0]).tolist(), distances=2.7),
+            number=2,
+            seconds=8.0,
+            standard=True,
+            places=lanes(2),
+        )
+    )
+    write_bag(recording, folder / "people")
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in poses}
+    save(CalibrationResult("kinect1", poses, clocks, quality), folder / "true.yaml")
+    return folder / "people", folder / "true.yaml"
+
+
+def test_two_people_have_angles_of_their_own_the_same_live_and_offline(up: Callable[..., Up], tmp_path: Path) -> None:
+    bag, calibration = two_people(tmp_path)
+    file = tmp_path / "parameters.yaml"
+    file.write_text("fusion: {ros__parameters: {max_wait: 1.0}}\n")
+    shutil.copy(calibration, tmp_path / "live.yaml")  # the node writes what it finds out
+    arguments = ("--bag", bag, "--record", tmp_path / "live", "--reliable", "--calibration", tmp_path / "live.yaml")
+    graph_up = up(*arguments, "--params-file", file, "--subject", "all", "--people", "3")
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=120.0), graph_up.text()
+    assert graph_up.process.returncode == 0, graph_up.text()
+    settings = ReplaySettings(
+        ("kinect1", "kinect2"),
+        fusion=FusionParameters(max_wait=1.0),
+        calibration_file=calibration,
+        people=PeopleParameters(ALL, 3),
+    )
+    replay(bag, tmp_path / "offline", settings)
+    for body in ("body1", "body2"):
+        topic = graph.joint_states_topic(body)
+        live, offline = angles_in(tmp_path / "live", topic), angles_in(tmp_path / "offline", topic)
+        assert len(live) > 100 and live.keys() == offline.keys()
+        for stamp, values in live.items():
+            np.testing.assert_allclose(values, offline[stamp], rtol=0.0, atol=1e-6)
+    with BagReader(tmp_path / "live") as reader:
+        assert reader.topics[graph.joint_states_topic("body3")].count == 0
+        numbers = [
+            tuple(each.body for each in decode_skeletons(raw.cdr) or ()) for raw in reader.messages([graph.FILTERED])
+        ]
+    assert numbers.count((1, 2)) > 100 and set(numbers) <= {(1, 2), (1,), (2,)}
+
+
 def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
     up: Callable[..., Up], tmp_path: Path
 ) -> None:
@@ -279,6 +338,7 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     (tmp_path / "there").write_text("")
     assert "exists already" in refusal(capsys, "--bag", BAG, "--record", tmp_path / "there")
     assert "--rate 0" in refusal(capsys, "--bag", BAG, "--rate", "0")
+    assert "--external" in refusal(capsys, "--bag", BAG, "--external")
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
     assert "reserved" in refusal(capsys, "--sensors", "fused")
     assert "twice" in refusal(capsys, "--sensors", "a,a")

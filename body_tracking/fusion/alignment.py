@@ -83,11 +83,16 @@ class SensorAlignment:
 
     def reset(self) -> None:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""
+        self.forget()
+        for sensor in self._sensors.values():
+            sensor.restart()
+        self.counters["resets"] += 1
+
+    def forget(self) -> None:
+        """Forget all frames, because the next ones are of somebody else."""
         for sensor in self._sensors.values():
             sensor.clear()
-            sensor.restart()
         self._sides.reset()
-        self.counters["resets"] += 1
 
     def set_pose(self, pose: SensorPose) -> None:
         """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""

@@ -188,11 +188,16 @@ class Fusion:
 
     def reset(self) -> None:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""
+        self.forget()
+        for sensor in self._sensors.values():
+            sensor.restart()
+        self.counters["resets"] += 1
+
+    def forget(self) -> None:
+        """Forget all frames, because the next ones are of somebody else."""
         for sensor in self._sensors.values():
             sensor.clear()
-            sensor.restart()
         self._forget_output()
-        self.counters["resets"] += 1
 
     # --- calibration in
 

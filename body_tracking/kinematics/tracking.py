@@ -6,19 +6,20 @@ node receives, in any convention; :class:`LengthChanges` tells when a person's l
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
 
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of
+from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of, convention
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import Fit, InverseKinematics
 from body_tracking.kinematics.lengths import SkeletonLengths
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.motion import joint_densities
-from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
@@ -26,6 +27,16 @@ POSITIONAL = "positional"
 """The convention of :mod:`body_tracking.kinematics.positional`, which needs no model."""
 
 ALL_CONVENTIONS: tuple[str, ...] = (*CONVENTIONS, POSITIONAL)
+
+
+def angle_names(name: str) -> tuple[str, ...]:
+    """The angles of one of ``ALL_CONVENTIONS``, in order.
+
+    Raises:
+        ConventionError: another one.
+    """
+    return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
+
 
 _GAP_NS = NANOSECONDS // 2
 """After longer than this the last pose is no better a start than none."""
@@ -153,6 +164,7 @@ class AngleStream:
 
     Args:
         convention: one of ``ALL_CONVENTIONS``.
+        forget_after: seconds without the person after which the next frame is of somebody else.
 
     Attributes:
         model: the body.
@@ -162,13 +174,14 @@ class AngleStream:
         ConventionError: another one.
     """
 
-    def __init__(self, convention: str) -> None:
+    def __init__(self, convention: str, forget_after: float = math.inf) -> None:
         if convention not in ALL_CONVENTIONS:
             raise ConventionError(f"angle convention {convention!r}: not one of {', '.join(ALL_CONVENTIONS)}")
         self.convention = convention
         self.model = UpperBody()
         self.fit = SkeletonFit(self.model)
         self._previous: JointAngles | None = None
+        self._forget_after_ns = forget_after * NANOSECONDS
 
     def reset(self) -> None:
         """Forget the person."""
@@ -179,6 +192,7 @@ class AngleStream:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
         if self.convention == POSITIONAL:
             return positional_angles(skeleton)
+        self._forget_who_is_gone(skeleton.stamp_ns)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)
 
@@ -188,9 +202,14 @@ class AngleStream:
         Raises:
             ConventionError: the convention is made of positions.
         """
+        self._forget_who_is_gone(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)
         self._previous = angles
         return angles
+
+    def _forget_who_is_gone(self, stamp_ns: int) -> None:
+        if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:
+            self.reset()
 
 
 class LengthChanges:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from body_tracking.errors import BodyTrackingError
 from body_tracking.nodes.bag_topics import from_profile, message_class, to_profile
 from body_tracking.nodes.common import STEADY, GraphNode, run
-from body_tracking.parameters import Parameter
+from body_tracking.parameters import Parameter, Value
 from body_tracking.recording.qos import Qos, request_for
 from body_tracking.recording.rosbag2 import BagError, BagWriter
 
@@ -25,11 +25,18 @@ PARAMETERS = (
     Parameter(
         "folder",
         "",
-        "the bag; one that is there is continued. Empty for body_tracking_<date> in the working directory",
+        "the bag; one that is there is continued. Empty for body_tracking_<date> in the working directory. May change "
+        "between recorder/stop and recorder/start",
+        live=True,
     ),
-    Parameter("topics", (), "record only these topics; empty for all that appear"),
-    Parameter("exclude", ("/clock", "/rosout", "/parameter_events"), "topics not to record, where topics is empty"),
-    Parameter("start_recording", True, "begin at once, not only with recorder/start"),
+    Parameter("topics", (), "record only these topics; empty for all that appear. May change likewise", live=True),
+    Parameter(
+        "exclude",
+        ("/clock", "/rosout", "/parameter_events"),
+        "topics not to record, where topics is empty. May change likewise",
+        live=True,
+    ),
+    Parameter("start_recording", True, "begin at once, not only with recorder/start", fixed="it is about the start"),
     Parameter(
         "chunk_seconds",
         1.0,
@@ -49,12 +56,26 @@ class BagRecorder(GraphNode):
     NAME = "bag_recorder"
     PARAMETERS = PARAMETERS
 
-    def start(self) -> None:
-        """Open the bag and look for topics."""
-        given: dict[str, Any] = dict(self.values)
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Where to, and what."""
+        given: dict[str, Any] = dict(values)
         self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
         self.chosen = frozenset(given["topics"])
         self.exclude = frozenset(given["exclude"])
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """For the next recording.
+
+        Raises:
+            BagError: a bag is being recorded.
+        """
+        if self.writer is not None:
+            raise BagError(f"{self.folder} is being recorded; call recorder/stop first, and recorder/start afterwards")
+        self.configure(values)
+
+    def start(self) -> None:
+        """Open the bag and look for topics."""
+        given: dict[str, Any] = dict(self.values)
         self.simulated_time = bool(self.get_parameter("use_sim_time").value)
         self.writer: BagWriter | None = None
         self.inputs: dict[str, tuple[Qos, Any]] = {}
@@ -161,6 +182,7 @@ class BagRecorder(GraphNode):
             return
 
         def receive(cdr: bytes, info: dict[str, int]) -> None:
+            self.monitor.arrived(topic)
             self.receive(topic, cdr, info)
 
         callback: Any = receive  # rclpy passes the message info to callbacks of two arguments

@@ -35,6 +35,15 @@ except ImportError:
 SAVE_PERIOD = 2.0
 """Seconds between two writings of the calibration file at least."""
 
+_LEVEL = "world would tilt or move under everyone who uses it"
+_MEMORY = "the frames remembered so far were chosen by it"
+_STAMPS = "by it a recording gives offline what it gave live"
+_FIXED = {
+    "method": "what one method has estimated is no start for the other",
+    **dict.fromkeys(("reference_height", "reference_pitch", "reference_roll"), _LEVEL),
+    **dict.fromkeys(("history", "pairs_per_place", "capacity"), _MEMORY),
+    **dict.fromkeys(("settle_time", "activation_delay"), _STAMPS),
+}
 PARAMETERS = (
     SENSORS,
     REFERENCE,
@@ -42,9 +51,10 @@ PARAMETERS = (
         "calibration_file",
         "",
         "YAML file: loaded at the start if it exists, saved when the result changes; or empty",
+        fixed="it is loaded at the start",
     ),
     WORLD_FRAME,
-    *parameters_from(CalibrationParameters),
+    *parameters_from(CalibrationParameters, live=True, fixed=_FIXED),
     RELIABLE,
 )
 
@@ -64,6 +74,10 @@ class CalibrationNode(GraphNode):
         self.file = Path(given["calibration_file"]).expanduser() if given["calibration_file"] else None
         if self.file is not None and self.file.exists():
             self.calibration.load(load(self.file))
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """From the next frame on; what was estimated stays."""
+        self.calibration.parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
 
     def start(self) -> None:
         """Connect, and publish what holds now."""

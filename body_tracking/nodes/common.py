@@ -39,6 +39,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking import graph
+from body_tracking.backlog import Backlog, Sequences
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics
@@ -46,6 +47,7 @@ from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.executor import LeanExecutor
 from body_tracking.parameters import (
     Parameter,
+    ParameterError,
     Value,
     check_all,
     is_ros_own,
@@ -53,6 +55,7 @@ from body_tracking.parameters import (
     matches,
     read_file,
     to_ros,
+    unknown_parameter,
 )
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.skeleton import NANOSECONDS, Skeleton
@@ -61,7 +64,8 @@ RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FRAMES_KEPT = 16
-"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none."""
+"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
+that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
 _ALARM_NS = NANOSECONDS // 200, NANOSECONDS // 10
 """For at least so long, as simulated time may stand still, and at most, as it may run fast, a timer is set by it."""
 
@@ -80,11 +84,32 @@ RELIABLE = Parameter(
     "reliable",
     False,
     "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
+    fixed="a topic keeps the quality of service that it was made with",
 )
-WORLD_FRAME = Parameter("world_frame", "world", "name of the world frame; map for REP-155")
-BODY = Parameter("body", "body1", "the id of the person in topics and names of angles (REP-155)")
-SENSORS = Parameter("sensors", ("kinect1", "kinect2"), "the sensors; the node listens to /<sensor>/skeleton of each")
-REFERENCE = Parameter("reference", "", "the sensor that defines world and its time; empty for the first one")
+WORLD_FRAME = Parameter(
+    "world_frame",
+    "world",
+    "name of the world frame; map for REP-155",
+    fixed="what is published in this frame would lie in two",
+)
+BODY = Parameter(
+    "body",
+    "body1",
+    "the id of the person in topics and names of angles (REP-155)",
+    fixed="the names of topics and angles hold it",
+)
+SENSORS = Parameter(
+    "sensors",
+    ("kinect1", "kinect2"),
+    "the sensors; the node listens to /<sensor>/skeleton of each",
+    fixed="every node of the graph must have the same sensors",
+)
+REFERENCE = Parameter(
+    "reference",
+    "",
+    "the sensor that defines world and its time; empty for the first one",
+    fixed="world and its time would jump for everyone who uses them",
+)
 
 
 class Monitor:
@@ -100,10 +125,13 @@ class Monitor:
         self._last_stamp: dict[str, int] = {}
         self._since = time.monotonic()
 
-    def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Count a message of an input; True when time jumped back."""
+    def arrived(self, topic: str) -> None:
+        """Count a message of an input."""
         self._window[f"in {topic}"] += 1
         self.totals["received"] += 1
+
+    def message_in(self, topic: str, stamp_ns: int) -> bool:
+        """Look at the stamp of a message of an input; True when time jumped back."""
         last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
         if last is None:
             return False
@@ -217,6 +245,10 @@ class GraphNode(Node):
     def __init__(self) -> None:
         super().__init__(self.NAME)
         self.monitor = Monitor()
+        self.backlog = Backlog()
+        self.sequences = Sequences()
+        self._droppable: dict[Subscription, str] = {}
+        self._told_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         self.configure(self.values)
@@ -228,11 +260,19 @@ class GraphNode(Node):
     # --- to be written by a node
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Take the parameters, at the start and whenever some of them change.
+        """Take the parameters at the start.
 
         Raises:
-            BodyTrackingError: they do not go together; at the start the node ends, later the change is refused.
+            BodyTrackingError: they do not go together, and the node ends.
         """
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """Take the parameters when some of them have changed; as at the start, unless a node knows better.
+
+        Raises:
+            BodyTrackingError: they do not go together, or not now; the change is refused for this reason.
+        """
+        self.configure(values)
 
     def start(self) -> None:
         """Make publishers, subscriptions, services and timers."""
@@ -246,6 +286,24 @@ class GraphNode(Node):
 
     # --- parameters
 
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """As the parameter services call it: what is refused is refused with our reason, not rcl's."""
+        table = {parameter.name: parameter for parameter in self.PARAMETERS}
+        changes = []
+        for change in parameter_list:
+            try:
+                if change.name in table:
+                    # a whole number serves as a number here, too
+                    value = table[change.name].check_change(change.value)
+                    change = RosParameter(change.name, value=to_ros(value))
+                elif not self.has_parameter(change.name):
+                    raise unknown_parameter(change.name, table)
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=f"{self.get_name()}: {error}")
+            changes.append(change)
+        result: SetParametersResult = super().set_parameters_atomically(changes)
+        return result
+
     def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
         table = {parameter.name: parameter for parameter in self.PARAMETERS}
         values = dict(self.values)
@@ -254,9 +312,9 @@ class GraphNode(Node):
                 if change.name in table:
                     values[change.name] = table[change.name].check(change.value)
             if values != self.values:
-                self.configure(MappingProxyType(values))
+                self.reconfigure(MappingProxyType(values))
         except BodyTrackingError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=f"{self.get_name()}: {error}")
         self.values = MappingProxyType(values)
         return SetParametersResult(successful=True)
 
@@ -284,6 +342,8 @@ class GraphNode(Node):
         """
 
         def callback(message: Any, info: dict[str, int]) -> None:
+            self.sequences.note(topic, info["publication_sequence_number"])
+            self.monitor.arrived(topic)
             try:
                 handle(message, info["source_timestamp"])
             except MessageError as error:
@@ -306,7 +366,29 @@ class GraphNode(Node):
 
         qos = self.skeleton_qos()
         qos.depth = max(qos.depth, _FRAMES_KEPT)
-        return self.listen(topic, PointCloud2, qos, convert, raw=True)
+        subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
+        if not self.values["reliable"]:
+            self._droppable[subscription] = topic
+        return subscription
+
+    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """All messages but frames that are too late where the node is too slow; called by the executor."""
+        frames = [place for place, (subscription, _) in enumerate(messages) if subscription in self._droppable]
+        if not frames:
+            self.backlog.late((), time.time_ns())
+            return messages
+        taken = [(self._droppable[messages[place][0]], messages[place][1][1]) for place in frames]
+        arrived = [(topic, info["received_timestamp"]) for topic, info in taken]
+        late = {frames[each] for each in self.backlog.late(arrived, time.time_ns())}
+        for place in late:
+            subscription, (_, info) = messages[place]
+            self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
+        return [each for place, each in enumerate(messages) if place not in late] if late else messages
+
+    def messages_handled(self) -> None:
+        """Note how long that took; called by the executor."""
+        if self._droppable:
+            self.backlog.done(time.time_ns())
 
     def time_jumped_back(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""
@@ -353,6 +435,14 @@ class GraphNode(Node):
     def _report(self) -> None:
         level, text, values = self.state()
         values = {**self.monitor.values(), **self._listeners(), **values}
+        values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
+        values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
+        dropped = self.backlog.dropped - self._told_dropped
+        if dropped:
+            self._told_dropped = Counter(self.backlog.dropped)
+            said = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
+            level, text = max(level, 1), f"too slow: dropped {said}" + (f"; {text}" if text else "")
+            self.log_seldom("dropped", text)
         if self.monitor.totals["malformed"] and level == 0:
             text = text or f"{self.monitor.totals['malformed']} malformed messages"
         message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)

@@ -36,6 +36,17 @@ class TakesTogether(Protocol):
         """Called after the last callback of all the messages that were there."""
 
 
+@runtime_checkable
+class LeavesOut(Protocol):
+    """A node that does not handle all that has come."""
+
+    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """Those of the messages, each with its subscription, that are to be handled, in the same order."""
+
+    def messages_handled(self) -> None:
+        """Called after that."""
+
+
 class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
@@ -47,6 +58,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._taken = node.messages_taken if isinstance(node, TakesTogether) else None
+        self._leaving_out = node if isinstance(node, LeavesOut) else None
         self._changed = True
         self._stopped = False
         self.add_node(node)
@@ -131,6 +143,8 @@ class LeanExecutor(SingleThreadedExecutor):
                 if not self._context.ok():
                     return
                 messages = _take_all(subscriptions, wait_set)
+                if messages and self._leaving_out is not None:
+                    messages = self._leaving_out.worth_handling(messages)
                 for subscription, taken in messages:
                     if self._stopped:
                         return
@@ -138,6 +152,8 @@ class LeanExecutor(SingleThreadedExecutor):
                     subscription.callback(*(taken[:1] if only_message else taken))
                 if messages and self._taken is not None:
                     self._taken()
+                if messages and self._leaving_out is not None:
+                    self._leaving_out.messages_handled()
                 executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None

@@ -15,8 +15,9 @@ from sensor_msgs.msg import PointCloud2, TimeReference
 
 from body_tracking import graph
 from body_tracking.cdr import encode_skeletons
-from body_tracking.fusion.fusion import Fusion, FusionParameters
-from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.filtering import PEOPLE, people_from
+from body_tracking.fusion.fusion import FusionParameters
+from body_tracking.fusion.people_fusion import PeopleFusion
 from body_tracking.messages import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, Alarm, GraphNode, run
@@ -25,7 +26,15 @@ from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (SENSORS, REFERENCE, WORLD_FRAME, *parameters_from(FusionParameters), RELIABLE)
+_FIXED = {"turned_hold": "a body that is held reversed is held for as long as was said when it was seen"}
+PARAMETERS = (
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    *PEOPLE,
+    *parameters_from(FusionParameters, live=True, fixed=_FIXED),
+    RELIABLE,
+)
 
 
 class FusionNode(GraphNode):
@@ -37,13 +46,17 @@ class FusionNode(GraphNode):
     def configure(self, values: Mapping[str, Value]) -> None:
         """Make the fusion."""
         given: dict[str, Any] = dict(values)
-        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         parameters = FusionParameters(**fields_of(FusionParameters, values))
-        self.fusion = Fusion(self.sensors, parameters, given["reference"] or None, given["world_frame"])
+        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
+        people = people_from(values)
+        self.fusion = PeopleFusion(self.sensors, parameters, people, given["reference"] or None, given["world_frame"])
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """From the next frame on."""
+        self.fusion.parameters = FusionParameters(**fields_of(FusionParameters, values))
 
     def start(self) -> None:
         """Connect."""
-        self.subjects = {sensor: SubjectSelector() for sensor in self.sensors}
         self.last_sent_ns = 0
         self.output = self.create_publisher(PointCloud2, graph.FUSED, self.skeleton_qos())
         latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(self.sensors))))
@@ -63,27 +76,23 @@ class FusionNode(GraphNode):
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Feed one frame and publish what follows from it."""
-        subject = self.subjects[sensor].pick(skeletons)
-        if subject is not None:
+        if any(skeleton.valid.any() for skeleton in skeletons):
             self.last_sent_ns = sent_ns
-            self.publish(self.fusion.push(sensor, subject, time.monotonic_ns()))
+            self.publish(self.fusion.push(sensor, skeletons, time.monotonic_ns()))
 
     def on_deadline(self) -> None:
         """Nothing more to wait for."""
         self.publish(self.fusion.poll(time.monotonic_ns()))
 
-    def publish(self, fused: list[Skeleton]) -> None:
+    def publish(self, fused: list[tuple[Skeleton, ...]]) -> None:
         """Send the skeletons and set the timer for the next that cannot wait longer."""
-        for skeleton in fused:
-            cloud = encode_skeletons([skeleton])
-            self.send(self.output, cloud, skeleton.stamp_ns, self.last_sent_ns)
+        for skeletons in fused:
+            self.send(self.output, encode_skeletons(skeletons), skeletons[0].stamp_ns, self.last_sent_ns)
         self.alarm.at(self.fusion.deadline_ns)
 
     def time_jumped_back(self, topic: str) -> None:
         """Start anew; poses and clocks stay."""
         self.fusion.reset()
-        for subject in self.subjects.values():
-            subject.reset()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """The fusion's counters."""

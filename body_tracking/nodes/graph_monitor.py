@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,17 +43,17 @@ class GraphMonitor:
     """Listens in a thread of its own.
 
     Args:
-        body: the id of the person.
+        bodies: the ids of those who may be tracked.
     """
 
-    def __init__(self, body: str) -> None:
+    def __init__(self, bodies: Sequence[str]) -> None:
         self.clock_ns = 0
         """The latest time on ``/clock``; 0 before there is one."""
         self.last_angles = 0.0
         """Steady time at which the latest angles came, seconds."""
         self.angles = 0
         """How many angle messages have come."""
-        self._angles_topic = graph.joint_states_topic(body)
+        self._angles_topics = [graph.joint_states_topic(body) for body in bodies]
         self._statuses: dict[str, _Status] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -61,7 +61,8 @@ class GraphMonitor:
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
-        self._node.create_subscription(JointState, self._angles_topic, self._on_angles, to_profile(RELIABLE))
+        for topic in self._angles_topics:
+            self._node.create_subscription(JointState, topic, self._on_angles, to_profile(RELIABLE))
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -125,7 +126,9 @@ class GraphMonitor:
 
         sensors = " ".join(f"{name} {rate('fusion', f'in {graph.skeleton_topic(name)}')}" for name in options.sensors)
         fused = rate("fusion", f"out {graph.FUSED}")
-        angles = rate("joint_angles", f"out {self._angles_topic}")
+        rates = [rate("joint_angles", f"out {topic}") for topic in self._angles_topics]
+        # those of whom something comes; of nobody at least how it is with the first
+        angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
         return f"{sensors}, fused {fused}, angles {angles} Hz"
 
     @staticmethod

@@ -14,6 +14,9 @@ from std_srvs.srv import Trigger
 
 from body_tracking import graph
 from body_tracking.cdr import encode_skeletons
+from body_tracking.filtering import PEOPLE
+from body_tracking.fusion.association import HOLD
+from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.tracking import TrackingParameters
 from body_tracking.messages import orientation_to_message
@@ -23,7 +26,14 @@ from body_tracking.parameters import Value, fields_of
 from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (*IMU_PARAMETERS, SENSORS, REFERENCE, WORLD_FRAME, RELIABLE)
+PARAMETERS = (
+    *IMU_PARAMETERS,
+    *(item for item in PEOPLE if item.name == "subject"),
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    RELIABLE,
+)
 
 _READINGS = 64
 """Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
@@ -53,6 +63,7 @@ class ImuSkeletonNode(GraphNode):
             self.listen(topic, MagneticField, waiting, partial(self.on_field, topic))
         for topic in self.stage.imu:
             self.listen(topic, Imu, waiting, partial(self.on_imu, topic))
+        self.wearer = HeldSubject(HOLD) if self.values["subject"] == ALL else SubjectSelector()
         self.listen_to_skeletons(graph.FUSED, self.on_skeletons)
         given: dict[str, Any] = dict(self.values)
         reference = given["reference"] or next(iter(given["sensors"]), "")
@@ -74,8 +85,10 @@ class ImuSkeletonNode(GraphNode):
         self.stage.on_field(topic, message)
 
     def on_skeletons(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
-        """Note what cameras see."""
-        self.stage.on_skeleton(skeletons[0], self.now_ns())
+        """Note what cameras see of the one who wears the sensors: of several, who is nearest to the first camera."""
+        wearer = self.wearer.pick(skeletons)
+        if wearer is not None:
+            self.stage.on_skeleton(wearer, self.now_ns())
 
     def on_frame(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Note when the reference sensor's frames come."""

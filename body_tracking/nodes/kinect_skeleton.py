@@ -10,7 +10,8 @@ from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 
-import body_tracking.recording.source  # noqa: F401  (registers the backend "recording")
+import body_tracking.recording.source
+import body_tracking.sensors.network  # noqa: F401  (both register their backends)
 from body_tracking import graph
 from body_tracking.cdr import encode_skeletons
 from body_tracking.errors import BodyTrackingError
@@ -19,10 +20,13 @@ from body_tracking.parameters import Parameter
 from body_tracking.sensors import check_sensor_name
 from body_tracking.sensors.live import SourceSettings, backends, open_source
 
+_DEFAULTS = SourceSettings("")
+_PROBLEM_PERIOD_S = 30.0
+
 PARAMETERS = (
     Parameter("sensor", "kinect1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
     Parameter("backend", "recording", "where skeletons come from", choices=backends()),
-    Parameter("device", "", "live backends: which of several devices; empty for the only one"),
+    Parameter("device", "", "network: the sensor's name at kinect_sender; empty for the same name"),
     Parameter("file", "", "recording: a .csv, .csv.gz or .skeleton file, or a bag"),
     Parameter("recorded_sensor", "", "recording: the sensor's name in the file; empty for the same name"),
     Parameter("rate", 1.0, "recording: seconds of it per second", min=0.01, max=100.0),
@@ -35,6 +39,22 @@ PARAMETERS = (
         unit="s",
         min=0.0,
         max=1e11,
+    ),
+    Parameter(
+        "address",
+        _DEFAULTS.address,
+        "network: the IP address of this computer to listen on, 0.0.0.0 for all; other computers reach no loopback "
+        "address, and any other needs a key",
+    ),
+    Parameter("port", _DEFAULTS.port, "network: the UDP port to listen on; one per sensor", min=1, max=65535),
+    Parameter("key_file", "", "network: the file with the key that kinect_sender was given too"),
+    Parameter(
+        "least_delay",
+        _DEFAULTS.least_delay,
+        "network: what the sensor takes at least from capture until its frame can be sent, which nothing else tells",
+        unit="s",
+        min=0.0,
+        max=1.0,
     ),
     RELIABLE,
 )
@@ -59,6 +79,10 @@ class KinectSkeleton(GraphNode):
             given["rate"],
             given["loop"],
             given["start_time"],
+            given["address"],
+            given["port"],
+            given["key_file"],
+            given["least_delay"],
         )
         self.source = open_source(given["backend"], settings)
         self.output = self.create_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
@@ -77,9 +101,12 @@ class KinectSkeleton(GraphNode):
             self.get_logger().error(self.failure)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Whether it plays, ended or failed."""
-        text = self.failure or ("ended" if self.source.ended else "streaming")
-        return (2 if self.failure else 0), text, dict(self.source.counters)
+        """Whether it plays, ended or failed, or what keeps frames from coming."""
+        problem = self.source.problem
+        if problem:
+            self.log_seldom("problem", problem, _PROBLEM_PERIOD_S)
+        text = self.failure or problem or ("ended" if self.source.ended else "streaming")
+        return (2 if self.failure else 1 if problem else 0), text, dict(self.source.counters)
 
     def close(self) -> None:
         """Let the thread end."""

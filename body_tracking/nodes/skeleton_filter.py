@@ -10,11 +10,14 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+try:
+    from hri_msgs.msg import IdsList
+except ImportError:  # not on PyPI
+    IdsList = None
 from geometry_msgs.msg import TransformStamped
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Image, Imu, JointState, MultiDOFJointState, PointCloud2, TimeReference
-from std_msgs.msg import String
+from sensor_msgs.msg import Imu, TimeReference
 
 from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
@@ -23,19 +26,31 @@ from body_tracking.filtering import (
     INPUT,
     ORDER_WAIT,
     ORIENTATIONS,
+    PEOPLE,
     PREDICT_AFTER,
     FilterSettings,
     FilterStage,
+    PeopleStage,
     filter_parameters,
     filter_table,
+    make_stage,
     orientation_topics,
+    people_from,
 )
-from body_tracking.messages import message_to_orientation, time_reference_to_clock, transform_to_pose
-from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.messages import (
+    SEGMENTS,
+    STRING,
+    message_to_orientation,
+    time_reference_to_clock,
+    to_header,
+    transform_to_pose,
+)
+from body_tracking.nodes.bag_topics import message_class, to_profile
 from body_tracking.nodes.common import (
     BODY,
     REFERENCE,
     RELIABLE,
+    ROS,
     SENSORS,
     WORLD_FRAME,
     Alarm,
@@ -44,6 +59,7 @@ from body_tracking.nodes.common import (
 )
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import LATCHED, Qos
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
@@ -57,6 +73,7 @@ PARAMETERS = (
     ORDER_WAIT,
     PREDICT_AFTER,
     ORIENTATIONS,
+    *PEOPLE,
     *filter_table(),
     RELIABLE,
 )
@@ -74,7 +91,7 @@ class SkeletonFilterNode(GraphNode):
     PARAMETERS = PARAMETERS
 
     def __init__(self) -> None:
-        self.stage: FilterStage | None = None
+        self.stage: FilterStage | PeopleStage | None = None
         self.inputs: list[Subscription] = []
         self.outputs: dict[str, Publisher] = {}
         self.sent_ns: int | None = None
@@ -95,39 +112,35 @@ class SkeletonFilterNode(GraphNode):
             graph.check_body(given["body"]),
             given["predict_after"],
             given["order_wait"],
+            people_from(values),
         )
-        before, stage = self.stage, FilterStage(settings, self.publish, self.wanted, time.monotonic_ns)
-        if before is not None and before.by_sensor and stage.by_sensor:
-            stage.alignment = before.alignment  # latched poses come once
-        self.stage = stage
+        before, stage = self.stage, make_stage(settings, self.publish, self.wanted, time.monotonic_ns)
         if before is not None:
-            self.advertise(values)
+            stage.inherit(before)
+        self.stage = stage
+        self.told_apart = {graph.FILTERED} | {topic for topic in stage.topics if topic.endswith("/model_state")}
+        if before is not None:
+            self.advertise()
             if before.by_sensor != stage.by_sensor:
                 self.connect(values)
 
     def start(self) -> None:
         """Connect."""
-        self.advertise(self.values)
+        self.ids = IdsList and self.create_publisher(IdsList, graph.TRACKED, to_profile(RELIABLE_QOS))
+        self.tracked: tuple[str, ...] = ()
+        self.advertise()
         self.connect(self.values)
         self.waiting = Alarm(self, self.on_alarm)
         self.silence = Alarm(self, self.on_alarm, self.now_ns)
 
-    def advertise(self, values: Mapping[str, Value]) -> None:
+    def advertise(self) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
         assert self.stage is not None
-        skeletons, body = self.skeleton_qos(), str(values["body"])
-        topics: dict[str, tuple[type[Any], Any]] = {graph.FILTERED: (PointCloud2, skeletons)}
-        if self.stage.models:
-            topics |= {
-                graph.MODEL_STATE: (JointState, skeletons),
-                graph.MODEL_STATE_STDDEV: (JointState, skeletons),
-                graph.MODEL_COVARIANCE: (Image, skeletons),
-                graph.segments_topic(body): (MultiDOFJointState, self.result_qos()),
-                graph.urdf_topic(body): (String, to_profile(graph.URDF_QOS)),
-            }
-        for topic in topics.keys() - self.outputs.keys():
-            kind, qos = topics[topic]
-            self.outputs[topic] = self.create_publisher(kind, topic, qos)
+        qos = {SEGMENTS: self.result_qos(), STRING: to_profile(graph.URDF_QOS)}
+        for topic, kind in self.stage.topics.items():
+            if topic not in self.outputs:
+                profile = qos.get(kind) or self.skeleton_qos()
+                self.outputs[topic] = self.create_publisher(message_class(kind), topic, profile)
 
     def connect(self, values: Mapping[str, Value]) -> None:
         """Listen to what the filter takes, and to nothing else."""
@@ -166,7 +179,7 @@ class SkeletonFilterNode(GraphNode):
         """Filter and publish."""
         assert self.stage is not None
         self.sent_ns = sent_ns
-        self.stage.on_fused(skeletons[0], self.now_ns())
+        self.stage.on_fused(skeletons, self.now_ns())
         self.set_alarms()
 
     def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
@@ -199,10 +212,20 @@ class SkeletonFilterNode(GraphNode):
             self.set_alarms()
 
     def set_alarms(self) -> None:
-        """For what is due next."""
+        """For what is due next; and say so if others are tracked now."""
         assert self.stage is not None
+        if self.stage.tracked != self.tracked:
+            self.tell_tracked()
         self.waiting.at(self.stage.deadline_ns)
         self.silence.at(self.stage.due_ns)
+
+    def tell_tracked(self) -> None:
+        """The ids of those who are tracked, for those who follow ROS4HRI (REP-155)."""
+        assert self.stage is not None
+        self.tracked = self.stage.tracked
+        if self.ids is not None:
+            header = to_header(self.now_ns(), str(self.values["world_frame"]), ROS)
+            self.ids.publish(IdsList(header=header, ids=list(self.tracked)))
 
     def wanted(self, topic: str) -> bool:
         """Whether anybody listens."""
@@ -210,23 +233,22 @@ class SkeletonFilterNode(GraphNode):
 
     def publish(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
         """One message of the filter."""
-        if topic in (graph.FILTERED, graph.MODEL_STATE):
+        if topic in self.told_apart:
             self.send(self.outputs[topic], cdr, stamp_ns, self.sent_ns)
         else:
             self.outputs[topic].publish(cdr)
 
     def time_jumped_back(self, topic: str) -> None:
-        """Start anew; of a sensor, the stage finds out what that means for the others."""
+        """Start anew; of a sensor, the stage finds out by itself."""
         assert self.stage is not None
         if topic == graph.FUSED:
             self.stage.reset()
-        else:
-            self.stage.sensor_jumped_back(topic.removeprefix("/").removesuffix(graph.SKELETON_SUFFIX))
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """The filter's counters."""
         assert self.stage is not None
-        return 0, str(self.values["filter"]), dict(self.stage.counters)
+        self.tell_tracked()
+        return 0, str(self.values["filter"]), {"tracked": ", ".join(self.tracked), **self.stage.counters}
 
 
 def main() -> None:

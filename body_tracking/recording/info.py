@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,6 +25,7 @@ class TopicSummary:
         count: messages that can be read.
         rate: mean rate in hertz, between its first and its last message; None with fewer than two.
         qos: what its publishers offered.
+        longest_gap: seconds between two messages at most; None with fewer than two.
     """
 
     name: str
@@ -31,6 +33,7 @@ class TopicSummary:
     count: int
     rate: float | None
     qos: tuple[Qos, ...]
+    longest_gap: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,7 @@ class BagInfo:
         messages: that can be read.
         topics: by name.
         warnings: what is missing or damaged.
+        complete: it was read to its end.
     """
 
     path: Path
@@ -54,37 +58,61 @@ class BagInfo:
     messages: int
     topics: tuple[TopicSummary, ...]
     warnings: list[str]
+    complete: bool = True
 
 
-def bag_info(path: Path | str) -> BagInfo:
+def bag_info(path: Path | str, deadline: float | None = None) -> BagInfo:
     """Look through a whole bag; what is counted is what can really be read.
+
+    Args:
+        path: a folder, or a single mcap file.
+        deadline: steady time at which to stop, seconds; None for never.
 
     Raises:
         BagError: nothing there can be read as a recording.
     """
+    complete = True
     with BagReader(path) as reader:
-        spans: dict[str, tuple[int, int, int]] = {}
+        spans: dict[str, _Span] = {}
         for message in reader.messages():
-            count, first, last = spans.get(message.topic, (0, message.log_time_ns, message.log_time_ns))
-            spans[message.topic] = (count + 1, first, max(last, message.log_time_ns))
+            span = spans.setdefault(message.topic, _Span(message.log_time_ns, message.log_time_ns))
+            span.add(message.log_time_ns)
+            if deadline is not None and time.monotonic() > deadline:
+                complete = False
+                break
         topics = []
         for name, topic in reader.topics.items():
-            count, first, last = spans.get(name, (0, 0, 0))
-            rate = (count - 1) * NANOSECONDS / (last - first) if last > first else None
-            topics.append(TopicSummary(name, topic.type_name, count, rate, topic.offered))
+            span = spans.get(name, _Span(0, 0))
+            known = span.last > span.first
+            rate = (span.count - 1) * NANOSECONDS / (span.last - span.first) if known else None
+            gap = span.longest / NANOSECONDS if known else None
+            topics.append(TopicSummary(name, topic.type_name, span.count, rate, topic.offered, gap))
+        start_ns = min((span.first for span in spans.values()), default=0)
         return BagInfo(
             path=Path(path),
             files={file.path.name: file.path.stat().st_size for file in reader.files},
-            start_ns=min((first for _, first, _ in spans.values()), default=0),
-            duration_s=(
-                max((last for *_, last in spans.values()), default=0)
-                - min((first for _, first, _ in spans.values()), default=0)
-            )
-            / NANOSECONDS,
-            messages=sum(count for count, *_ in spans.values()),
+            start_ns=start_ns,
+            duration_s=(max((span.last for span in spans.values()), default=0) - start_ns) / NANOSECONDS,
+            messages=sum(span.count for span in spans.values()),
             topics=tuple(topics),
             warnings=reader.warnings,
+            complete=complete,
         )
+
+
+@dataclass(slots=True)
+class _Span:
+    """Log times of a topic, nanoseconds."""
+
+    first: int
+    last: int
+    count: int = 0
+    longest: int = 0
+
+    def add(self, time_ns: int) -> None:
+        self.count += 1
+        self.longest = max(self.longest, time_ns - self.last)
+        self.last = max(self.last, time_ns)
 
 
 def _as_json(info: BagInfo) -> str:

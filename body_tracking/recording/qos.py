@@ -55,6 +55,8 @@ class Qos:
 RELIABLE = Qos()
 SENSOR_DATA = Qos(reliability="best_effort", depth=5)
 LATCHED = Qos(durability="transient_local", depth=10)
+LATEST = Qos(reliability="best_effort", depth=1)
+"""To ask for: whatever is the newest, at no cost to who sends it."""
 
 
 def offer_for(recorded: Sequence[Qos]) -> Qos:

@@ -26,9 +26,11 @@ from body_tracking.filtering import (
     INPUT,
     ORDER_WAIT,
     ORIENTATIONS,
+    PEOPLE,
     PREDICT_AFTER,
     filter_parameters,
     filter_table,
+    people_from,
 )
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.fusion.fusion import FusionParameters
@@ -94,14 +96,14 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
     return {graph.skeleton_topic(name): name for name in names}
 
 
-def skeletons_of(
+def frames_of(
     bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
-) -> Iterator[tuple[str, Skeleton, int, bytes]]:
-    """The subject of each sensor's frames in log-time order: sensor, skeleton, log time, the message itself.
+) -> Iterator[tuple[str, tuple[Skeleton, ...], int, bytes]]:
+    """Each sensor's frames in log-time order: sensor, the bodies in it, log time, the message itself.
 
-    Malformed messages are counted and skipped, with the last reason in ``counters`` only as a number per topic.
+    Malformed messages are counted and skipped, with the last reason in ``counters`` only as a number per topic; so are
+    frames without a body.
     """
-    subjects = {sensor: SubjectSelector() for sensor in topics.values()}
     last: dict[str, int] = {}
     for raw in bag.messages(topics.keys()):
         sensor = topics[raw.topic]
@@ -113,13 +115,27 @@ def skeletons_of(
         stamp = skeletons[0].stamp_ns
         if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
             counters["time jumps"] += 1
+        last[sensor] = stamp
+        if not any(skeleton.valid.any() for skeleton in skeletons):
+            counters["frames without a body"] += 1
+            continue
+        yield sensor, skeletons, raw.log_time_ns, raw.cdr
+
+
+def skeletons_of(
+    bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
+) -> Iterator[tuple[str, Skeleton, int, bytes]]:
+    """The same with the body that is nearest to the sensor, as long as it is there, instead of all."""
+    subjects = {sensor: SubjectSelector() for sensor in topics.values()}
+    last: dict[str, int] = {}
+    for sensor, skeletons, log_time_ns, cdr in frames_of(bag, topics, counters):
+        stamp = skeletons[0].stamp_ns
+        if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
             subjects[sensor].reset()
         last[sensor] = stamp
         subject = subjects[sensor].pick(skeletons)
-        if subject is None:
-            counters["frames without a body"] += 1
-            continue
-        yield sensor, subject, raw.log_time_ns, raw.cdr
+        assert subject is not None  # a body is there
+        yield sensor, subject, log_time_ns, cdr
 
 
 class Progress:
@@ -173,14 +189,14 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             beside = _Passed(bag, truth, downstream)
             felt = _Felt(bag, inertial, downstream, upstream, counters)
             started = False
-            for sensor, skeleton, log_time_ns, cdr in skeletons_of(bag, topics, counters):
+            for sensor, skeletons, log_time_ns, cdr in frames_of(bag, topics, counters):
                 beside.until(log_time_ns)
                 felt.until(log_time_ns)
                 if not started:
                     started = True
                     upstream.start(log_time_ns)
                 downstream.take(graph.skeleton_topic(sensor), cdr, log_time_ns)
-                upstream.push(sensor, skeleton, log_time_ns)
+                upstream.push(sensor, skeletons, log_time_ns)
                 progress.at(log_time_ns)
             beside.until(None)
             felt.until(None)
@@ -295,13 +311,21 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings that a command line asks for."""
     file = args.params_file
     calibration, _ = parameters_for("calibration", CalibrationParameters, file, {**_SHARED, "calibration_file": ""})
-    fusion, shared = parameters_for("fusion", FusionParameters, file, _SHARED)
+    whom: dict[str, Value] = {item.name: item.default for item in PEOPLE}
+    fusion, shared = parameters_for("fusion", FusionParameters, file, {**_SHARED, **whom})
     own = {**_SHARED, "body": ""}
-    table = (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, ORIENTATIONS, *filter_table())
+    table = (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, ORIENTATIONS, *PEOPLE, *filter_table())
     filtering, _ = values_for("skeleton_filter", table, file, own)
-    values_for("joint_angles", ANGLES, file, own)
+    values_for("joint_angles", ANGLES, file, {**own, **whom})
     # What one node is told and another must know: from the command line, else from the file.
-    chosen = graph.with_file(graph.GraphOptions(filter_name=args.filter or "", convention=args.convention or ""), file)
+    options = graph.GraphOptions(
+        filter_name=args.filter or "", convention=args.convention or "", subject=args.subject or "", people=args.people
+    )
+    chosen = graph.with_file(options, file)
+    if chosen.subject:
+        filtering["subject"] = chosen.subject
+    if chosen.people:
+        filtering["people"] = chosen.people
     filter_name = chosen.filter_name or DEFAULT_FILTER
     imus = _imus_from(chosen, file)
     return ReplaySettings(
@@ -320,12 +344,13 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         args.calibration,
         imus,
         _names(filtering["orientations"]) or tuple(each.segment for each in graph.imu_topics(chosen.imus)),
+        people_from(filtering),
     )
 
 
 def _imus_from(chosen: graph.GraphOptions, file: Path | None) -> ImuSettings | None:
     """The inertial sensors that a parameters file lists; None where it lists none."""
-    values, _ = values_for("imu_skeleton", IMU_PARAMETERS, file, _SHARED)
+    values, _ = values_for("imu_skeleton", IMU_PARAMETERS, file, {**_SHARED, "subject": ""})
     if not chosen.imus:
         return None
     parameters: dict[str, Any] = fields_of(TrackingParameters, values)
@@ -354,7 +379,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
     command.add_argument("--calibration", type=Path, metavar="FILE", help="start from this calibration (YAML)")
     command.add_argument("--params-file", type=Path, metavar="F", help="ROS parameters file, as for the nodes")
-    command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the person (default: %(default)s)")
+    command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
+    graph.add_people(command)
     command.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=run)

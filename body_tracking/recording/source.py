@@ -62,9 +62,14 @@ class RecordingSource:
         return self._next is None
 
     @property
-    def counters(self) -> Mapping[str, int]:
+    def counters(self) -> Mapping[str, object]:
         """Frames left out because they were late."""
         return self._counters
+
+    @property
+    def problem(self) -> str:
+        """None, ever."""
+        return ""
 
     def close(self) -> None:
         """Let a ``read`` in another thread return."""

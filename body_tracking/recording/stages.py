@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -31,16 +31,20 @@ from body_tracking.filtering import (
     DEFAULT_ORDER_WAIT,
     DEFAULT_PREDICT_AFTER,
     FilterSettings,
-    FilterStage,
+    angle_streams,
+    by_person,
+    make_stage,
     orientation_topics,
 )
 from body_tracking.filters import DEFAULT_FILTER
-from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.fusion.fusion import FusionParameters
+from body_tracking.fusion.people import PeopleParameters
+from body_tracking.fusion.people_fusion import PeopleFusion
+from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import ImuSettings, ImuStage
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.tracking import AngleStream, state_estimate
+from body_tracking.kinematics.tracking import state_estimate
 from body_tracking.messages import (
-    IMAGE,
     IMU,
     JOINT_STATE,
     MAGNETIC_FIELD,
@@ -81,13 +85,14 @@ class ReplaySettings:
         order_wait: seconds that a sensor's frame waits at most for another's older one, where the filter takes these.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
         angles_input: what they are made of; ``graph.AUTO`` for what is the filter's own.
-        body: the id in topics and names of angles.
+        body: the id in topics and names of angles, of one subject.
         calibration: parameters of the calibration.
         fusion: parameters of the fusion.
         filter_parameters: parameters of the filter.
         calibration_file: start from this calibration; None for none.
         imus: inertial sensors, if there are any.
         orientations: segments whose orientations by these the filter takes.
+        people: whom to track.
     """
 
     sensors: tuple[str, ...]
@@ -105,6 +110,7 @@ class ReplaySettings:
     calibration_file: Path | None = None
     imus: ImuSettings | None = None
     orientations: tuple[str, ...] = ()
+    people: PeopleParameters = field(default_factory=PeopleParameters)
 
     def role(self) -> graph.FilterRole:
         """What the filter is to do.
@@ -132,6 +138,7 @@ class ReplaySettings:
             body=self.body,
             predict_after=self.predict_after,
             order_wait=self.order_wait,
+            people=self.people,
         )
 
 
@@ -155,22 +162,33 @@ class Upstream:
         self.calibration = OnlineCalibration(settings.sensors, settings.calibration, reference)
         if settings.calibration_file is not None:
             self.calibration.load(load(settings.calibration_file))
-        self.fusion = Fusion(settings.sensors, settings.fusion, reference)
+        self.fusion = PeopleFusion(settings.sensors, settings.fusion, settings.people, reference)
         self.imus = None if settings.imus is None else ImuStage(settings.imus)
         self._reference = reference or settings.sensors[0]
+        self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
+        self._last_ns: dict[str, int] = {}
+        several = settings.people.subject == ALL
+        self._wearer = HeldSubject(settings.people.hold) if several else SubjectSelector()
         self._sink = sink
 
     def start(self, log_time_ns: int) -> None:
         """What is known before the first frame."""
         self._calibrated(self.calibration.current_update(), log_time_ns)
 
-    def push(self, sensor: str, skeleton: Skeleton, log_time_ns: int) -> None:
-        """One frame of one sensor."""
+    def push(self, sensor: str, skeletons: Sequence[Skeleton], log_time_ns: int) -> None:
+        """One frame of one sensor, with all bodies in it."""
+        stamp_ns = skeletons[0].stamp_ns
         if self.imus is not None and sensor == self._reference:
-            self.imus.on_frame(skeleton.stamp_ns, log_time_ns)
-        for update in self.calibration.push(sensor, skeleton, log_time_ns):
+            self.imus.on_frame(stamp_ns, log_time_ns)
+        if stamp_ns < self._last_ns.get(sensor, stamp_ns) - JUMP_BACK_NS:
+            self._subjects[sensor].reset()
+        self._last_ns[sensor] = stamp_ns
+        subject = self._subjects[sensor].pick(skeletons)
+        if subject is None:
+            return
+        for update in self.calibration.push(sensor, subject, log_time_ns):
             self._calibrated(update, log_time_ns)
-        for fused in self.fusion.push(sensor, skeleton, log_time_ns):
+        for fused in self.fusion.push(sensor, skeletons, log_time_ns):
             self._fused(fused, log_time_ns)
 
     def feel(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
@@ -196,11 +214,11 @@ class Upstream:
             for fused in self.fusion.poll(self.fusion.deadline_ns):
                 self._fused(fused, log_time_ns)
 
-    def _fused(self, fused: Skeleton, log_time_ns: int) -> None:
-        cdr = encode_skeletons([fused])
+    def _fused(self, fused: tuple[Skeleton, ...], log_time_ns: int) -> None:
+        cdr = encode_skeletons(fused)
         self._sink.take(graph.FUSED, cdr, log_time_ns)
-        if self.imus is not None:
-            self.imus.on_skeleton(_decoded(cdr)[0], log_time_ns)
+        if self.imus is not None and (wearer := self._wearer.pick(_decoded(cdr))) is not None:
+            self.imus.on_skeleton(wearer, log_time_ns)
 
     def _calibrated(self, update: CalibrationUpdate, log_time_ns: int) -> None:
         result = update.result
@@ -247,32 +265,26 @@ class FilterAndAngles:
     def __init__(self, settings: ReplaySettings, publish: Callable[[str, bytes], None]) -> None:
         role = settings.role()
         self.frames = 0
-        self._filter = FilterStage(settings.filter_settings(), self._filtered)
-        self._angles = AngleStream(role.convention)
+        self._filter = make_stage(settings.filter_settings(), self._filtered)
+        self._angles = angle_streams(role.convention, settings.body, settings.people)
+        self._several = settings.people.subject == ALL
         self._of_model = role.angles_input == graph.MODEL_INPUT
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in settings.sensors}
         self._orientations = orientation_topics(settings.orientations)
-        self._last_ns: dict[str, int] = {}
-        self._model_state = b""
+        # of each person, state and covariance
+        models = {body: graph.model_topics(body, self._several) for body in self._angles}
+        self._bodies_of_states = {topics.state: body for body, topics in models.items()}
+        self._bodies_of_covariances = {topics.covariance: body for body, topics in models.items()}
+        self._model_states: dict[str, bytes] = {}
         self._publish = publish
-        self._body = settings.body
 
     @property
     def published(self) -> dict[str, tuple[str, Qos]]:
         """Topics with their types and QoS."""
-        topics = {
-            graph.FILTERED: (POINT_CLOUD, SENSOR_DATA),
-            graph.joint_states_topic(self._body): (JOINT_STATE, RELIABLE),
-            graph.joint_states_stddev_topic(self._body): (JOINT_STATE, RELIABLE),
-        }
-        if self._filter.models:
-            topics |= {
-                graph.MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
-                graph.MODEL_STATE_STDDEV: (JOINT_STATE, SENSOR_DATA),
-                graph.MODEL_COVARIANCE: (IMAGE, SENSOR_DATA),
-                graph.segments_topic(self._body): (SEGMENTS, RELIABLE),
-                graph.urdf_topic(self._body): (STRING, graph.URDF_QOS),
-            }
+        topics = {topic: (kind, _QOS.get(kind, SENSOR_DATA)) for topic, kind in self._filter.topics.items()}
+        for body in self._angles:
+            topics[graph.joint_states_topic(body)] = JOINT_STATE, RELIABLE
+            topics[graph.joint_states_stddev_topic(body)] = JOINT_STATE, RELIABLE
         return topics
 
     @property
@@ -284,9 +296,9 @@ class FilterAndAngles:
         """One message of what comes before; others than those it needs are ignored."""
         if not self._filter.by_sensor:
             if topic == graph.FUSED:
-                self._filter.on_fused(_decoded(cdr)[0], log_time_ns)
+                self._filter.on_fused(_decoded(cdr), log_time_ns)
         elif topic in self._sensors:
-            self._seen(self._sensors[topic], _decoded(cdr), log_time_ns)
+            self._filter.on_sensor(self._sensors[topic], _decoded(cdr), log_time_ns)
         elif topic in self._orientations:
             measurement = message_to_orientation(deserialize(IMU, cdr), self._orientations[topic])
             self._filter.on_orientation(measurement, log_time_ns)
@@ -300,36 +312,39 @@ class FilterAndAngles:
         while (deadline_ns := self._filter.deadline_ns) is not None:
             self._filter.poll(deadline_ns)
 
-    def _seen(self, sensor: str, skeletons: tuple[Skeleton, ...], log_time_ns: int) -> None:
-        stamp = skeletons[0].stamp_ns
-        if stamp < self._last_ns.get(sensor, stamp) - JUMP_BACK_NS:
-            self._filter.sensor_jumped_back(sensor)
-        self._last_ns[sensor] = stamp
-        self._filter.on_sensor(sensor, skeletons, log_time_ns)
-
     def _filtered(self, topic: str, cdr: bytes, stamp_ns: int) -> None:
         """What the filter publishes."""
         self._publish(topic, cdr)
-        if topic == graph.FILTERED and not self._of_model:
-            (arrived,) = _decoded(cdr)
-            self._tell(self._angles.of_skeleton(arrived), arrived.frame_id)
-        elif topic == graph.MODEL_STATE:
-            self._model_state = cdr
-        elif topic == graph.MODEL_COVARIANCE and self._of_model:
-            model = self._angles.model
-            state, covariance = decode_model_state(self._model_state, model), decode_covariance(cdr, model)
+        if topic == graph.FILTERED:
+            if not self._of_model:
+                self._arrived(_decoded(cdr))
+        elif topic in self._bodies_of_states:
+            self._model_states[self._bodies_of_states[topic]] = cdr
+        elif self._of_model and topic in self._bodies_of_covariances:
+            body = self._bodies_of_covariances[topic]
+            angles = self._angles[body]
+            state = decode_model_state(self._model_states[body], angles.model)
+            covariance = decode_covariance(cdr, angles.model)
             assert state is not None
             assert covariance is not None
             _, frame_id, q, velocity = state
-            estimate = state_estimate(model, stamp_ns, frame_id, q, velocity, covariance[1])
-            self._tell(self._angles.of_estimate(estimate), frame_id)
+            estimate = state_estimate(angles.model, stamp_ns, frame_id, q, velocity, covariance[1])
+            self._tell(body, angles.of_estimate(estimate), frame_id)
 
-    def _tell(self, angles: JointAngles | None, frame_id: str) -> None:
+    def _arrived(self, skeletons: tuple[Skeleton, ...]) -> None:
+        for body, skeleton in by_person(skeletons, self._angles, several=self._several):
+            self._tell(body, self._angles[body].of_skeleton(skeleton), skeleton.frame_id)
+
+    def _tell(self, body: str, angles: JointAngles | None, frame_id: str) -> None:
         if angles is not None:
-            states, stddevs = encode_angles(angles, self._body, frame_id)
-            self._publish(graph.joint_states_topic(self._body), states)
-            self._publish(graph.joint_states_stddev_topic(self._body), stddevs)
+            states, stddevs = encode_angles(angles, body, frame_id)
+            self._publish(graph.joint_states_topic(body), states)
+            self._publish(graph.joint_states_stddev_topic(body), stddevs)
             self.frames += 1
+
+
+_QOS: Mapping[str, Qos] = {SEGMENTS: RELIABLE, STRING: graph.URDF_QOS}
+"""Of what the filter publishes, by type; all else is sensor data."""
 
 
 class Downstream:

@@ -1,7 +1,8 @@
 """The place for live sensors: what a backend offers to the ``kinect_skeleton`` node, and how it is found by name.
 
 A new backend is a class with the methods of :class:`SkeletonSource` whose module calls :func:`register`; the node, its
-topics and everything after them stay as they are. ``recording`` is the one there is (``recording/source.py``).
+topics and everything after them stay as they are. There are ``recording`` (``recording/source.py``) and ``network``
+(``network.py``).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Protocol
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.sensors import RecordedFrame
+from body_tracking.sensors.kinect_protocol import DEFAULT_PORT
 
 
 class SourceError(BodyTrackingError):
@@ -30,6 +32,10 @@ class SourceSettings:
         rate: seconds of the recording per second.
         loop: begin again at the end.
         start_time: wall time, seconds, at which the recording's first frame of any sensor plays; 0 for now.
+        address: on which ``network`` listens: an IP address of this computer.
+        port: likewise.
+        key_file: holds the key that senders share; empty for none, on a loopback address.
+        least_delay: seconds that the sensor takes at least from capture until its frame can be sent.
     """
 
     sensor: str
@@ -39,6 +45,10 @@ class SourceSettings:
     rate: float = 1.0
     loop: bool = False
     start_time: float = 0.0
+    address: str = "127.0.0.1"
+    port: int = DEFAULT_PORT
+    key_file: str = ""
+    least_delay: float = 0.0
 
 
 class SkeletonSource(Protocol):
@@ -49,8 +59,12 @@ class SkeletonSource(Protocol):
         """Whether no frame will ever come again."""
 
     @property
-    def counters(self) -> Mapping[str, int]:
+    def counters(self) -> Mapping[str, object]:
         """What was met so far, such as frames that were dropped."""
+
+    @property
+    def problem(self) -> str:
+        """What keeps frames from coming, in a line, although they may come again; empty if nothing does."""
 
     def read(self, timeout: float) -> RecordedFrame | None:
         """The next frame as soon as it is there; None when none is within the timeout (seconds).

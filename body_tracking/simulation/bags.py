@@ -41,6 +41,7 @@ from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
 from body_tracking.simulation.scene import (
+    MAX_PEOPLE,
     RECEIVED_FROM_NS,
     START_NS,
     WORLD,
@@ -48,6 +49,7 @@ from body_tracking.simulation.scene import (
     Setup,
     SimulatedRecording,
     draw_clock,
+    lanes,
     simulate,
 )
 from body_tracking.skeleton import NANOSECONDS
@@ -203,6 +205,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     command.add_argument("--people", type=int, default=1, metavar="N", help="side by side (default: 1)")
     command.add_argument(
+        "--crossing", action="store_true", help="people walk past each other and hide each other, whatever the motion"
+    )
+    command.add_argument(
         "--imus", default="", metavar="SEGMENT,...", help="segments of the first person with an inertial sensor"
     )
     command.add_argument("--raw", action="store_true", help="inertial sensors do not tell their orientation")
@@ -241,13 +246,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking simulate``."""
     setup = Setup(
-        args.motion,
+        "walking_and_turning" if args.crossing else args.motion,
         _layout_of(args),
         number=args.people,
         seconds=args.seconds,
         seed=args.seed,
         errors=KinectErrors() if args.config is None else read_errors(args.config),
         dark=args.dark,
+        standard=args.crossing,
+        places=lanes(args.people) if args.crossing and 1 <= args.people <= MAX_PEOPLE else None,
     )
     recording = simulate(replace(setup, imus=tuple(_imus(args))))
     write_bag(recording, args.output, overwrite=args.overwrite)

@@ -21,7 +21,7 @@ are greater along the ray than across it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -46,7 +46,7 @@ from body_tracking.parameters import (
     read_file,
 )
 from body_tracking.sensors import RecordedFrame, optical_frame
-from body_tracking.simulation.occlusion import Capsules, obstruction
+from body_tracking.simulation.occlusion import Capsules, obstruction, veil
 from body_tracking.skeleton import (
     BONES,
     MIRROR,
@@ -303,6 +303,8 @@ _FLICKERS: Final[FloatArray] = np.select([JOINT_CLASSES == EXTREMITY, JOINT_CLAS
 _SPINE_WEIGHT, _FAR_DEPTH = 0.4, 0.3
 """What of the variance that grows with yaw the spine has; metres behind it at which a limb has all of the far side."""
 _MIDDLE = 0.75
+_LOST_FROM, _FIND_AGAIN = 0.6, 0.15
+"""Share of the trunk's joints that must be behind others for a body to be lost, and the seconds that it stays so."""
 """Cover from which a joint is behind the middle of something."""
 _REST_LEVEL = -0.27
 """Shoulder against SpineShoulder of a person who stands, as a share of its distance (``kinect_pairs``)."""
@@ -475,8 +477,17 @@ class SimulatedKinect:
         capsules: Capsules,
         rng: np.random.Generator,
         misreading: Misreading | None = None,
+        others: Sequence[tuple[FloatArray, Capsules]] = (),
     ) -> tuple[FloatArray, NDArray[np.uint8]]:
         """What it makes of one person; arguments as of :meth:`observe`.
+
+        Args:
+            times: as there, like all that follows but the last.
+            truth: as there.
+            capsules: as there.
+            rng: as there.
+            misreading: as there.
+            others: who may stand before the person: (n, 25, 3) metres, true joints in ``world``, and flesh of each.
 
         Returns:
             (n, 25, 3) metres in the optical frame, NaN where a joint is not tracked, and its (n, 25) states.
@@ -493,7 +504,11 @@ class SimulatedKinect:
         sight = (truth - self.pose.translation) @ self.pose.rotation
         steps = np.diff(times)
         period = float(np.median(steps)) if len(steps) else 1.0 / self.rate
-        return _Sighting(self.errors, period, rng).of(sight, capsules, misreading)
+        veiled = np.zeros(sight.shape[:2])
+        for joints, flesh in others:
+            other = (joints - self.pose.translation) @ self.pose.rotation
+            np.maximum(veiled, veil(sight, capsules, other, flesh), out=veiled)
+        return _Sighting(self.errors, period, rng).of(sight, capsules, misreading, veiled)
 
     def deliver(
         self,
@@ -586,14 +601,18 @@ class _Sighting:
     period: float
     rng: np.random.Generator
 
-    def of(self, sight: FloatArray, capsules: Capsules, misreading: Misreading) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """True joints in the optical frame to reported ones and their states."""
+    def of(
+        self, sight: FloatArray, capsules: Capsules, misreading: Misreading, veiled: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.uint8]]:
+        """True joints in the optical frame, (n, 25) hidden by others, to reported ones and their states."""
         # one generator per kind of error, so that one kind does not depend on how often another one happens
         for_labels, for_slow, for_states, for_white = self.rng.spawn(4)
         before, in_view = obstruction(sight, capsules), _in_view(sight)
         labels = self._labels(sight, for_labels)
         sight = np.take_along_axis(sight, labels[..., None], axis=1)
-        cover, nearer = (np.take_along_axis(values, labels, axis=1) for values in (before.cover, before.nearer))
+        # the sensor knows the other for somebody else: what is hidden by others is not drawn to them
+        covers = np.maximum(before.cover, veiled), np.where(veiled > before.cover, 0.0, before.nearer)
+        cover, nearer = (np.take_along_axis(values, labels, axis=1) for values in covers)
         in_view = np.take_along_axis(in_view, labels, axis=1)
 
         view = _View.of(sight, self.errors)
@@ -605,6 +624,7 @@ class _Sighting:
         self._keep_lengths(placed, anatomy, length)
         placed += self._new(view, for_white)
         states = self._states(cover, in_view, for_states)
+        states[self._unseen(veiled)] = TrackingState.NOT_TRACKED
         placed[states == TrackingState.NOT_TRACKED] = np.nan
         return placed, states
 
@@ -744,6 +764,12 @@ class _Sighting:
         states = np.where(inferred | flickers, TrackingState.INFERRED, TrackingState.TRACKED).astype(np.uint8)
         states[lost | ~in_view] = TrackingState.NOT_TRACKED
         return states
+
+    def _unseen(self, veiled: FloatArray) -> BoolArray:
+        """(n,) when the body is lost: most of the trunk behind others, and for a moment after that."""
+        hidden = (veiled[:, _ON_TRUNK] > self.errors.hidden_from).mean(axis=1) > _LOST_FROM
+        until = np.convolve(hidden, np.ones(1 + round(_FIND_AGAIN / self.period)))[: len(hidden)]
+        return until > 0.5
 
     def _wander(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """A smooth process of unit variance over the first axis: an Ornstein-Uhlenbeck process, followed by another.

@@ -103,6 +103,24 @@ def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
     return Obstruction(covered, nearer)
 
 
+def veil(sight: FloatArray, capsules: Capsules, other: FloatArray, flesh: Capsules) -> FloatArray:
+    """(n, 25) how deep each joint lies behind somebody else, 0 to 1; as of :func:`obstruction`.
+
+    Args:
+        sight: (n, 25, 3) metres, the joints in the sensor's optical frame.
+        capsules: the flesh round them.
+        other: (n, 25, 3) metres, the other's joints.
+        flesh: round those.
+    """
+    distance = np.linalg.norm(sight, axis=2, keepdims=True)
+    reach = sight * (1.0 - np.minimum(_own_radii(capsules)[:, None] / np.maximum(distance, 1e-9), 1.0))
+    covered = np.zeros(sight.shape[:2])
+    for start, end, radius in zip(flesh.starts, flesh.ends, flesh.radii, strict=True):
+        miss, _ = _nearest_of_rays(reach, other[:, None, start], other[:, None, end])
+        np.maximum(covered, np.clip(1.0 - miss / radius, 0.0, 1.0), out=covered)
+    return covered
+
+
 def _own_radii(capsules: Capsules) -> FloatArray:
     """(25,) metres: the widest capsule that ends in each joint, 0 where none does."""
     radii = np.zeros(N_JOINTS)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from body_tracking.calibration.result import ClockModel
 from body_tracking.errors import BodyTrackingError
@@ -31,6 +33,8 @@ MAX_PEOPLE: Final = 6
 """As many bodies as a Kinect v2 tracks."""
 APART: Final = 0.9
 """Metres from one person to the next, side by side."""
+LANE: Final = 0.7
+"""Metres from one person to the next, who walk past each other."""
 _CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM = 2.0, 50.0
 """Greatest offset and drift of a sensor's clock against the reference sensor's."""
 _STEP = 1e-4
@@ -39,6 +43,31 @@ _STEP = 1e-4
 
 class SceneError(BodyTrackingError):
     """A scene that cannot be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where somebody stands at first, from where the layout puts a single person.
+
+    Attributes:
+        ahead: metres in the direction in which that one faces.
+        left: metres to that one's left.
+        turn: radians by which this one faces further to the left.
+    """
+
+    ahead: float
+    left: float
+    turn: float = 0.0
+
+
+def beside(number: int) -> tuple[Place, ...]:
+    """Side by side: the first where the layout says, the others 1, -1, 2, -2, ... places to the left."""
+    return tuple(Place(0.0, APART * ((k + 1) // 2 * (1 if k % 2 else -1))) for k in range(number))
+
+
+def lanes(number: int, apart: float = LANE) -> tuple[Place, ...]:
+    """One behind the other, every second one turned about: who walks from side to side then passes the next."""
+    return tuple(Place(apart * (0.5 * (number - 1) - k), 0.0, np.pi * (k % 2)) for k in range(number))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +85,7 @@ class Setup:
         standard: the motion as the thesis shows it, without a person's own way.
         errors: of the cameras.
         dark: no light: a Kinect takes 15 frames a second.
+        places: where each stands at first; side by side where there is None.
     """
 
     motion: str
@@ -68,11 +98,14 @@ class Setup:
     standard: bool = False
     errors: KinectErrors = field(default_factory=KinectErrors)
     dark: bool = False
+    places: tuple[Place, ...] | None = None
 
     def __post_init__(self) -> None:
         count = self.number if self.people is None else len(self.people)
         if not 1 <= count <= MAX_PEOPLE:
             raise SceneError(f"{count} people: expected 1 to {MAX_PEOPLE}")
+        if self.places is not None and len(self.places) != count:
+            raise SceneError(f"{len(self.places)} places for {count} people")
         if self.seed < 0:
             raise SceneError(f"seed {self.seed}: must not be negative")
         if self.seconds is not None and not 1.0 <= self.seconds <= 36_000.0:
@@ -203,17 +236,41 @@ def simulate(setup: Setup) -> SimulatedRecording:
         times = sensor.capture_times(duration, rng)
         if number == 0:
             truths = tuple(actor.truth(times) for actor in actors)
-        seen = {
-            body: sensor.see(times, actor.positions(times), actor.person.capsules(), rng, actor.misreading)
-            for body, actor in enumerate(actors)
-        }
-        frames += sensor.deliver(times, seen, START_NS, RECEIVED_FROM_NS, rng)
+        bodies = [(actor.positions(times), actor.person.capsules()) for actor in actors]
+        seen = [
+            sensor.see(times, *body, rng, actor.misreading, bodies[:number] + bodies[number + 1 :])
+            for number, (body, actor) in enumerate(zip(bodies, actors, strict=True))
+        ]
+        frames += sensor.deliver(times, _numbered(seen), START_NS, RECEIVED_FROM_NS, rng)
     frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
     imus = tuple(
         (imu, _felt(imu, actors[0], duration, np.random.default_rng([setup.seed, name, 4, number])))
         for number, imu in enumerate(setup.imus)
     )
     return SimulatedRecording(setup, duration, sensors, tuple(frames), truths, imus)
+
+
+_Seen = tuple[FloatArray, NDArray[np.uint8]]
+"""Positions and states of one person."""
+
+
+def _numbered(seen: Sequence[_Seen]) -> dict[int, _Seen]:
+    """What a sensor sees of each person by its own numbers: who appears gets the lowest that is free."""
+    if len(seen) == 1:
+        return {0: seen[0]}
+    there = np.stack([states.any(axis=1) for _, states in seen], axis=1)
+    numbered = {number: (np.full_like(seen[0][0], np.nan), np.zeros_like(seen[0][1])) for number in range(len(seen))}
+    taken: dict[int, int] = {}
+    edges = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1
+    for begin, end in pairwise([0, *edges.tolist(), len(there)]):
+        present = np.flatnonzero(there[begin]).tolist() if end > begin else []
+        taken = {person: number for person, number in taken.items() if person in present}
+        for person in present:
+            if person not in taken:
+                taken[person] = min(numbered.keys() - taken.values())
+            positions, states = numbered[taken[person]]
+            positions[begin:end], states[begin:end] = seen[person][0][begin:end], seen[person][1][begin:end]
+    return numbered
 
 
 def draw_clock(rng: np.random.Generator) -> ClockModel:
@@ -223,19 +280,18 @@ def draw_clock(rng: np.random.Generator) -> ClockModel:
 
 
 def _actors(setup: Setup, name: int) -> tuple[_Actor, ...]:
-    """Side by side, the first one where the layout says."""
+    """Each at their place."""
     rng = np.random.default_rng([setup.seed, 1])
     people: Sequence[Person] = setup.people or [Person.draw(rng) for _ in range(setup.number)]
     yaw = setup.layout.yaw
-    left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     actors = []
-    for number, person in enumerate(people):
+    for number, (person, place) in enumerate(zip(people, setup.places or beside(len(people)), strict=True)):
         own = None if setup.standard else np.random.default_rng([setup.seed, name, 2, number])
         movement = make_movement(setup.motion, person, own, setup.seconds)
-        # 0, 1, -1, 2, -2, ... places to the left of the first
-        place = (number + 1) // 2 * (1 if number % 2 else -1)
         misreading = Misreading.draw(np.random.default_rng([setup.seed, 6, number]))
-        actors.append(_Actor(person, misreading, movement, setup.layout.position + place * APART * left, yaw))
+        position = setup.layout.position + place.ahead * ahead + place.left * left
+        actors.append(_Actor(person, misreading, movement, position, yaw + place.turn))
     return tuple(actors)
 
 

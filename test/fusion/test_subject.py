@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.skeleton import Skeleton
+from body_tracking.fusion.subject import HeldSubject, SubjectSelector
+from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 
 def body(number: int, distance: float, state: int = 2) -> Skeleton:
@@ -42,3 +44,19 @@ def test_a_body_without_a_joint_is_nobody() -> None:
     picked = selector.pick([body(1, 1.0, state=0), body(2, 9.0)])
     assert picked is not None
     assert picked.body == 2
+
+
+def test_one_of_several_is_held_through_messages_without_that_one() -> None:
+    held = HeldSubject(1.0)
+
+    def pick(seconds: float, *numbers: tuple[int, float]) -> int | None:
+        stamp_ns = round(seconds * NANOSECONDS)
+        found = held.pick([replace(body(number, distance), stamp_ns=stamp_ns) for number, distance in numbers])
+        return None if found is None else found.body
+
+    assert pick(10.0, (1, 3.0), (2, 2.0)) == 2
+    assert pick(10.1, (1, 1.0)) is None
+    assert pick(10.2, (1, 1.0), (2, 2.0)) == 2
+    assert pick(11.1, (1, 1.0)) is None
+    assert pick(11.3, (1, 1.0), (3, 4.0)) == 1
+    assert pick(2.0, (3, 1.0)) == 3  # time jumped back

@@ -58,7 +58,7 @@ def recorded(sensor: str) -> list[Skeleton]:
     [
         ("kinect_skeleton", "sensr:=kinect1", "unknown parameter 'sensr'; did you mean 'sensor'?"),
         ("kinect_skeleton", "rate:=-1.0", "parameter 'rate': -1.0, expected 0.01 to 100"),
-        ("kinect_skeleton", "backend:=xbox", "parameter 'backend': 'xbox', expected one of recording"),
+        ("kinect_skeleton", "backend:=xbox", "parameter 'backend': 'xbox', expected one of network, recording"),
         ("kinect_skeleton", "sensor:=fused", "sensor name 'fused' is reserved"),
         ("kinect_skeleton", "file:=/nowhere.csv", "/nowhere.csv: no such file"),
         ("calibration", "calibration_fil:=a", "unknown parameter 'calibration_fil'"),

@@ -21,6 +21,7 @@ from body_tracking.simulation.scene import (
     SceneError,
     Setup,
     SimulatedRecording,
+    lanes,
     simulate,
 )
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
@@ -112,6 +113,28 @@ def test_people_stand_side_by_side_and_are_told_apart() -> None:
         assert len({skeleton.stamp_ns for skeleton in frame.skeletons}) == 1
 
 
+def test_who_walks_behind_another_is_lost_and_comes_back_and_the_truth_has_both() -> None:
+    setup = Setup("walking_and_turning", around([0.0]), number=2, seconds=8.0, standard=True, places=lanes(2))
+    recording = simulate(setup)
+    near, far = (truth.positions[:, Joint.SPINE_MID] for truth in recording.truths)
+    assert (near[:, 0] < far[:, 0]).all() and len(near) == len(far) > 200
+    hidden = 0
+    for frame in recording.frames:
+        instant = np.abs(recording.truths[0].stamps_ns - frame.skeletons[0].stamp_ns).argmin()
+        # by the angle between their lines of sight
+        apart = abs(near[instant, 1] / near[instant, 0] - far[instant, 1] / far[instant, 0])
+        if len(frame.skeletons) == 1:
+            hidden += 1
+            (seen,) = frame.skeletons
+            assert np.abs(recording.sensors[0].pose.apply(seen.positions[Joint.SPINE_MID]) - near[instant]).max() < 0.3
+            assert apart < 0.4
+        else:
+            assert apart > 0.02 and {skeleton.body for skeleton in frame.skeletons} == {0, 1}
+    assert 5 < hidden < 0.5 * len(recording.frames)
+    alone = simulate(replace(setup, people=(recording.truths[0].person,), places=lanes(2)[:1]))
+    assert_array_equal(alone.truths[0].positions, recording.truths[0].positions)
+
+
 def test_frames_come_in_the_order_of_receipt_and_after_their_capture() -> None:
     recording = simulate(Setup("move_along", seconds=SHORT, seed=3))
     received = [frame.received_ns for frame in recording.frames]
@@ -139,6 +162,7 @@ def test_an_inertial_sensor_turns_as_its_segment_does() -> None:
         ({"number": 7}, "7 people"),
         ({"people": ()}, "0 people"),
         ({"seed": -1}, "seed -1"),
+        ({"places": lanes(2)}, "2 places for 1 people"),
         ({"seconds": 0.5}, r"0\.5 seconds"),
         ({"seconds": float("nan")}, "nan seconds"),
     ],

@@ -1,0 +1,418 @@
+"""The full graph for an hour at ten times the rate: does memory grow, does anything die, does it become later?
+
+``body_tracking up`` plays a simulated recording of a person with two Kinects (and, with ``--imus``, inertial sensors)
+again and again, and records. At each beginning stamps jump back, and every node starts anew. Once a minute the recorder
+closes its bag by its service, the bag is deleted, and the next one begins.
+
+Memory is the private part of each process (USS), which others that share its libraries cannot change; beside it the
+table has RSS and PSS. Latency is from the writer's time of a reference sensor's frame to that of the angles with its
+stamp, both by this machine's clock and both noted by the middleware, so that nothing depends on how busy the listener
+is. The rate is what the player reached: it sends everything, later if need be.
+
+The bars: the private memory of no process grows by more than 5 % from the second minute to the last tenth, no process
+dies by itself, and the median latency of the last tenth is that of the first one after the first minute, within a
+fifth. The graph must keep up for the last one to mean something: the table says at which rate it ran, what share of the
+frames came through, and what else the machine did. At the end every node is killed once, and must be there again, with
+angles coming.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+
+import numpy as np
+import psutil
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from four_sensors import nodes_of, running_up
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState, PointCloud2
+from std_srvs.srv import Trigger
+from tqdm import tqdm
+
+from body_tracking import graph
+from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.parameters import SECTION
+from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.skeleton import FloatArray
+
+GROWTH = 0.05
+"""Of private memory, from the second minute to the last tenth."""
+LATER = 1.2
+"""The median latency of the last tenth over that of the first."""
+WARM_UP = 60.0
+"""Seconds that do not count."""
+PERIOD, LISTENING = 10.0, 2.0
+"""Seconds from sample to sample, and for which this process listens at each: it is not to cost a core itself."""
+BACK_WITHIN = 20.0
+"""Seconds after which a node that was killed must be there again."""
+BAG_SECONDS = 60.0
+
+
+@dataclass(slots=True)
+class Samples:
+    """What was seen of the graph.
+
+    Attributes:
+        memory: of each process, rows of (seconds since the start, USS, PSS, RSS), bytes.
+        latency: (seconds, seconds) of frames.
+        progress: (seconds, seconds of the bag played, frames sent, frames that the fusion took).
+        machine: (seconds, load average).
+        deaths: what died by itself, or did not answer.
+    """
+
+    memory: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=lambda: defaultdict(list))
+    latency: list[tuple[float, float]] = field(default_factory=list)
+    progress: list[tuple[float, float, float, float]] = field(default_factory=list)
+    machine: list[tuple[float, float]] = field(default_factory=list)
+    deaths: list[str] = field(default_factory=list)
+
+
+class Ear:
+    """Hears a reference sensor, the angles and the diagnostics."""
+
+    def __init__(self, sensor: str) -> None:
+        rclpy.init()
+        self.node = rclpy.create_node("soak_bench")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.sent: dict[bytes, int] = {}
+        self.latencies: list[float] = []
+        self.angles_at = 0.0
+        self.statuses: dict[str, tuple[float, dict[str, str]]] = {}
+        diagnostics = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.node.create_subscription(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, diagnostics)
+        quick = to_profile(graph.SKELETON)
+        # rclpy passes the message info to callbacks of two arguments
+        on_frame: Any = self._on_frame
+        on_angles: Any = self._on_angles
+        self.node.create_subscription(PointCloud2, graph.skeleton_topic(sensor), on_frame, quick, raw=True)
+        self.node.create_subscription(
+            JointState, graph.joint_states_topic(graph.DEFAULT_BODY), on_angles, quick, raw=True
+        )
+        self.triggers = {name: self.node.create_client(Trigger, f"recorder/{name}") for name in ("start", "stop")}
+
+    def _on_frame(self, cdr: bytes, info: Mapping[str, int]) -> None:
+        self.sent[cdr[4:12]] = info["source_timestamp"]
+
+    def _on_angles(self, cdr: bytes, info: Mapping[str, int]) -> None:
+        self.angles_at = time.time()
+        sent = self.sent.pop(cdr[4:12], None)
+        # what is far off is the same stamp of another round of the bag
+        if sent is not None and 0 <= info["source_timestamp"] - sent < 2_000_000_000:
+            self.latencies.append((info["source_timestamp"] - sent) / 1e9)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.split(":")[0]
+            self.statuses[name] = time.time(), {pair.key: pair.value for pair in status.values}
+
+    def listen(self, seconds: float) -> None:
+        """Take what comes for so long."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def call(self, name: str) -> str:
+        """A service of the recorder; why it did not do what it was asked, or empty."""
+        if not self.triggers[name].wait_for_service(timeout_sec=30.0):
+            return "is not there"
+        future = self.triggers[name].call_async(Trigger.Request())
+        self.executor.spin_until_future_complete(future, timeout_sec=60.0)
+        answer: Any = future.result()
+        if answer is None:
+            return "gave no answer"
+        return "" if answer.success else f"said {answer.message}"
+
+    def number(self, node: str, key: str) -> float:
+        """The latest of a node's values."""
+        return float(self.statuses.get(node, (0.0, {}))[1].get(key, 0.0))
+
+    def close(self) -> None:
+        rclpy.try_shutdown()
+
+
+def simulated(folder: Path, imus: bool) -> Path:
+    """A recording of a minute."""
+    bag = folder / "bag"
+    command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
+    command += ["--seconds", str(BAG_SECONDS)]
+    subprocess.run(command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True)
+    return bag
+
+
+@contextlib.contextmanager
+def running_graph(folder: Path, bag: Path, args: argparse.Namespace) -> Iterator[subprocess.Popen[bytes]]:
+    """``body_tracking up`` with a bag that begins again at its end, and a recorder."""
+    values: dict[str, Any] = {"bag_player": {SECTION: {"loop": True}}}
+    if args.imus:
+        segments = [f"{name}:imu_{name}" for name in graph.SOME_IMUS]
+        values["imu_skeleton"] = {SECTION: {"segments": segments}}
+    file = folder / "parameters.yaml"
+    file.write_text(yaml.safe_dump(values), encoding="utf-8")
+    command = [sys.executable, "-m", "body_tracking.cli", "up", "--bag", str(bag), "--rate", str(args.rate)]
+    command += ["--filter", args.filter, "--record", str(folder / "recording"), "--log-dir", str(folder)]
+    command += ["--params-file", str(file)]
+    with running_up(command, folder / "up.log") as process:
+        yield process
+
+
+# --- the measurement
+
+
+def sample(samples: Samples, now: float, processes: Mapping[str, psutil.Process], ear: Ear, duration: float) -> None:
+    """One look at everything."""
+    for name, process in processes.items():
+        with contextlib.suppress(psutil.Error):
+            memory = process.memory_full_info()
+            samples.memory[name].append((now, memory.uss, memory.pss, memory.rss))
+    samples.latency += [(now, each) for each in ear.latencies]
+    ear.latencies.clear()
+    ear.sent.clear()
+    played = ear.number("bag_player", "loops") * duration + ear.number("bag_player", "position s")
+    samples.progress.append((now, played, ear.number("bag_player", "sent"), ear.number("fusion", "received")))
+    samples.machine.append((now, os.getloadavg()[0]))
+
+
+def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any]]:
+    """Run the graph; what was seen, and how nodes came back that were killed."""
+    samples = Samples()
+    bag = args.bag or simulated(folder, args.imus)
+    with BagReader(bag) as reader:
+        duration = (reader.end_ns - reader.start_ns) / 1e9
+        sensor = graph.sensors_among(reader.topics)[0]
+    with contextlib.ExitStack() as stack:
+        up = stack.enter_context(running_graph(folder, bag, args))
+        ear = Ear(sensor)
+        stack.callback(ear.close)
+        begin = time.monotonic()
+        while not ear.angles_at:
+            if up.poll() is not None or time.monotonic() - begin > 60.0:
+                raise SystemExit(f"soak: the graph did not start:\n{(folder / 'up.log').read_text()}")
+            ear.listen(0.5)
+        begin, recorded_since = time.monotonic(), time.monotonic()
+        pids = {name: process.pid for name, process in nodes_of(up.pid).items()}
+        total = 60.0 * args.minutes
+        bar = stack.enter_context(
+            tqdm(total=total, unit="s", disable=args.json, bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} s")
+        )
+        cpu: dict[str, float] = {}
+        while (now := time.monotonic() - begin) < total:
+            if up.poll() is not None:
+                samples.deaths.append(f"the whole graph after {now:.0f} s: {(folder / 'up.log').read_text()[-500:]}")
+                return samples, {"back_s": {}, "cpu": {}}
+            processes = nodes_of(up.pid)
+            for name, pid in pids.items():
+                if name not in processes or processes[name].pid != pid:
+                    samples.deaths.append(f"{name} after {now:.0f} s")
+            pids |= {name: process.pid for name, process in processes.items()}
+            sample(samples, now, {**processes, "up": psutil.Process(up.pid)}, ear, duration)
+            if time.monotonic() - recorded_since > 60.0:
+                recorded_since = time.monotonic()
+                failure = ear.call("stop")
+                if not failure:
+                    shutil.rmtree(folder / "recording")
+                    failure = ear.call("start")
+                if failure:
+                    samples.deaths.append(f"a service of bag_recorder {failure} after {now:.0f} s")
+            bar.update(now - bar.n)
+            time.sleep(max(0.0, min(PERIOD, total) - LISTENING - (time.monotonic() - begin - now)))
+            ear.listen(LISTENING)
+        for name, process in nodes_of(up.pid).items():
+            times = process.cpu_times()
+            cpu[name] = (times.user + times.system) / (time.time() - process.create_time())
+        back = {name: _killed(name, up, ear) for name in pids} if args.kill else {}
+    return samples, {"back_s": back, "cpu": cpu}
+
+
+def _killed(name: str, up: subprocess.Popen[bytes], ear: Ear) -> float | None:
+    """Kill a node; seconds until it reports again and angles come; None where that did not happen."""
+    nodes_of(up.pid)[name].kill()
+    killed, since = time.monotonic(), time.time()
+    while time.monotonic() - killed < BACK_WITHIN:
+        ear.listen(0.2)
+        # what was on its way when the node died does not count
+        reported = ear.statuses.get(name, (0.0, {}))[0] > since + 0.5
+        if reported and name in nodes_of(up.pid) and ear.angles_at > since + 0.5:
+            return round(time.monotonic() - killed, 1)
+    return None
+
+
+# --- the result
+
+
+def _tenths(times: FloatArray, total: float) -> tuple[Any, Any]:
+    """Which samples belong to the first tenth after the warm-up, and which to the last tenth."""
+    warm = min(WARM_UP, total / 2)
+    length = max((total - warm) / 10, min(PERIOD, total / 4))
+    return (times >= warm) & (times < warm + length), times >= total - length
+
+
+def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """All figures."""
+    total = 60.0 * args.minutes
+    rows = {}
+    for name, values in samples.memory.items():
+        table = np.array(values)
+        times, megabytes = table[:, 0], table[:, 1:] / 2**20
+        warm = min(WARM_UP, total / 2)
+        early, (_, late) = (times >= warm) & (times < 2 * warm), _tenths(times, total)
+        if not early.any() or not late.any():
+            continue
+        first, last = np.median(megabytes[early], axis=0), np.median(megabytes[late], axis=0)
+        counted = times >= warm
+        slope = np.polyfit(times[counted] / 60.0, megabytes[counted, 0], 1)[0] if counted.sum() > 2 else 0.0
+        rows[name] = {
+            "uss_mb": [round(float(first[0]), 2), round(float(last[0]), 2)],
+            "pss_mb": [round(float(first[1]), 2), round(float(last[1]), 2)],
+            "rss_mb": [round(float(first[2]), 2), round(float(last[2]), 2)],
+            "growth_percent": round(100.0 * float(last[0] / first[0] - 1.0), 2),
+            "kb_per_minute": round(1024.0 * float(slope), 1),
+            "cpu_percent": round(100.0 * more["cpu"].get(name, 0.0), 1),
+        }
+    latency = np.array(samples.latency).reshape(-1, 2)
+    early, late = _tenths(latency[:, 0], total)
+    latencies = {
+        which: {
+            "frames": int(chosen.sum()),
+            "median_ms": round(1e3 * float(np.median(latency[chosen, 1])), 2),
+            "p99_ms": round(1e3 * float(np.percentile(latency[chosen, 1], 99)), 2),
+        }
+        for which, chosen in (("first", early), ("last", late))
+        if chosen.any()
+    }
+    progress = np.array(samples.progress)
+    progress = progress[progress[:, 0] >= min(WARM_UP, total / 2)]
+    elapsed, played, sent, taken = progress[-1] - progress[0] if len(progress) > 1 else np.full(4, np.nan)
+    load = np.array(samples.machine)
+    return {
+        "minutes": args.minutes,
+        "filter": args.filter,
+        "imus": args.imus,
+        "rate_asked": args.rate,
+        "rate": round(float(played / elapsed), 2),
+        "taken_percent": None if args.imus else round(100.0 * float(taken / sent), 2),
+        "load_average": round(float(load[:, 1].mean()), 2),
+        "cores": psutil.cpu_count(),
+        "processes": rows,
+        "latency": latencies,
+        "deaths": samples.deaths,
+        "back_s": more["back_s"],
+    }
+
+
+def bars(result: Mapping[str, Any]) -> dict[str, bool]:
+    """Which are met."""
+    latency = result["latency"]
+    met = {
+        "memory_flat": all(row["growth_percent"] <= 100.0 * GROWTH for row in result["processes"].values()),
+        "nothing_died": not result["deaths"],
+        "latency_unchanged": len(latency) == 2
+        and latency["last"]["median_ms"] <= LATER * latency["first"]["median_ms"],
+    }
+    if result["back_s"]:
+        met["every_node_back_after_a_kill"] = all(seconds is not None for seconds in result["back_s"].values())
+    return met
+
+
+def show(result: Mapping[str, Any]) -> None:
+    """The table."""
+    came = "" if result["taken_percent"] is None else f", the fusion took {result['taken_percent']} % of the frames"
+    print(
+        f"{result['minutes']:g} minutes, filter {result['filter']}{', inertial sensors' if result['imus'] else ''}: "
+        f"asked for {result['rate_asked']:g} times the rate, ran at {result['rate']:g}{came}; load average "
+        f"{result['load_average']} of {result['cores']} cores"
+    )
+    print("  process          USS MB at 1 min     last   growth   per minute       PSS MB        RSS MB   one core")
+    for name, row in result["processes"].items():
+        pss, rss = row["pss_mb"], row["rss_mb"]
+        print(
+            f"  {name:16} {row['uss_mb'][0]:15.1f} {row['uss_mb'][1]:8.1f} {row['growth_percent']:6.1f} % "
+            f"{row['kb_per_minute']:9.1f} kB {pss[0]:6.1f} {pss[1]:6.1f} {rss[0]:6.1f} {rss[1]:6.1f} "
+            f"{row['cpu_percent']:7.1f} %"
+        )
+    for which, row in result["latency"].items():
+        print(
+            f"  latency, {which} tenth: median {row['median_ms']} ms, 99 % {row['p99_ms']} ms of {row['frames']} frames"
+        )
+    print(f"  died by itself, or gave no answer: {', '.join(result['deaths']) or 'nothing'}")
+    if result["back_s"]:
+        texts = [f"{name} {'never' if at is None else f'{at:g} s'}" for name, at in result["back_s"].items()]
+        print(f"  killed, and back with angles after: {', '.join(texts)}")
+    for name, met in bars(result).items():
+        print(f"  {name}: {'met' if met else 'missed'}")
+
+
+def draw(samples: Samples, path: Path) -> None:
+    """Memory and latency over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 7), sharex=True, height_ratios=(2, 1), layout="constrained")
+    for name, values in samples.memory.items():
+        table = np.array(values)
+        top.plot(table[:, 0] / 60.0, table[:, 2] / 2**20, label=f"{name} {table[-1, 2] / 2**20:.0f} MB")
+    top.set(ylabel="PSS, MB", ylim=(0, None), title="Memory of each process")
+    top.legend(loc="lower right", ncols=2, fontsize="small")
+    latency = np.array(samples.latency).reshape(-1, 2)
+    times = np.unique(latency[:, 0])
+    for percent, style in ((50, "-"), (99, ":")):
+        values = [1e3 * np.percentile(latency[latency[:, 0] == time, 1], percent) for time in times]
+        bottom.plot(times / 60.0, values, style, color="tab:blue", label="median" if percent == 50 else "99 %")
+    bottom.set(xlabel="minutes", ylabel="frame to angles, ms", yscale="log")
+    bottom.legend(loc="upper right", fontsize="small")
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main() -> int:
+    """The command: 0, or 1 when a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0, help="to run (default 60)")
+    parser.add_argument("--rate", type=float, default=10.0, help="times the rate of the recording (default 10)")
+    parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="(default %(default)s)")
+    parser.add_argument("--imus", action="store_true", help="inertial sensors on the forearms, too")
+    parser.add_argument("--bag", type=Path, help="play this one (default: a minute is simulated)")
+    parser.add_argument("--no-kill", dest="kill", action="store_false", help="kill no node at the end")
+    parser.add_argument("-o", "--output", type=Path, default=Path("soak.png"), help="the picture (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    if not 0.5 <= args.minutes <= 1440.0:
+        parser.error(f"--minutes {args.minutes:g}: expected 0.5 to 1440")
+    with tempfile.TemporaryDirectory() as folder:
+        samples, more = soak(args, Path(folder))
+    result = result_of(samples, more, args)
+    result["bars"] = bars(result)
+    draw(samples, args.output)
+    if args.json:
+        print(json.dumps(result, indent=2))
+    else:
+        show(result)
+        print(f"picture: {args.output}")
+    return 0 if all(result["bars"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

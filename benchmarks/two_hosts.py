@@ -1,0 +1,520 @@
+"""Two Kinects on one computer, the graph on another, and a bad network between them: angles, stamps and recovery.
+
+A person is simulated before two Kinects. ``kinect_sender --replay`` streams each of them from a host of its own to a
+host with the graph of ``body_tracking up``, through a relay that loses packets, holds each of them up
+for another time, and cuts the link for a while. The hosts are network namespaces; the clock that the senders go by is
+shifted by a time namespace. The graph starts with the true poses of the sensors and, since the stamps of both are to be
+in its own clock, with no difference between their clocks. Needs root, or a system that lets users make namespaces;
+every interface and namespace ends with the processes.
+
+The angles are compared with those that the same chain makes offline of the same recording: of all of it, and of it
+without the frames that were lost on the way, which tells what the loss alone does. Where the chain's own standard
+deviation of an angle exceeds 15 degrees in one of them, nothing is compared; nor from the beginning of the cut until a
+second after its end. The time of each capture is known, so are the errors of the stamps; the delay of the fastest
+frame, which no receiver can tell, is taken off.
+
+The bars: the angles are as far from those of the recording as the loss alone puts them, and half a degree more at most
+(RMS of each; a quarter of a degree more all together); angles come again within a second after the link is back, and
+are as far off as those before the cut; no process was started again, and each sender needed one session; stamps err by
+no more than half the jitter. The graph runs with ``--reliable``, so that nothing is lost beside the network; where the
+machine has too much to do, late frames are another matter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import hosts
+import numpy as np
+import yaml
+
+from body_tracking import graph
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
+from body_tracking.calibration.storage import save
+from body_tracking.evaluation.metrics import wrapped
+from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.messages import JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, to_nanoseconds
+from body_tracking.parameters import SECTION
+from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
+from body_tracking.simulation import scene
+from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.layouts import around
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, Setup, SimulatedRecording
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+SETTLE = 4.0
+"""Seconds in which person and noise become known; what is compared comes after."""
+
+LEAD, LEAD_FACTOR = 2.0, 3.0
+"""Seconds until the recording begins once the graph is there, and so many times what a sender takes to start."""
+READY_TIMEOUT = 180.0
+
+WORST_STDDEV = np.radians(15.0)
+LIMITS = {"angle_deg": 0.5, "all_angles_deg": 0.25, "recovery_s": 1.0}
+NO_NAMESPACES = 77
+"""The exit code where the system does not permit them."""
+
+_SEED = 11
+_LAYOUT = around(np.radians([45.0, -45.0]).tolist(), (2.0, 2.0), (1.0, 1.0))
+_PORT = 7525
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Probability of loss, seconds of delay at most, wall times between which nothing passes."""
+
+    loss: float
+    jitter: float
+    cut: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Seconds to compare before and after the cut, of the cut, between the clocks; the link; the filter; a folder."""
+
+    seconds: float
+    cut: float
+    shift: float
+    link: Link
+    filter: str
+    keep: Path | None
+
+
+# --- the recording
+
+
+def simulate(seconds: float, folder: Path) -> SimulatedRecording:
+    """The recording as a bag in a folder, and its calibration in two files."""
+    recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
+    write_bag(recording, folder / "bag")
+    names = [sensor.pose.sensor for sensor in recording.sensors]
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
+    for file, clocks in (
+        ("recorded.yaml", {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}),
+        ("received.yaml", dict.fromkeys(names, ClockModel())),
+    ):
+        save(CalibrationResult(names[0], poses, clocks, quality), folder / file)
+    return recording
+
+
+def captures(recording: SimulatedRecording) -> dict[str, FloatArray]:
+    """Of each sensor (n, 3) integer nanoseconds: stamp of a frame, its capture in reference time, its receipt."""
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    found: dict[str, list[tuple[int, int, int]]] = {name: [] for name in clocks}
+    for frame in recording.frames:
+        stamp = frame.skeletons[0].stamp_ns
+        found[frame.sensor].append((stamp, clocks[frame.sensor].to_reference(stamp), frame.received_ns))
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+# --- the run
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """When the recording began, the link with its cut, how often a node was started again, how the senders ended."""
+
+    start: float
+    link: Link
+    restarts: int
+    codes: dict[str, int]
+
+
+def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
+    """Stream the recording."""
+    link, before = options.link, SETTLE + options.seconds
+    names = [sensor.pose.sensor for sensor in recording.sensors]
+    key, parameters = folder / "key", folder / "parameters.yaml"
+    sender = [sys.executable, "-m", "body_tracking.sensors.kinect_sender"]
+    subprocess.run([*sender, "--make-key", str(key)], check=True, stdout=subprocess.DEVNULL)
+    begun = time.monotonic()
+    subprocess.run([*sender, "--replay", str(folder / "bag"), "--sensor", "nobody"], stderr=subprocess.DEVNULL)
+    lead = LEAD + LEAD_FACTOR * (time.monotonic() - begun)
+    ports = {name: _PORT + k for k, name in enumerate(names)}
+    values = {
+        f"{name}_skeleton": {
+            SECTION: {"backend": "network", "address": hosts.INSIDE, "port": port, "key_file": str(key)}
+        }
+        for name, port in ports.items()
+    }
+    parameters.write_text(yaml.safe_dump(values), encoding="utf-8")
+    up = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", options.filter, "--sensors", ",".join(names)]
+    up += ["--params-file", str(parameters), "--calibration", str(folder / "received.yaml")]
+    up += ["--record", str(folder / "live"), "--log-dir", str(folder), "--reliable"]
+    with hosts.hosts() as (outside, middle), contextlib.ExitStack() as stack:
+
+        def begin(name: str, command: Sequence[str]) -> subprocess.Popen[bytes]:
+            with (folder / f"{name}.log").open("wb") as log:
+                made = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT)
+            stack.callback(_stop, made)
+            return made
+
+        middleman = begin("relay", [*middle, *hosts.command("relay", link.loss, link.jitter, *ports.values())])
+        graph_process = begin("up", up)
+        # The sensors' nodes come last, when everybody listens to whom they should.
+        end = time.monotonic() + READY_TIMEOUT
+        while not all(f":{port:04X}" in Path("/proc/net/udp").read_text() for port in ports.values()):
+            if graph_process.poll() is not None or time.monotonic() > end:
+                raise SystemExit(f"two_hosts: the graph did not come up\n{(folder / 'up.log').read_text()[-2000:]}")
+            time.sleep(0.1)
+        start = time.time() + lead
+        link = replace(link, cut=(start + before, start + before + options.cut) if options.cut else (0.0, 0.0))
+        assert middleman.stdin is not None
+        middleman.stdin.write(f"{link.cut[0]} {link.cut[1]}\n".encode())
+        middleman.stdin.flush()
+        senders = {}
+        for name in names:
+            words = [*sender, "--replay", str(folder / "bag"), "--sensor", name, "--key-file", str(key)]
+            words += ["--to", f"{hosts.RELAY_OUT}:{ports[name]}", "--start-time", repr(start)]
+            senders[name] = begin(name, [*outside, *hosts.command("shift", options.shift, *words)])
+        while time.time() < start + recording.duration + 1.0:
+            if graph_process.poll() is not None or middleman.poll() is not None:
+                raise SystemExit(f"two_hosts: a process ended too early\n{(folder / 'up.log').read_text()[-2000:]}")
+            time.sleep(0.1)
+        codes = {name: process.wait(60.0) for name, process in senders.items()}
+    return Run(start, link, (folder / "up.log").read_text().count("starting it again"), codes)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+# --- what came of it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Angles:
+    """Joint angles over time: names, (n,) stamps ns, (n,) receipt ns, (n, k) radians, (n, k) standard deviations."""
+
+    names: tuple[str, ...]
+    stamps: FloatArray
+    received: FloatArray
+    values: FloatArray
+    stddevs: FloatArray
+
+    def at(self, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Angles and standard deviations between the samples."""
+        unwrapped = np.unwrap(self.values, axis=0)
+        columns = range(len(self.names))
+        return (
+            np.stack([np.interp(stamps, self.stamps, unwrapped[:, k]) for k in columns], axis=1),
+            np.stack([np.interp(stamps, self.stamps, self.stddevs[:, k]) for k in columns], axis=1),
+        )
+
+
+def read_angles(bag: Path) -> Angles:
+    """The joint angles in a recording, by time."""
+    topics = (graph.joint_states_topic(graph.DEFAULT_BODY), graph.joint_states_stddev_topic(graph.DEFAULT_BODY))
+    values: dict[int, tuple[int, FloatArray]] = {}
+    stddevs: dict[int, FloatArray] = {}
+    names: tuple[str, ...] = ()
+    with BagReader(bag) as reader:
+        for raw in reader.messages(topics):
+            message = deserialize(JOINT_STATE, raw.cdr)
+            stamp = to_nanoseconds(message.header.stamp)
+            if raw.topic == topics[0]:
+                names = tuple(message.name)
+                values[stamp] = raw.log_time_ns, np.array(message.position)
+            else:
+                stddevs[stamp] = np.minimum(np.array(message.position), 10.0)
+    stamps = sorted(values.keys() & stddevs.keys())
+    return Angles(
+        tuple(name.removesuffix(f"_{graph.DEFAULT_BODY}") for name in names),
+        np.array(stamps),
+        np.array([values[stamp][0] for stamp in stamps]),
+        np.array([values[stamp][1] for stamp in stamps]),
+        np.array([stddevs[stamp] for stamp in stamps]),
+    )
+
+
+def match(recording: SimulatedRecording, live: Path) -> dict[str, FloatArray]:
+    """Of each sensor (m, 3): index of a recorded frame that came, its stamp there, its receipt there; ns.
+
+    A frame is known by its coordinates, which come through the network to the bit.
+    """
+    known = {name: {} for name in captures(recording)}
+    count = dict.fromkeys(known, 0)
+    for frame in recording.frames:
+        known[frame.sensor][frame.skeletons[0].positions.astype(np.float32).tobytes()] = count[frame.sensor]
+        count[frame.sensor] += 1
+    found: dict[str, list[tuple[int, int, int]]] = {name: [] for name in known}
+    topics = {graph.skeleton_topic(name): name for name in known}
+    with BagReader(live) as reader:
+        for raw in reader.messages(topics):
+            (skeleton,) = cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
+            name = topics[raw.topic]
+            index = known[name][skeleton.positions.astype(np.float32).tobytes()]
+            found[name].append((index, skeleton.stamp_ns, raw.log_time_ns))
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def without_lost(folder: Path, came: Mapping[str, FloatArray]) -> Path:
+    """The recording without the frames that did not come."""
+    out = folder / "came"
+    topics = {graph.skeleton_topic(name): set(rows[:, 0].tolist()) for name, rows in came.items()}
+    count = dict.fromkeys(topics, 0)
+    with BagReader(folder / "bag") as reader, BagWriter(out) as writer:
+        for topic in topics:
+            writer.add_topic(topic, POINT_CLOUD, SENSOR_DATA)
+        for raw in reader.messages(topics):
+            if count[raw.topic] in topics[raw.topic]:
+                writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+            count[raw.topic] += 1
+    return out
+
+
+def offline(folder: Path, bag: Path, out: Path, name: str) -> Angles:
+    """What the chain makes of a recording."""
+    calibration = folder / f"{out.name}.yaml"
+    shutil.copy(folder / "recorded.yaml", calibration)
+    command = [sys.executable, "-m", "body_tracking.cli", "replay", str(bag), "-o", str(out), "--filter", name]
+    subprocess.run([*command, "--calibration", str(calibration)], check=True, stdout=subprocess.DEVNULL)
+    return read_angles(out)
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Everything once."""
+    with contextlib.ExitStack() as stack:
+        folder = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="two_hosts_")))
+        folder.mkdir(parents=True, exist_ok=True)
+        recording = simulate(SETTLE + 2.0 * options.seconds + options.cut, folder)
+        ran = run(recording, folder, options)
+        start, link = ran.start, ran.link
+        came = match(recording, folder / "live")
+        if not all(len(rows) for rows in came.values()):
+            raise SystemExit("two_hosts: no frame of a sensor came through")
+        live = read_angles(folder / "live")
+        whole = offline(folder, folder / "bag", folder / "whole", options.filter)
+        lossy = offline(folder, without_lost(folder, came), folder / "of_what_came", options.filter)
+        values = last_values(folder / "live")
+    result: dict[str, Any] = {
+        "seconds": recording.duration,
+        "cut_s": options.cut,
+        "filter": options.filter,
+        "loss": link.loss,
+        "jitter_ms": link.jitter * 1e3,
+    }
+    result["shift_ms"] = options.shift * 1e3
+    result |= {"restarts": ran.restarts, "sender_exit_codes": ran.codes, "sensors": {}}
+    truth = captures(recording)
+    begun = round(start * NANOSECONDS) - RECEIVED_FROM_NS
+    for sensor, rows in came.items():
+        delivered = truth[sensor][:, 2] + begun
+        in_cut = (delivered >= link.cut[0] * NANOSECONDS) & (delivered < link.cut[1] * NANOSECONDS)
+        lost = len(delivered) - len(rows) - int(in_cut.sum())
+        # in wall time: captured so long before delivery as by the reference sensor's clock, which runs as the wall does
+        errors = (rows[:, 1] - (truth[sensor][rows[:, 0], 1] + begun)) / 1e6
+        steady = delivered[rows[:, 0]] > (start + SETTLE) * NANOSECONDS
+        errors = errors[steady] - np.median(errors[steady])
+        back = rows[rows[:, 2] >= link.cut[1] * NANOSECONDS, 2]
+        result["sensors"][sensor] = {
+            "recorded": len(delivered),
+            "received": len(rows),
+            # a sender on a busy machine leaves out what is late by half a second
+            "not_sent": max(0, len(delivered) - len(rows) - int(values[f"{sensor}_skeleton"].get("lost", 0))),
+            "lost_percent": round(100.0 * lost / max(1, int((~in_cut).sum())), 2),
+            "stamp_rms_ms": round(float(np.sqrt((errors**2).mean())), 3),
+            "stamp_max_ms": round(float(np.abs(errors).max()), 3),
+            "first_frame_after_s": round(float(back[0]) / NANOSECONDS - link.cut[1], 3)
+            if options.cut and len(back)
+            else None,
+            **{
+                key: values[f"{sensor}_skeleton"].get(key)
+                for key in ("sessions", "round trip ms", "lost", "clock drift ppm")
+            },
+        }
+    reference, rows = next(iter(came.items()))
+    # the reference sensor's clock and this machine's, by the frames that both stamped
+    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, (truth[reference][rows[:, 0], 1] - rows[:, 1]), 1)
+    stamps = live.stamps + base + slope * (live.stamps - rows[0, 1]) / NANOSECONDS
+    result["angles"] = compare(live, stamps, whole, lossy, start, link)
+    return result
+
+
+def compare(live: Angles, stamps: FloatArray, whole: Angles, lossy: Angles, start: float, link: Link) -> dict[str, Any]:
+    """Differences by angle in degrees, and the recovery."""
+    wall = live.stamps / NANOSECONDS
+    judged = (wall > start + SETTLE) & ~((wall > link.cut[0] - 0.2) & (wall < link.cut[1] + 1.0))
+    judged &= (stamps > lossy.stamps[0]) & (stamps < lossy.stamps[-1])
+    by_whole, dev_whole = whole.at(stamps)
+    by_lossy, dev_lossy = lossy.at(stamps)
+    certain = np.maximum(np.maximum(dev_whole, dev_lossy), live.stddevs) < WORST_STDDEV
+    use = certain & judged[:, None]
+    apart = np.degrees(np.abs(wrapped(live.values - by_lossy)))
+    from_whole = np.degrees(np.abs(wrapped(live.values - by_whole)))
+    loss_alone = np.degrees(np.abs(wrapped(by_lossy - by_whole)))
+    rows = {}
+    for k, name in enumerate(live.names):
+        if use[:, k].sum() > 50:
+            own = use[:, k]
+            rows[name] = {
+                "samples": int(own.sum()),
+                "rms_to_whole_deg": _rms(from_whole[own, k]),
+                "rms_deg": _rms(apart[own, k]),
+                "loss_alone_deg": _rms(loss_alone[own, k]),
+            }
+    result: dict[str, Any] = {
+        "by_angle": rows,
+        "all_deg": _rms(apart[use]),
+        "all_to_whole_deg": _rms(from_whole[use]),
+        "loss_alone_deg": _rms(loss_alone[use]),
+    }
+    if link.cut[1]:
+        result |= recovery(live.received / NANOSECONDS, wall, np.where(certain, apart, np.nan), start, link)
+    return result
+
+
+def recovery(received: FloatArray, wall: FloatArray, apart: FloatArray, start: float, link: Link) -> dict[str, Any]:
+    """Seconds from the end of the cut until the first angles, and until half a second of them is as before the cut.
+
+    As before: together as near to what they should be as 99 of 100 half seconds were before it, or within a degree.
+    """
+
+    def half_second(at: float) -> float:
+        found = apart[(wall >= at) & (wall < at + 0.5)]
+        return _rms(found) if np.isfinite(found).any() else float("inf")
+
+    before = [half_second(at) for at in np.arange(start + SETTLE, link.cut[0] - 0.5, 0.1)]
+    limit = max(1.0, float(np.percentile([each for each in before if np.isfinite(each)], 99.0)))
+    after = np.flatnonzero(wall > link.cut[1])
+    good = next((k for k in after if half_second(wall[k]) <= limit), None)
+    return {
+        "first_angles_after_s": round(float(received[after[0]] - link.cut[1]), 3) if len(after) else None,
+        "recovery_limit_deg": round(limit, 2),
+        "recovery_s": None if good is None else round(float(received[good] - link.cut[1]), 3),
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return round(float(np.sqrt((finite**2).mean())), 3) if len(finite) else 0.0
+
+
+def last_values(bag: Path) -> dict[str, dict[str, str]]:
+    """What each node said last in its diagnostics."""
+    found = {}
+    with BagReader(bag) as reader:
+        for raw in reader.messages([graph.DIAGNOSTICS_TOPIC]):
+            for status in deserialize("diagnostic_msgs/msg/DiagnosticArray", raw.cdr).status:
+                found[status.name.partition(":")[0]] = {item.key: item.value for item in status.values}
+    return found
+
+
+# --- the command
+
+
+def bars(result: dict[str, Any]) -> dict[str, bool]:
+    """Which are met."""
+    angles, sensors = result["angles"], result["sensors"].values()
+    met = {
+        "every angle as from the recording within the loss": all(
+            row["rms_to_whole_deg"] <= row["loss_alone_deg"] + LIMITS["angle_deg"]
+            for row in angles["by_angle"].values()
+        ),
+        "all angles together": angles["all_to_whole_deg"] <= angles["loss_alone_deg"] + LIMITS["all_angles_deg"],
+        "no restart, one session each": result["restarts"] == 0
+        and all(code == 0 for code in result["sender_exit_codes"].values())
+        and all(row["sessions"] == "1" for row in sensors),
+        "stamps": all(row["stamp_max_ms"] <= 0.5 * result["jitter_ms"] for row in sensors),
+    }
+    if result["cut_s"]:
+        recovered = angles["recovery_s"] is not None and angles["recovery_s"] <= LIMITS["recovery_s"]
+        met["recovery after the cut"] = recovered
+    return met
+
+
+def main() -> int:
+    """The command: 0 where every bar is met, 1 where not, 77 where namespaces are not permitted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="to compare before and after the cut, each (default 20)"
+    )
+    parser.add_argument("--cut", type=float, default=30.0, help="seconds without a link (default 30; 0 for none)")
+    parser.add_argument("--loss", type=float, default=2.0, help="percent of packets lost (default 2)")
+    parser.add_argument("--jitter", type=float, default=5.0, help="milliseconds of delay at most (default 5)")
+    parser.add_argument("--shift", type=float, default=0.3, help="seconds between the clocks (default 0.3)")
+    parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="default %(default)s")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for recordings and logs, to look at them later")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if not args.inside:
+        return _inside()
+    link = Link(args.loss / 100.0, args.jitter / 1e3)
+    result = measure(Options(args.seconds, args.cut, args.shift, link, args.filter, args.keep))
+    result["bars"] = bars(result)
+    if args.json:
+        print(json.dumps(result, indent=2))
+    else:
+        show(result)
+    return 0 if all(result["bars"].values()) else 1
+
+
+def _inside() -> int:
+    """The same command in a network namespace of its own: the host of the graph."""
+    reason = hosts.not_permitted()
+    if reason:
+        print(f"two_hosts: network and time namespaces are not permitted here ({reason})", file=sys.stderr)
+        return NO_NAMESPACES
+    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+    command = hosts.in_own_network([sys.executable, __file__, "--inside", *sys.argv[1:]])
+    process = subprocess.Popen(command, env=environment)
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        return process.wait()
+
+
+def show(result: dict[str, Any]) -> None:
+    """For people."""
+    print(
+        f"two sensors over a network that loses {100 * result['loss']:g} %, delays up to {result['jitter_ms']:g} ms "
+        f"and is cut for {result['cut_s']:g} s; filter {result['filter']}; clocks {result['shift_ms']:g} ms apart"
+    )
+    for name, row in result["sensors"].items():
+        print(
+            f"  {name}: {row['received']} of {row['recorded']} frames, {row['lost_percent']} % lost beside the cut or "
+            f"not sent ({row['not_sent']}); "
+            f"stamps {row['stamp_rms_ms']} ms RMS, at most {row['stamp_max_ms']} ms off; round trip "
+            f"{row['round trip ms']} ms"
+        )
+    angles = result["angles"]
+    print("  off by, degrees RMS         from the recording   loss alone, offline   from it without lost frames")
+    for name, row in sorted(angles["by_angle"].items(), key=lambda item: -item[1]["rms_to_whole_deg"]):
+        print(f"    {name:26}{row['rms_to_whole_deg']:16.3f}{row['loss_alone_deg']:21.3f}{row['rms_deg']:26.3f}")
+    print(f"    {'all':26}{angles['all_to_whole_deg']:16.3f}{angles['loss_alone_deg']:21.3f}{angles['all_deg']:26.3f}")
+    if result["cut_s"]:
+        print(
+            f"  after the cut: first angles {angles['first_angles_after_s']} s, within "
+            f"{angles['recovery_limit_deg']} deg from {angles['recovery_s']} s on"
+        )
+    print(f"  restarts: {result['restarts']}")
+    for name, met in result["bars"].items():
+        print(f"  {'met   ' if met else 'MISSED'} {name}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,302 @@
+"""Which of the people whom sensors see are tracked: one, the same in all sensors, or each under a number of their own.
+
+:mod:`body_tracking.fusion.association` says who is whom; here frames are placed for it, and its people get slots.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.fusion.association import HOLD, Association
+from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.subject import ALL, FIRST, MAX_PEOPLE, NEAREST, SUBJECTS, SubjectSelector
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+
+_PRESENT = round(0.2 * NANOSECONDS)
+"""Who was seen this long ago may be chosen, nanoseconds."""
+
+_PENDING = 5
+"""Frames of one who is alone that are kept until a look is due: the first and the last tell of the velocity."""
+
+_KEEP = 5 * NANOSECONDS
+"""Poses and clocks are kept for frames that are late by no more than this, nanoseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class PeopleParameters:
+    """Whom to track."""
+
+    subject: str = field(
+        default=NEAREST,
+        metadata={
+            "doc": "whom to track: the person who is nearest to the reference sensor at first, or the one who is seen "
+            "first, for as long as that person is there; or all, each under a number and with topics of their own",
+            "choices": SUBJECTS,
+        },
+    )
+    people: int = field(
+        default=MAX_PEOPLE,
+        metadata={
+            "doc": "subject all: how many people at most; their ids are body1, body2, ...",
+            "min": 1,
+            "max": 16,
+        },
+    )
+    hold: float = field(
+        default=HOLD,
+        metadata={
+            "doc": "a person whom no sensor sees keeps the id for this long; another is chosen, or gets it, then",
+            "unit": "s",
+            "min": 0.5,
+            "max": 60.0,
+        },
+    )
+
+
+class Slots:
+    """A fixed number of numbers, 1 and up, for people who come and go.
+
+    Args:
+        count: how many.
+
+    Attributes:
+        of: the number of each person who has one.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.of: dict[int, int] = {}
+        self._free = deque(range(1, count + 1))  # the one unused for longest first
+
+    def update(self, people: Sequence[int]) -> tuple[list[int], int]:
+        """Give the numbers of those who are gone to those who are new.
+
+        Args:
+            people: everybody who is there, the longest known first.
+
+        Returns:
+            The numbers that nobody has any more, or somebody else, and how many people there is none for.
+        """
+        gone = [person for person in self.of if person not in people]
+        freed = [self.of.pop(person) for person in gone]
+        self._free.extend(freed)
+        for person in people:
+            if person not in self.of and self._free:
+                self.of[person] = self._free.popleft()
+        return freed, len(people) - len(self.of)
+
+
+class _Sensor(Placement):
+    """Where and when a sensor is, and its frames of one who is alone that the association has not been told of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.selector = SubjectSelector()
+        self.clear()
+
+    def clear(self) -> None:
+        self.last_ns: int | None = None  # in its own clock
+        self.newest_ns: int | None = None  # in the reference's
+        self.ahead = False
+        self.used: SensorPose | None = None
+        self.pending: deque[tuple[int, SensorPose, Skeleton]] = deque(maxlen=_PENDING)
+        self.selector.reset()
+
+
+class People:
+    """Sorts the bodies of every sensor's frames by person.
+
+    With one subject, a sensor that is not calibrated yet, or whose clock is not what it is taken for, follows the
+    nearest to itself, for whoever only wants to know of its rhythm; with all, its frames are left out.
+
+    Args:
+        sensors: their names.
+        parameters: whom to track.
+        reference: the sensor whose clock is that of ``world``; the first one when None.
+        gone: called with the number of a person who is lost, before anybody else gets it; with one subject never.
+
+    Attributes:
+        counters: what happened since the construction, for diagnostics.
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[str],
+        parameters: PeopleParameters,
+        reference: str | None = None,
+        gone: Callable[[int], None] = lambda number: None,
+    ) -> None:
+        self.parameters = parameters
+        self.reference = reference or sensors[0]
+        self.gone = gone
+        self._sensors = {name: _Sensor() for name in sensors}
+        self._association = Association(parameters.hold)
+        self._slots = Slots(parameters.people)
+        self._chosen: int | None = None
+        self._counters: Counter[str] = Counter()
+        self._without = 0
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """How many people there are now, and what happened since the construction."""
+        counters = {"people": len(self._association.people), **self._association.counters, **self._counters}
+        if self._without:
+            counters["people without a number"] = self._without
+        return counters
+
+    @property
+    def tracked(self) -> tuple[int, ...]:
+        """The numbers under which somebody is tracked now."""
+        if self.parameters.subject == ALL:
+            return tuple(sorted(self._slots.of.values()))
+        return () if self._chosen is None else (1,)
+
+    @property
+    def nearest(self) -> int | None:
+        """With all, the number of the one who would be tracked with ``nearest``."""
+        return None if self._chosen is None else self._slots.of.get(self._chosen)
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are ignored."""
+        if pose.sensor in self._sensors:
+            self._sensors[pose.sensor].set_pose(pose)
+
+    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
+        """Take a sensor's clock, in force from a reference time; unknown sensors are ignored."""
+        if sensor in self._sensors:
+            self._sensors[sensor].set_clock(valid_from_ns, clock)
+
+    def reset(self) -> None:
+        """Forget everybody, because time jumped back; poses and clocks stay."""
+        for source in self._sensors.values():
+            source.clear()
+            source.restart()
+        self._association.reset()
+        self._chosen = None
+        self._free_slots()
+
+    def sensor_jumped_back(self, sensor: str) -> None:
+        """Forget what one sensor saw."""
+        self._sensors[sensor].clear()
+        self._association.forget_sensor(sensor)
+
+    def sort(self, sensor: str, skeletons: Sequence[Skeleton]) -> list[tuple[int, Skeleton]]:
+        """The people in one frame of one sensor.
+
+        Args:
+            sensor: one of those given.
+            skeletons: the bodies in it, in the sensor's own frame and clock.
+
+        Returns:
+            Numbers and bodies, the latter as they are given; with one subject at most one, with number 1.
+        """
+        seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
+        if not seen:
+            return []
+        source = self._sensors[sensor]
+        one = self.parameters.subject != ALL
+        placed = self._placed(sensor, source, seen[0].stamp_ns)
+        if placed is None:
+            subject = source.selector.pick(seen) if one else None
+            return [] if subject is None else [(1, subject)]
+        stamp_ns, pose = placed
+        if len(seen) == 1:
+            alone = self._association.alone(sensor, stamp_ns, seen[0].body)
+            if alone is not None and self._number(alone) is not None:
+                source.pending.append((stamp_ns, pose, seen[0]))
+                return [(1 if one else self._slots.of[alone], seen[0])]
+        self._tell_pending()
+        if source.used is not None and source.used is not pose:
+            turned = pose.rotation @ source.used.rotation.T
+            self._association.move_sensor(sensor, turned, pose.translation - turned @ source.used.translation)
+        source.used = pose
+        whose = self._association.assign(sensor, [_in_world(body, stamp_ns, pose) for body in seen])
+        self._choose(stamp_ns)
+        found = []
+        for person, body in zip(whose, seen, strict=True):
+            number = None if person is None else self._number(person)
+            if number is not None:
+                found.append((number, body))
+        return sorted(found, key=lambda each: each[0])
+
+    def _number(self, person: int) -> int | None:
+        """Under which somebody is tracked; None for who is not."""
+        if self.parameters.subject == ALL:
+            return self._slots.of.get(person)
+        return 1 if person == self._chosen else None
+
+    def _placed(self, sensor: str, source: _Sensor, sensor_ns: int) -> tuple[int, SensorPose] | None:
+        """A frame's time in the reference's clock and its sensor's pose; None where they are not known."""
+        if source.last_ns is not None and sensor_ns < source.last_ns - CLOCK_JUMP * NANOSECONDS:
+            if sensor == self.reference:
+                self.reset()
+            else:
+                self.sensor_jumped_back(sensor)
+        source.last_ns = sensor_ns
+        stamp_ns = source.to_reference(sensor_ns)
+        pose = source.pose(stamp_ns)
+        if pose is None:
+            self._counters["uncalibrated"] += 1
+            return None
+        source.forget_before(stamp_ns - _KEEP)
+        source.newest_ns = stamp_ns
+        if not self._in_step(sensor, source, stamp_ns):
+            self._counters["other_clock"] += 1
+            return None
+        return stamp_ns, pose
+
+    def _in_step(self, sensor: str, source: _Sensor, stamp_ns: int) -> bool:
+        """Whether a frame is of the time in which the reference sensor is, as far as that can be told."""
+        jump = CLOCK_JUMP * NANOSECONDS
+        if sensor == self.reference:
+            for other in self._sensors.values():
+                other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + jump
+            return True
+        reference_ns = self._sensors[self.reference].newest_ns
+        if reference_ns is None:
+            return True
+        source.ahead &= stamp_ns > reference_ns + jump
+        return not source.ahead and stamp_ns >= reference_ns - jump
+
+    def _tell_pending(self) -> None:
+        """Tell the association what sensors saw of one who was alone."""
+        for sensor, source in self._sensors.items():
+            if source.pending:
+                ends = (source.pending[0], source.pending[-1])[2 - min(2, len(source.pending)) :]
+                seen = [(stamp_ns, _points(body, pose)) for stamp_ns, pose, body in ends]
+                self._association.note(sensor, seen, ends[-1][2].body)
+                source.used = ends[-1][1]
+                source.pending.clear()
+
+    def _choose(self, stamp_ns: int) -> None:
+        """Give numbers to people, and choose the one."""
+        people = self._association.people
+        if self.parameters.subject == ALL:
+            self._free_slots()
+        if self._chosen in people:
+            return
+        seen = ((person, self._association.seen_ns(person)) for person in people)
+        present = [person for person, seen_ns in seen if seen_ns is not None and stamp_ns - seen_ns <= _PRESENT]
+        self._chosen = None
+        if present and self.parameters.subject == FIRST:
+            self._chosen = present[0]
+        elif present:
+            self._chosen = min(present, key=lambda person: float(np.linalg.norm(self._association.place(person))))
+
+    def _free_slots(self) -> None:
+        freed, self._without = self._slots.update(self._association.people)
+        for number in freed:
+            self.gone(number)
+
+
+def _points(skeleton: Skeleton, pose: SensorPose) -> FloatArray:
+    """(25, 3) metres in world; NaN for what is not valid."""
+    return pose.apply(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
+
+
+def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> Skeleton:
+    return replace(skeleton, stamp_ns=stamp_ns, positions=_points(skeleton, pose))

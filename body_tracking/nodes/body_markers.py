@@ -1,0 +1,126 @@
+"""Skeletons, their uncertainty and the sensors as markers for RViz and Foxglove, and a person's segments as TF."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Final
+
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import MultiDOFJointState, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from body_tracking import graph
+from body_tracking.calibration.result import SensorPose
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.messages import Markers, cloud_to_skeletons, segments_to_transforms, transform_to_pose
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.common import BODY, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
+from body_tracking.parameters import Parameter
+from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
+from body_tracking.sensors import check_sensor_name
+from body_tracking.skeleton import Skeleton
+from body_tracking.viewing.colours import FILTERED, FUSED, UNCERTAINTY, sensor_colours
+from body_tracking.viewing.shapes import ellipsoids, figure, frustum, in_world
+
+try:  # not on PyPI
+    from tf2_msgs.msg import TFMessage
+except ImportError:
+    TFMessage = None
+
+PARAMETERS = (
+    Parameter(
+        "rate",
+        15.0,
+        "publish markers at most this often, and only while somebody listens",
+        unit="Hz",
+        min=0.1,
+        max=100.0,
+    ),
+    Parameter(
+        "tf",
+        "segments",
+        "which of a person's segments become frames, where the filter has a model: all; only the pelvis, as "
+        "robot_state_publisher with the person's URDF needs it; none",
+        choices=("segments", "root", "none"),
+    ),
+    SENSORS,
+    BODY,
+    WORLD_FRAME,
+)
+
+_FRUSTUM_DEPTH: Final = 0.3
+"""Metres to which a sensor's view is drawn."""
+
+
+class BodyMarkers(GraphNode):
+    """Keeps what came last of each topic, and draws it now and then."""
+
+    NAME = "body_markers"
+    PARAMETERS = PARAMETERS
+
+    def start(self) -> None:
+        """Connect."""
+        given: dict[str, Any] = dict(self.values)
+        self.body, self.world = graph.check_body(given["body"]), given["world_frame"]
+        sensors = [check_sensor_name(sensor) for sensor in given["sensors"]]
+        self.colours = {**sensor_colours(sensors), "fused": FUSED, "filtered": FILTERED}
+        self.latest: dict[str, dict[int, Skeleton]] = {}
+        self.poses: dict[str, SensorPose] = {}
+        self.output = self.create_publisher(MarkerArray, graph.markers_topic(self.body), to_profile(RELIABLE))
+        sources = {graph.FUSED: "fused", graph.FILTERED: "filtered", **{graph.skeleton_topic(s): s for s in sensors}}
+        for topic, name in sources.items():
+            self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
+        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
+        model = UpperBody()
+        self.framed = {"segments": model.segment_names, "root": model.segment_names[:1], "none": ()}[given["tf"]]
+        if TFMessage is not None and self.framed:
+            self.tf = self.create_publisher(TFMessage, graph.TF, to_profile(RELIABLE))
+            segments = graph.segments_topic(self.body)
+            self.listen(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
+        self.create_timer(1.0 / given["rate"], self.publish, clock=STEADY)
+
+    def on_skeletons(self, topic: str, name: str, message: Any, sent_ns: int) -> None:
+        """Note what is seen."""
+        skeletons = cloud_to_skeletons(message)
+        self.monitor.message_in(topic, skeletons[0].stamp_ns)
+        self.latest.setdefault(name, {}).update({each.body: each for each in skeletons})
+
+    def on_pose(self, message: Any, sent_ns: int) -> None:
+        """A sensor's pose."""
+        pose = transform_to_pose(message)
+        self.poses[pose.sensor] = pose
+
+    def on_segments(self, message: Any, sent_ns: int) -> None:
+        """Where the segments are."""
+        self.send(self.tf, segments_to_transforms(message, self.body, self.framed, ROS))
+
+    def publish(self) -> None:
+        """Markers of what is new; what does not come again vanishes by itself."""
+        latest, self.latest = self.latest, {}
+        if not self.output.get_subscription_count():
+            return
+        markers = Markers(0, self.world, ROS)
+        for name, people in latest.items():
+            skeletons = tuple(people.values())
+            pose = self.poses.get(name)
+            if pose is None and skeletons[0].frame_id != self.world:
+                continue  # of a sensor that is not calibrated
+            placed = skeletons if pose is None else tuple(in_world(each, pose) for each in skeletons)
+            markers.figure(name, figure(placed, self.colours[name]), self.colours[name], 0.02, 0.01)
+        markers.ellipsoids("uncertainty", ellipsoids(tuple(latest.get("filtered", {}).values())), UNCERTAINTY, 0.3)
+        for number, (name, pose) in enumerate(sorted(self.poses.items())):
+            if name in self.colours:
+                markers.lines("sensors", number, frustum(_FRUSTUM_DEPTH), pose, self.colours[name])
+        self.send(self.output, markers.message())
+
+
+def main() -> None:
+    """The executable ``body_markers``."""
+    run(BodyMarkers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""A person's joint angles to the commands of a robot's controller, with a safe stop.
+
+A node of its own, and no part of ``joint_angles``: one job per node, and who holds the robot must not die with what it
+watches. It holds within ``silence`` of the last word however the rest of the graph ends, and by the wall clock, also
+where the time on ``/clock`` stands still. If it ends itself, there are no more commands, and what the robot then does
+is its controller's to decide. No safety-rated function: docs/robots.md.
+"""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
+
+from body_tracking import graph
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.messages import (
+    command_to_array,
+    command_to_trajectory,
+    joint_states_to_angles,
+    to_nanoseconds,
+    transform_to_pose,
+)
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.common import BODY, RELIABLE, ROS, SENSORS, STEADY, GraphNode, run
+from body_tracking.parameters import Parameter, Value
+from body_tracking.recording.qos import LATCHED
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.robot.calibration import CalibrationQuality
+from body_tracking.robot.follower import AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK, Command, Follower, State
+from body_tracking.robot.mapping import TRAJECTORY, load
+from body_tracking.sensors import check_sensor_name
+from body_tracking.skeleton import Skeleton
+
+PARAMETERS = (
+    Parameter("mapping", "", "the robot's mapping file; see docs/robots.md"),
+    BODY,
+    SENSORS,
+    Parameter("rate", 100.0, "commands per second", unit="Hz", min=10.0, max=1000.0),
+    Parameter(
+        "clock",
+        AUTO_CLOCK,
+        "by which angles are stamped: ros, or a sensor's own that need not show the time of day, as a Kinect's; auto: "
+        "ros unless they are 10 s apart",
+        choices=(AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK),
+    ),
+    Parameter(
+        "delay",
+        0.05,
+        "with a sensor's clock: from capture to here of the quickest angles, which cannot be measured here",
+        unit="s",
+        min=0.0,
+        max=1.0,
+    ),
+    RELIABLE,
+)
+
+_UNPAIRED = 16
+"""Angles and standard deviations that may wait for each other."""
+_LEVELS = {State.FOLLOWING: 0, State.APPROACHING: 0, State.HOLDING: 1, State.STOPPED: 2}
+
+
+class RobotCommands(GraphNode):
+    """Tells the follower what is heard, and publishes its commands at a steady rate."""
+
+    NAME = "robot_commands"
+    PARAMETERS = PARAMETERS
+
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Read the mapping; what is wrong with it ends the node."""
+        given: dict[str, Any] = dict(values)
+        self.body = graph.check_body(given["body"])
+        self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
+        self.mapping = load(Path(given["mapping"]).expanduser(), {name: angle_names(name) for name in ALL_CONVENTIONS})
+        self.follower = Follower(self.mapping, 1.0 / given["rate"], given["clock"], given["delay"])
+        self.follower.watch_sensors(self.sensors)
+
+    def start(self) -> None:
+        """Connect."""
+        self.waiting: OrderedDict[int, dict[str, JointState]] = OrderedDict()
+        self.command: Command | None = None
+        output = self.mapping.output
+        kind = JointTrajectory if output.kind == TRAJECTORY else Float64MultiArray
+        self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
+        angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
+        for topic in angles:
+            self.listen(topic, JointState, self.result_qos(), partial(self.on_angles, topic))
+        for sensor in self.sensors:
+            self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
+        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
+        self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
+        if output.state_topic:
+            self.listen(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot)
+        self.create_timer(1.0 / float(str(self.values["rate"])), self.tell_robot, clock=STEADY)
+
+    def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
+        """Angles, or their standard deviations; both of one stamp go on."""
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        self.monitor.message_in(topic, stamp_ns)
+        pair = self.waiting.setdefault(stamp_ns, {})
+        pair[topic] = message
+        if len(pair) == 2:
+            while self.waiting.popitem(last=False)[0] != stamp_ns:
+                self.monitor.totals["unpaired"] += 1
+            values, deviations = (pair[name] for name in sorted(pair))
+            angles = joint_states_to_angles(values, deviations, self.body)
+            if self.follower.hear_angles(angles, self.now_ns(), time.monotonic_ns()):
+                self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+        elif len(self.waiting) > _UNPAIRED:
+            self.waiting.popitem(last=False)
+            self.monitor.totals["unpaired"] += 1
+
+    def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        """A sensor sees somebody."""
+        self.follower.hear_sensor(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
+
+    def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:
+        """Since when a sensor's pose holds."""
+        pose = transform_to_pose(message)
+        self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
+
+    def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
+        """How well the sensors are calibrated, if that is what it says."""
+        for status in message.status:
+            if status.name.startswith("calibration:"):
+                values = {item.key: item.value for item in status.values}
+                quality = CalibrationQuality.from_diagnostics(values, self.sensors)
+                self.follower.calibration.heard(quality, time.monotonic_ns())
+
+    def on_robot(self, message: JointState, sent_ns: int) -> None:
+        """How the robot stands."""
+        position = np.array(message.position, dtype=np.float64)
+        self.follower.hear_robot(tuple(message.name), position, time.monotonic_ns())
+
+    def time_jumped_back(self, topic: str) -> None:
+        """Hold, and wait for angles of the new time."""
+        self.waiting.clear()
+        self.follower.time_jumped_back()
+
+    def tell_robot(self) -> None:
+        """One command, or none."""
+        now_ns = self.now_ns()
+        self.command = command = self.follower.step(now_ns, time.monotonic_ns())
+        if command.position is not None:
+            output = self.mapping.output
+            if output.kind == TRAJECTORY:
+                stamp_ns = now_ns if output.stamped else 0
+                message = command_to_trajectory(
+                    self.mapping.joints, command.position, stamp_ns, output.time_from_start, ROS
+                )
+            else:
+                message = command_to_array(command.position, ROS)
+            self.send(self.output, message)
+        for change in self.follower.transitions:
+            self.monitor.totals[f"{change.after} began"] += 1
+            self.get_logger().info(str(change))
+        if self.follower.transitions:
+            self.follower.transitions.clear()
+            self._report()
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """What the robot is told, and why."""
+        command = self.command
+        if command is None:
+            return 2, "stopped: nothing heard yet", {}
+        values: dict[str, object] = {
+            "robot": self.mapping.robot,
+            "state": command.state,
+            "reason": command.reason,
+            "age of angles ms": f"{1e3 * command.age:.1f}",
+            "margin to limits rad": f"{command.margin:.3f}",
+            "nearest to a limit": command.nearest,
+            "joints that keep their place": ", ".join(command.kept),
+        }
+        return _LEVELS[command.state], f"{command.state}: {command.reason}", values
+
+
+def main() -> None:
+    """The executable ``robot_commands``."""
+    run(RobotCommands)
+
+
+if __name__ == "__main__":
+    main()

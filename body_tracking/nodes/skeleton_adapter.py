@@ -1,0 +1,88 @@
+"""What the ROS driver of another camera publishes of bodies, to ``/<sensor>/skeleton``."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from body_tracking import graph
+from body_tracking.cdr import encode_skeletons
+from body_tracking.messages import markers_to_points
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.common import RELIABLE, GraphNode, run
+from body_tracking.parameters import Parameter
+from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.sensors import check_sensor_name, optical_frame
+from body_tracking.sensors.azure import bodies_of
+from body_tracking.skeleton import TrackingState
+
+PARAMETERS = (
+    Parameter("sensor", "azure1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
+    Parameter(
+        "topic",
+        "/body_tracking_data",
+        "what is listened to: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
+    ),
+    Parameter(
+        "state",
+        "tracked",
+        "what is said of every joint: the driver does not tell which ones the camera sees and which it guesses",
+        choices=("tracked", "inferred"),
+    ),
+    RELIABLE,
+)
+
+SILENCE = 1.0
+"""Seconds without a message from which on the topic is a problem."""
+
+
+class SkeletonAdapter(GraphNode):
+    """Converts and publishes each message as it comes."""
+
+    NAME = "skeleton_adapter"
+    PARAMETERS = PARAMETERS
+
+    def start(self) -> None:
+        """Connect."""
+        given: dict[str, Any] = dict(self.values)
+        sensor = check_sensor_name(given["sensor"])
+        self.frame_id = optical_frame(sensor)
+        self.joint_state = TrackingState[given["state"].upper()]
+        self.topic: str = given["topic"]
+        self.heard: float | None = None
+        self.output = self.create_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers)
+
+    def on_markers(self, message: Any, sent_ns: int) -> None:
+        """Publish the bodies of one message; nobody in view is no message."""
+        self.heard = time.monotonic()
+        if not message.markers:
+            return
+        stamp_ns, ids, points = markers_to_points(message)
+        if self.monitor.message_in(self.topic, stamp_ns):
+            self.log_seldom("jump", f"{self.topic}: time jumped back", period_s=1.0)
+        skeletons = bodies_of(ids, points, stamp_ns, self.frame_id, self.joint_state)
+        if skeletons:
+            self.send(self.output, encode_skeletons(skeletons), stamp_ns, sent_ns)
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """Whether messages come."""
+        if self.heard is None:
+            return 1, f"no message on {self.topic} yet", {}
+        silent = time.monotonic() - self.heard
+        return (1, f"no message on {self.topic} for {silent:.0f} s", {}) if silent > SILENCE else (0, "streaming", {})
+
+
+def main() -> None:
+    """The executable ``skeleton_adapter``."""
+    run(SkeletonAdapter)
+
+
+if __name__ == "__main__":
+    main()

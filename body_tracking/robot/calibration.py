@@ -1,0 +1,98 @@
+"""How well the sensors are calibrated, as far as a robot needs to know: by what the node ``calibration`` says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from body_tracking.robot.mapping import SafetyLimits
+from body_tracking.skeleton import NANOSECONDS
+
+SILENCE = 5.0
+"""Seconds after which what was said once a second is no longer taken to hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationQuality:
+    """What is known of the sensors' poses.
+
+    Attributes:
+        missing: sensors without a pose.
+        rotation_stddev: radians, of the least certain sensor; NaN where that is not said.
+        translation_stddev: metres, likewise.
+    """
+
+    missing: tuple[str, ...]
+    rotation_stddev: float
+    translation_stddev: float
+
+    @classmethod
+    def from_diagnostics(cls, values: Mapping[str, str], sensors: Iterable[str]) -> CalibrationQuality:
+        """By the values in the diagnostics of ``calibration``, for these sensors; the reference needs none."""
+        others = [sensor for sensor in sensors if sensor != values.get("reference")]
+
+        def worst(key: str) -> float:
+            numbers = [_number(values.get(f"{sensor} {key}", "nan")) for sensor in others]
+            return math.nan if any(map(math.isnan, numbers)) else max(numbers, default=0.0)
+
+        missing = tuple(sensor for sensor in others if f"{sensor} rotation_stddev_deg" not in values)
+        return cls(missing, math.radians(worst("rotation_stddev_deg")), worst("translation_stddev_mm") / 1e3)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+class CalibrationWatch:
+    """Remembers what was last said of the calibration, and says what is wrong with it."""
+
+    def __init__(self) -> None:
+        self._quality: CalibrationQuality | None = None
+        self._heard_ns = 0
+        self._valid_from_ns: dict[str, int] = {}
+
+    def heard(self, quality: CalibrationQuality, steady_ns: int) -> None:
+        """Take note of the present quality."""
+        self._quality, self._heard_ns = quality, steady_ns
+
+    def pose(self, sensor: str, valid_from_ns: int) -> None:
+        """Take note of a sensor's pose, which holds from this stamp on; 0 for always."""
+        self._valid_from_ns[sensor] = valid_from_ns
+
+    def fault(self, limits: SafetyLimits, stamp_ns: int, steady_ns: int) -> str:
+        """What is wrong; empty for nothing.
+
+        Args:
+            limits: what is allowed.
+            stamp_ns: of the angles that are to be followed, in the clock of the poses' stamps.
+            steady_ns: now.
+        """
+        if not limits.calibration:
+            return ""
+        if self._quality is None:
+            return "calibration has not been heard of"
+        silent = (steady_ns - self._heard_ns) / NANOSECONDS
+        if silent > SILENCE:
+            return f"calibration has not been heard of for {silent:.0f} s"
+        if self._quality.missing:
+            return f"calibration is missing: {', '.join(self._quality.missing)}"
+        for what, value, most, unit in (
+            ("orientation", self._quality.rotation_stddev, limits.max_rotation_stddev, "rad"),
+            ("place", self._quality.translation_stddev, limits.max_translation_stddev, "m"),
+        ):
+            if not value <= most:
+                return (
+                    f"calibration is poor: standard deviation {value:.3g} {unit} of a sensor's {what}, limit {most:g}"
+                )
+        if math.isfinite(limits.max_calibration_age):
+            oldest = min(self._valid_from_ns.values(), default=0)
+            if oldest == 0:
+                return "the age of the calibration is not known"
+            age = (stamp_ns - oldest) / NANOSECONDS
+            if age > limits.max_calibration_age:
+                return f"calibration is {age:.0f} s old, limit {limits.max_calibration_age:g} s"
+        return ""

@@ -1,0 +1,444 @@
+"""A robot's joints follow a person's angles, and hold and stop where they should not.
+
+States and what leads from one to the next (times by the mapping's ``SafetyLimits``)::
+
+    stopped ──good for recover_after──> approaching ──after approach──> following
+       ^                                  ^    └──────any fault──────┐     │
+       │                 good for recover_after                      v     v
+       └───────────a fault after stop_after of holding───────────── holding
+
+- *stopped*: no commands. So it begins, too.
+- *approaching*: follows; the rates grow from nothing to their limits, so that there is no jump to where the person is.
+- *following*: each command is where the person is expected to be now, within the limits.
+- *holding*: the same command again and again; joints with a limit of acceleration come to rest first.
+
+A fault is any of: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although
+somebody goes on saying what is to be expected; angles older than ``max_age`` or stamped in the future; an angle that is
+missing, not finite or less certain than allowed; no good calibration; a robot that is silent, beyond its limits, or not
+where it was sent; commands that came to a standstill themselves. Each is told by name.
+
+Nothing in here looks at a clock. Two times are given: ``now_ns`` in the clock of the stamps (which may stand still or
+jump), and ``steady_ns``, which never does. This is no safety-rated function.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.robot.calibration import CalibrationWatch
+from body_tracking.robot.limiter import Limiter
+from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+
+JUMP_BACK_NS = NANOSECONDS
+"""A stamp further behind than this is a backward jump of time, not a late message."""
+
+ROBOT_SILENCE = 0.5
+"""Seconds without a word of the robot's own state after which it is taken to be away."""
+
+AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK = "auto", "ros", "sensor"
+
+_OTHER_CLOCK_NS = 10 * NANOSECONDS
+"""Stamps further than this from now are by another clock."""
+
+_AHEAD = 0.05
+"""Seconds by which stamps may be in the future: clocks that are kept together differ by less."""
+
+
+class FollowerError(BodyTrackingError):
+    """A follower that cannot do what its mapping says, or a state that is not of its robot."""
+
+
+class State(StrEnum):
+    """What the robot is told to do."""
+
+    STOPPED = "stopped"
+    APPROACHING = "approaching"
+    FOLLOWING = "following"
+    HOLDING = "holding"
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A change of state.
+
+    Attributes:
+        before, after: the states.
+        reason: what caused it, by name.
+    """
+
+    before: State
+    after: State
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.before} -> {self.after}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Command:
+    """What to tell the robot now.
+
+    Attributes:
+        state: of the follower.
+        reason: why it is in that state, or what it waits for.
+        position: (n,) radians by the mapping's joints; None where nothing is to be published.
+        kept: joints that keep their place alone, because their angles are unknown.
+        age: seconds from capture to now of the angles that it is made of; NaN where there are none.
+        margin: radians from the joint nearest to one of its limits to that limit.
+        nearest: the name of that joint.
+    """
+
+    state: State
+    reason: str
+    position: FloatArray | None
+    kept: tuple[str, ...]
+    age: float
+    margin: float
+    nearest: str
+
+
+@dataclass(slots=True, eq=False)
+class _Angles:
+    """The last angles: (m,) each, in the mapping's order."""
+
+    stamp_ns: int = 0
+    steady_ns: int = 0
+    position: FloatArray = field(default_factory=lambda: np.empty(0))
+    velocity: FloatArray = field(default_factory=lambda: np.empty(0))
+    stddev: FloatArray = field(default_factory=lambda: np.empty(0))
+    velocity_stddev: FloatArray = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Expected:
+    """What is expected of the person now.
+
+    Attributes:
+        age: seconds since capture; NaN without angles.
+        angle, stddev: (m,) radians of the person.
+        target: (n,) radians of the robot.
+        known: (n,) whether all of a joint's angles are known well enough.
+    """
+
+    age: float
+    angle: FloatArray
+    stddev: FloatArray
+    target: FloatArray
+    known: BoolArray
+
+
+class Follower:
+    """Takes what is heard, and answers with commands.
+
+    Args:
+        mapping: of the robot.
+        period: seconds between two commands. A fault that would be one by the next command is one now.
+        clock: by which angles are stamped: ``ROS_CLOCK`` for that of ``now_ns``; ``SENSOR_CLOCK`` for another one, as a
+            Kinect's own that counts from its start; ``AUTO_CLOCK`` for the former unless they are 10 s apart.
+        delay: seconds from capture to here of the quickest angles, where the clock is another one, and nobody can tell:
+            the least difference between the clocks in the last 10 to 20 s stands for this delay.
+
+    Attributes:
+        state: what it does now.
+        transitions: those that nobody has taken away yet, the oldest first.
+
+    Raises:
+        FollowerError: ``silence`` is not longer than the period, or the point of a trajectory nearer than that.
+    """
+
+    def __init__(self, mapping: RobotMapping, period: float, clock: str = AUTO_CLOCK, delay: float = 0.05) -> None:
+        if period >= mapping.safety.silence:
+            raise FollowerError(
+                f"{mapping.robot}: silence {mapping.safety.silence:g} s is no more than the period {period:g} s"
+            )
+        if mapping.output.kind == TRAJECTORY and mapping.output.time_from_start < period:
+            at = mapping.output.time_from_start
+            raise FollowerError(f"{mapping.robot}: time_from_start {at:g} s is less than the period {period:g} s")
+        self.mapping = mapping
+        self.calibration = CalibrationWatch()
+        self.state = State.STOPPED
+        self.transitions: list[Transition] = []
+        self._limits = mapping.safety
+        self._period, self._clock, self._delay = period, clock, delay
+        self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
+        self._offsets = _LeastOffset()
+        self._angles: _Angles | None = None
+        self._wrong = "no angles yet"
+        self._names: tuple[str, ...] = ()
+        self._places: IntArray | None = None
+        self._watched: tuple[str, ...] = ()
+        self._sensors: dict[str, tuple[int, int]] = {}
+        self._robot: FloatArray | None = None
+        self._robot_ns = 0
+        self._robot_wrong = ""
+        self._stepped_ns: int | None = None
+        self._since_ns = self._approached_ns = 0
+        self._good_since_ns: int | None = None
+        self._reason = self._wrong
+        n = len(mapping.joints)
+        self._known_since_ns: IntArray = np.full(n, -1, dtype=np.intp)
+        self._used = mapping.matrix != 0.0
+
+    # --- what is heard
+
+    def hear_angles(self, angles: JointAngles, now_ns: int, steady_ns: int) -> bool:
+        """Take note of angles; of a message that came late, nothing.
+
+        Returns:
+            Whether time jumped back, which forgets what was heard before.
+        """
+        last_ns = self._angles.stamp_ns if self._angles is not None else None
+        jumped = last_ns is not None and angles.stamp_ns < last_ns - JUMP_BACK_NS
+        if jumped:
+            self.time_jumped_back()
+        elif last_ns is not None and angles.stamp_ns <= last_ns:
+            return False  # late, or the same again: no news
+        if angles.names != self._names:
+            self._names = angles.names
+            missing = [name for name in self.mapping.angles if name not in angles.names]
+            self._wrong = f"angle {missing[0]} is not among the joint states" if missing else ""
+            places = [angles.names.index(name) for name in self.mapping.angles if name in angles.names]
+            self._places = None if missing else np.array(places, dtype=np.intp)
+        if self._places is None:
+            return jumped
+        self._wrong = ""
+        self._offsets.add(now_ns - angles.stamp_ns, steady_ns)
+        self._angles = _Angles(
+            angles.stamp_ns,
+            steady_ns,
+            angles.position[self._places],
+            angles.velocity[self._places],
+            angles.position_stddev[self._places],
+            angles.velocity_stddev[self._places],
+        )
+        return jumped
+
+    def hear_sensor(self, sensor: str, stamp_ns: int, steady_ns: int) -> None:
+        """Take note of a sensor's frame; a stamp that stands still is none."""
+        if sensor not in self._sensors or self._sensors[sensor][0] != stamp_ns:
+            self._sensors[sensor] = stamp_ns, steady_ns
+
+    def watch_sensors(self, sensors: tuple[str, ...]) -> None:
+        """Hold where none of these is heard of; of none at all, that does not matter."""
+        self._watched = sensors
+
+    def hear_robot(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
+        """Take note of how the robot stands.
+
+        Args:
+            joints: names, in any order, others among them.
+            position: radians of each.
+            steady_ns: now.
+
+        Raises:
+            FollowerError: a joint is missing, or stands nowhere.
+        """
+        self._robot_ns = steady_ns
+        missing = [name for name in self.mapping.joints if name not in joints]
+        if missing or len(position) != len(joints):
+            what = (
+                f"{missing[0]} is not among them" if missing else f"{len(position)} positions of {len(joints)} joints"
+            )
+            self._robot, self._robot_wrong = None, f"the robot's joint states: {what}"
+            raise FollowerError(self._robot_wrong)
+        found = position[[joints.index(name) for name in self.mapping.joints]]
+        if not np.isfinite(found).all():
+            self._robot, self._robot_wrong = None, "the robot's joint states are not finite"
+            raise FollowerError(self._robot_wrong)
+        self._robot, self._robot_wrong = found, ""
+
+    def time_jumped_back(self) -> None:
+        """The stamps jumped back: what was heard before is of another time."""
+        self._angles, self._wrong = None, "time jumped back"
+        self._names, self._places = (), None
+        self._good_since_ns = None
+        self._known_since_ns[:] = -1
+        self._offsets.clear()
+
+    # --- what follows from it
+
+    def step(self, now_ns: int, steady_ns: int) -> Command:
+        """The next command; to be called once per period, late or not."""
+        elapsed = self._period if self._stepped_ns is None else (steady_ns - self._stepped_ns) / NANOSECONDS
+        # Never more than two periods at once: after a standstill the robot must not make up for it.
+        dt = min(max(elapsed, 0.0), 2.0 * self._period)
+        self._stepped_ns = steady_ns
+        expected = self._expected(now_ns)
+        known = expected.known
+        fault = self._fault(steady_ns, elapsed, expected)
+        if fault:
+            self._good_since_ns = None
+        elif self._good_since_ns is None:
+            self._good_since_ns = steady_ns
+        self._known_since_ns[~known] = -1
+        self._known_since_ns[known & (self._known_since_ns < 0)] = steady_ns
+        self._next_state(fault, steady_ns)
+        kept: tuple[str, ...] = ()
+        if self.state in (State.APPROACHING, State.FOLLOWING):
+            share = self._shares(steady_ns)
+            free = share >= 0.0
+            kept = tuple(name for name, moves in zip(self.mapping.joints, free, strict=True) if not moves)
+            self._limiter.step(np.where(free, expected.target, self._limiter.position), dt, np.maximum(share, 0.0))
+        elif self.state == State.HOLDING:
+            self._limiter.brake(dt)
+        position = self._limiter.position
+        margins = np.minimum(position - self.mapping.lower, self.mapping.upper - position)
+        nearest = int(margins.argmin())
+        return Command(
+            self.state,
+            self._reason,
+            None if self.state == State.STOPPED else position.copy(),
+            kept,
+            expected.age,
+            float(margins[nearest]),
+            self.mapping.joints[nearest],
+        )
+
+    def _expected(self, now_ns: int) -> _Expected:
+        """Where the person's angles put the joints now."""
+        angles, mapping, n = self._angles, self.mapping, len(self.mapping.joints)
+        if angles is None:
+            unknown = np.full(len(mapping.angles), np.inf)
+            return _Expected(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
+        behind = now_ns - angles.stamp_ns
+        apart = self._clock == AUTO_CLOCK and abs(self._offsets.least) > _OTHER_CLOCK_NS
+        if apart or self._clock == SENSOR_CLOCK:
+            behind -= self._offsets.least - round(self._delay * NANOSECONDS)
+        age = behind / NANOSECONDS
+        wait = max(age, 0.0)
+        ahead = min(wait, self._limits.prediction)
+        with np.errstate(invalid="ignore"):  # infinite and NaN say that something is not known
+            predicted = angles.position + ahead * angles.velocity
+            # How errors of angle and velocity go together is not told; this is the most that any correlation makes of
+            # them. Beyond the horizon the velocity itself is the error.
+            stddev = angles.stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
+            sound = np.isfinite(predicted) & np.isfinite(stddev)
+        most = np.where(self._used, mapping.max_stddev[:, None], np.inf)
+        known = (~self._used | (sound & (stddev <= most))).all(axis=1)
+        turned = np.remainder(np.where(sound, predicted, 0.0) + np.pi, 2.0 * np.pi) - np.pi
+        target = mapping.matrix @ turned + mapping.offset
+        # Of the values that mean the same, the one nearest to where the joint is.
+        turns = np.divide(self._limiter.position - target, mapping.period, out=np.zeros(n), where=mapping.period > 0.0)
+        return _Expected(age, predicted, stddev, target + np.round(turns) * mapping.period, known)
+
+    def _fault(self, steady_ns: int, elapsed: float, expected: _Expected) -> str:
+        """What is wrong now, or would be by the next command; empty for nothing."""
+        limits, angles, age = self._limits, self._angles, expected.age
+        allowed_ns = round((limits.silence - self._period) * NANOSECONDS)
+        if self._wrong or angles is None:
+            return self._wrong or "no angles yet"
+        if steady_ns - angles.steady_ns >= allowed_ns:
+            return f"no new angles for {(steady_ns - angles.steady_ns) / NANOSECONDS:.2f} s"
+        if self._watched:
+            heard = [self._sensors[sensor][1] for sensor in self._watched if sensor in self._sensors]
+            listed = ", ".join(self._watched)
+            if not heard:
+                return f"no frame of {listed} yet"
+            if steady_ns - max(heard) >= allowed_ns:
+                return f"no frame of {listed} for {(steady_ns - max(heard)) / NANOSECONDS:.2f} s"
+        if elapsed > limits.silence:
+            return f"the commands themselves stood still for {elapsed:.2f} s"
+        if age > limits.max_age:
+            return f"angles are {age:.2f} s old, limit {limits.max_age:g} s"
+        if age < -_AHEAD:
+            return f"angles are stamped {-age:.2f} s in the future"
+        needed = ~expected.known & ~self.mapping.alone
+        if needed.any():
+            return self._unknown(int(needed.argmax()), expected)
+        return self.calibration.fault(limits, angles.stamp_ns, steady_ns) or self._robot_fault(steady_ns)
+
+    def _unknown(self, joint: int, expected: _Expected) -> str:
+        """What is wrong with the angles of a joint."""
+        for place in np.flatnonzero(self._used[joint]):
+            name, most = self.mapping.angles[place], self.mapping.max_stddev[joint]
+            if not np.isfinite(expected.angle[place]):
+                return f"{name} is not finite, or its velocity is not known"
+            if not expected.stddev[place] <= most:
+                return f"standard deviation of {name} is {expected.stddev[place]:.2f} rad, limit {most:g}"
+        raise AssertionError(f"nothing is wrong with {self.mapping.joints[joint]}")
+
+    def _robot_fault(self, steady_ns: int) -> str:
+        """What is wrong with the robot itself, where it says how it stands."""
+        if not self.mapping.output.state_topic:
+            return ""
+        if self._robot_wrong:
+            return self._robot_wrong
+        if self._robot is None or steady_ns - self._robot_ns > ROBOT_SILENCE * NANOSECONDS:
+            return "the robot does not say how it stands"
+        beyond = (self._robot < self.mapping.lower) | (self._robot > self.mapping.upper)
+        if self.state == State.STOPPED:  # where it stands is where commands would begin
+            if beyond.any():
+                joint = int(beyond.argmax())
+                return f"the robot's {self.mapping.joints[joint]} is at {self._robot[joint]:.3f} rad, beyond its limits"
+            return ""
+        errors = np.abs(self._robot - self._limiter.position)
+        worst = int(errors.argmax())
+        if errors[worst] > self._limits.max_tracking_error:
+            return f"the robot's {self.mapping.joints[worst]} is {errors[worst]:.2f} rad from its command"
+        return ""
+
+    def _next_state(self, fault: str, steady_ns: int) -> None:
+        limits = self._limits
+        good = -1.0 if self._good_since_ns is None else (steady_ns - self._good_since_ns) / NANOSECONDS
+        since = (steady_ns - self._since_ns) / NANOSECONDS
+        if self.state in (State.STOPPED, State.HOLDING):
+            if good >= limits.recover_after:
+                if self.state == State.STOPPED and self._robot is not None:
+                    self._limiter.reset(self._robot)
+                self._enter(State.APPROACHING, f"everything was good for {good:.2f} s", steady_ns)
+            elif fault and self.state == State.HOLDING and since >= limits.stop_after:
+                self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
+            else:
+                self._reason = fault or f"everything is good for {good:.2f} s, {limits.recover_after:g} s are needed"
+        elif fault:
+            self._enter(State.HOLDING, fault, steady_ns)
+        elif self.state == State.APPROACHING and since >= limits.approach:
+            self._enter(State.FOLLOWING, "the rates have reached their limits", steady_ns)
+
+    def _enter(self, state: State, reason: str, steady_ns: int) -> None:
+        self.transitions.append(Transition(self.state, state, reason))
+        if state == State.APPROACHING:
+            self._approached_ns = steady_ns
+        self.state, self._reason, self._since_ns = state, reason, steady_ns
+
+    def _shares(self, steady_ns: int) -> FloatArray:
+        """(n,) of its rate that each joint may use; negative for one that keeps its place."""
+        limits = self._limits
+        ready_ns = self._known_since_ns + round(limits.recover_after * NANOSECONDS)
+        begun_ns = np.maximum(ready_ns, self._approached_ns)
+        waiting = self.mapping.alone & ((self._known_since_ns < 0) | (steady_ns < ready_ns))
+        grown = (steady_ns - np.where(self.mapping.alone, begun_ns, self._approached_ns)) / NANOSECONDS
+        share = np.minimum(grown / limits.approach, 1.0) if limits.approach > 0.0 else np.ones(len(ready_ns))
+        return np.where(waiting, -1.0, share)
+
+
+class _LeastOffset:
+    """The least of some differences in the last 10 to 20 s: two buckets, of which the older one is dropped."""
+
+    _BUCKET_NS = 10 * NANOSECONDS
+
+    def __init__(self) -> None:
+        self._older = self._newer = 0
+        self._since_ns: int | None = None
+
+    @property
+    def least(self) -> int:
+        return min(self._older, self._newer)
+
+    def add(self, offset_ns: int, steady_ns: int) -> None:
+        if self._since_ns is not None and abs(offset_ns - self.least) > _OTHER_CLOCK_NS:
+            self._since_ns = None  # one of the clocks was set, or there was no /clock yet
+        if self._since_ns is None or steady_ns - self._since_ns > self._BUCKET_NS:
+            self._older = offset_ns if self._since_ns is None else self._newer
+            self._newer, self._since_ns = offset_ns, steady_ns
+        self._newer = min(self._newer, offset_ns)
+
+    def clear(self) -> None:
+        self._since_ns = None

@@ -1,0 +1,435 @@
+"""Mapping files: which joint of a robot follows which of the person's angles, and how far it may be trusted.
+
+A mapping is a YAML file; ``docs/robots.md`` explains it, ``config/robots/`` has two. Radians, seconds, metres::
+
+    robot: two_joint_arm            # a name, for people
+    convention: isb                 # whose angle names these are
+    output:
+      kind: joint_trajectory        # or float64_multi_array
+      topic: /arm_controller/joint_trajectory
+      time_from_start: 0.02         # joint_trajectory: how long the controller takes to get there
+      stamped: true                 # joint_trajectory: stamp with the present time, not with 0 ("now")
+      state_topic: /arm/joint_states    # optional: where the robot says how it stands
+      order: [shoulder, elbow]      # as in the controller's own configuration
+    joints:                         # in the same order
+      - name: shoulder
+        angle: shoulder_elevation_left          # or angles: [{angle: NAME, weight: NUMBER}, ...], or constant: NUMBER
+        scale: -1.0                 # robot = scale * person + offset
+        offset: 0.0
+        lower: 0.0
+        upper: 2.8
+        rate: 2.0                   # rad/s
+        acceleration: 20.0          # rad/s^2; optional: without it speed may change at once
+        home: 0.0                   # where the robot stands at the start, if nothing says so
+        max_stddev: 0.4             # of the person's angle; optional
+        when_uncertain: hold_robot  # or hold_joint: this joint alone keeps its place
+    safety: {...}                   # the fields of SafetyLimits
+
+Everything that is wrong is refused with its name: see :func:`load`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.parameters import (
+    Parameter,
+    ParameterError,
+    Value,
+    check_all,
+    fields_of,
+    number_field,
+    parameters_from,
+)
+from body_tracking.skeleton import BoolArray, FloatArray
+
+TRAJECTORY, ARRAY = "joint_trajectory", "float64_multi_array"
+HOLD_ROBOT, HOLD_JOINT = "hold_robot", "hold_joint"
+
+
+class MappingError(BodyTrackingError):
+    """A mapping file that cannot be read, or that says something that cannot be."""
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyLimits:
+    """When to hold, when to stop, and how to begin again; the fields' ``doc`` says what each is."""
+
+    silence: float = number_field(
+        0.1,
+        "the robot holds at the latest this long after the last new angles, and after the last frame of all sensors",
+        "s",
+        0.02,
+        5.0,
+    )
+    max_age: float = number_field(0.3, "hold where angles are this long past their capture", "s", 0.02, 10.0)
+    prediction: float = number_field(
+        0.15, "predict angles at constant velocity from their capture to now, but no further than this", "s", 0.0, 1.0
+    )
+    max_stddev: float = number_field(
+        0.35,
+        "hold where the standard deviation of an angle, predicted to now, exceeds this; a joint may have its own",
+        "rad",
+        0.001,
+        3.2,
+    )
+    recover_after: float = number_field(0.5, "begin again after everything was good for this long", "s", 0.0, 60.0)
+    approach: float = number_field(
+        1.5, "when it begins again, the rates grow from nothing to their limits over this time", "s", 0.0, 60.0
+    )
+    stop_after: float = number_field(2.0, "after holding for this long, publish nothing any more", "s", 0.1, 600.0)
+    calibration: bool = field(
+        default=True, metadata={"doc": "hold where the sensors are not calibrated, or the node that tells is not heard"}
+    )
+    max_rotation_stddev: float = number_field(
+        0.06, "hold where a sensor's orientation in world is less certain than this", "rad", 0.0001, 3.2
+    )
+    max_translation_stddev: float = number_field(
+        0.05, "hold where a sensor's place in world is less certain than this", "m", 0.0001, 10.0
+    )
+    max_calibration_age: float = number_field(
+        float("inf"),
+        "hold where the calibration in use is older than this, or of unknown age; infinite: any age",
+        "s",
+        1.0,
+        float("inf"),
+    )
+    max_tracking_error: float = number_field(
+        float("inf"),
+        "hold where a joint of the robot stands further than this from its command (with state_topic)",
+        "rad",
+        0.001,
+        float("inf"),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """Where commands go, and in which form.
+
+    Attributes:
+        kind: ``TRAJECTORY`` or ``ARRAY``.
+        topic: of the commands.
+        time_from_start: seconds, of a trajectory's only point.
+        stamped: whether a trajectory says the time at which it was made.
+        state_topic: ``sensor_msgs/JointState`` of the robot; empty for none.
+    """
+
+    kind: str
+    topic: str
+    time_from_start: float
+    stamped: bool
+    state_topic: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotMapping:
+    """A checked mapping of m angles to n joints; arrays are by joint, in the controller's order.
+
+    Attributes:
+        robot: its name.
+        convention: of the angles.
+        output: where commands go.
+        safety: when to hold.
+        joints: n names.
+        angles: m names of the angles that are used, each once.
+        matrix: (n, m) a joint's change per change of an angle: scale times weight; zeros for a constant joint.
+        offset: (n,) radians.
+        period: (n,) radians by which a joint's value is ambiguous because angles are so by a whole turn; 0 where the
+            angles of a sum have different weights and so no common period.
+        lower, upper, home: (n,) radians.
+        rate: (n,) rad/s.
+        acceleration: (n,) rad/s^2; infinite where not limited.
+        max_stddev: (n,) radians, for each of a joint's angles.
+        alone: (n,) whether the joint holds by itself while its angles are unknown, and the others go on.
+    """
+
+    robot: str
+    convention: str
+    output: Output
+    safety: SafetyLimits
+    joints: tuple[str, ...]
+    angles: tuple[str, ...]
+    matrix: FloatArray
+    offset: FloatArray
+    period: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    home: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+    max_stddev: FloatArray
+    alone: BoolArray
+
+
+def _number(name: str, default: float, doc: str) -> Parameter:
+    return Parameter(name, default, doc, min=-1e3, max=1e3)
+
+
+_JOINT = (
+    Parameter("name", "", "of the robot's joint"),
+    Parameter("angle", "", "of the person that it follows"),
+    _number("scale", 1.0, "robot = scale * person + offset"),
+    _number("offset", 0.0, "robot = scale * person + offset"),
+    _number("constant", 0.0, "in place of an angle"),
+    _number("lower", 0.0, "limit"),
+    _number("upper", 0.0, "limit"),
+    Parameter("rate", 0.0, "limit", min=1e-3, max=100.0),
+    Parameter("acceleration", 1.0, "limit", min=1e-3, max=1e5),
+    _number("home", 0.0, "at the start"),
+    Parameter("max_stddev", 0.35, "of the angle", min=1e-3, max=3.2),
+    Parameter("when_uncertain", HOLD_ROBOT, "who holds", choices=(HOLD_ROBOT, HOLD_JOINT)),
+)
+_TERM = (Parameter("angle", "", "of the person"), _number("weight", 1.0, "in the sum"))
+_OUTPUT = (
+    Parameter("kind", TRAJECTORY, "message", choices=(TRAJECTORY, ARRAY)),
+    Parameter("topic", "", "of the commands"),
+    Parameter("time_from_start", 0.02, "of the point", min=0.001, max=10.0),
+    Parameter("stamped", True, "or 0"),
+    Parameter("state_topic", "", "of the robot"),
+    Parameter("order", (), "of the controller"),
+)
+_TOP = ("robot", "convention", "output", "joints", "safety")
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML in which a key may not come twice: the second would silently replace the first."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for number, key in enumerate(keys):
+            if key in keys[:number]:
+                raise MappingError(f"line {node.value[number][0].start_mark.line + 1}: {key!r} comes twice")
+        return super().construct_mapping(node, deep)
+
+
+def load(path: Path, angle_names: Mapping[str, Sequence[str]]) -> RobotMapping:
+    """Read and check a mapping file.
+
+    Args:
+        path: of the file.
+        angle_names: the angles of each convention.
+
+    Raises:
+        MappingError: no such file, not YAML; a key that is unknown, missing or there twice; a value that is no number,
+            not finite or out of its range; an unknown convention, angle or joint; a joint or angle twice; limits that
+            are empty or inverted, a home or constant beyond them; joints in another order than the controller has
+            them; a time to stop in which the joints cannot brake. The text names the file and what it is.
+    """
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise MappingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    except yaml.YAMLError as error:
+        raise MappingError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
+    except MappingError as error:
+        raise MappingError(f"{path}: {error}") from None
+    try:
+        return parse(content, angle_names)
+    except (MappingError, ParameterError) as error:
+        raise MappingError(f"{path}: {str(error).replace('parameter ', '')}") from None
+
+
+def parse(content: object, angle_names: Mapping[str, Sequence[str]]) -> RobotMapping:
+    """The mapping that the content of a file says; see :func:`load`.
+
+    Raises:
+        MappingError, ParameterError: as there, without the file's name.
+    """
+    top = _section(content, "the file")
+    _known(top, _TOP, "the file")
+    _required(top, ("robot", "convention", "output", "joints"), "the file")
+    robot, convention = (_text(top[key], key) for key in ("robot", "convention"))
+    if convention not in angle_names:
+        raise MappingError(f"unknown convention {convention!r}; known: {', '.join(angle_names)}")
+    output, order = _output(top["output"])
+    safety = _safety(top.get("safety", {}))
+    if not isinstance(top["joints"], list) or not top["joints"]:
+        raise MappingError("joints: expected a list of at least one joint")
+    joints = [_joint(entry, number, angle_names[convention]) for number, entry in enumerate(top["joints"], 1)]
+    names = tuple(str(joint["name"]) for joint in joints)
+    _check_order(names, order)
+    for joint in joints:
+        _check_motion(joint, safety)
+    angles = tuple(dict.fromkeys(angle for joint in joints for angle, _ in joint["terms"]))
+    matrix = np.zeros((len(joints), len(angles)))
+    for row, joint in zip(matrix, joints, strict=True):
+        for angle, weight in joint["terms"]:
+            row[angles.index(angle)] = joint["scale"] * weight
+
+    def column(key: str) -> FloatArray:
+        return np.array([joint[key] for joint in joints], dtype=np.float64)
+
+    return RobotMapping(
+        robot,
+        convention,
+        output,
+        safety,
+        names,
+        angles,
+        matrix,
+        column("offset"),
+        np.array([_period(row) for row in matrix]),
+        column("lower"),
+        column("upper"),
+        column("home"),
+        column("rate"),
+        column("acceleration"),
+        column("max_stddev"),
+        np.array([joint["when_uncertain"] == HOLD_JOINT for joint in joints]),
+    )
+
+
+def _period(row: FloatArray) -> float:
+    used = np.abs(row[row != 0.0])
+    return float(2.0 * np.pi * used[0]) if used.size and np.ptp(used) == 0.0 else 0.0
+
+
+def _output(content: object) -> tuple[Output, tuple[str, ...]]:
+    given = _section(content, "output")
+    _required(given, ("kind", "topic", "order"), "output")
+    values = _checked(_OUTPUT, given, "output")
+    for key in ("topic", "state_topic"):
+        topic = str(values[key])
+        if not (topic.startswith("/") and topic.strip("/")) and (topic or key == "topic"):
+            raise MappingError(f"output: {key} {topic!r}, expected a topic that begins with /")
+    order = values.pop("order")
+    assert isinstance(order, tuple)
+    fields: dict[str, Any] = values
+    return Output(**fields), order
+
+
+def _safety(content: object) -> SafetyLimits:
+    table = parameters_from(SafetyLimits)
+    safety = SafetyLimits(**fields_of(SafetyLimits, _checked(table, _section(content, "safety"), "safety")))
+    if safety.prediction > safety.max_age:
+        raise MappingError(
+            f"safety: prediction {safety.prediction:g} s is longer than max_age {safety.max_age:g} s, "
+            "after which nothing is followed"
+        )
+    return safety
+
+
+def _joint(content: object, number: int, known_angles: Sequence[str]) -> dict[str, Any]:
+    given = dict(_section(content, f"joint {number}"))
+    what = f"joint {given['name']!r}" if isinstance(given.get("name"), str) else f"joint {number}"
+    sources = [key for key in ("angle", "angles", "constant") if key in given]
+    if len(sources) != 1:
+        raise MappingError(f"{what}: expected one of angle, angles, constant; it has {', '.join(sources) or 'none'}")
+    terms = given.pop("angles", None)
+    _required(given, ("name", "lower", "upper", "rate", "home"), what)
+    joint: dict[str, Any] = dict(_checked(_JOINT, given, what))
+    if not joint["name"]:
+        raise MappingError(f"{what}: no name")
+    if "acceleration" not in given:
+        joint["acceleration"] = np.inf
+    if "max_stddev" not in given:
+        joint["max_stddev"] = None
+    if sources == ["constant"]:
+        if "scale" in given or "offset" in given:
+            raise MappingError(f"{what}: a constant has neither scale nor offset")
+        joint["terms"], joint["offset"] = [], joint["constant"]
+    else:
+        joint["terms"] = _terms(terms, what) if sources == ["angles"] else [(joint["angle"], 1.0)]
+        if joint["scale"] == 0.0:
+            raise MappingError(f"{what}: scale 0 follows nothing; use constant")
+    for angle, _ in joint["terms"]:
+        if angle not in known_angles:
+            raise MappingError(f"{what}: unknown angle {angle!r}{_hint(angle, known_angles)}")
+    return joint
+
+
+def _terms(content: object, what: str) -> list[tuple[str, float]]:
+    if not isinstance(content, list) or not content:
+        raise MappingError(f"{what}: angles: expected a list of {{angle: NAME, weight: NUMBER}}")
+    terms: list[tuple[str, float]] = []
+    for entry in content:
+        given = _section(entry, f"{what}: angles")
+        _required(given, ("angle", "weight"), f"{what}: angles")
+        values: dict[str, Any] = _checked(_TERM, given, f"{what}: angles")
+        if values["weight"] == 0.0:
+            raise MappingError(f"{what}: weight 0 of angle {values['angle']!r} follows nothing")
+        terms.append((values["angle"], values["weight"]))
+    for angle, count in Counter(angle for angle, _ in terms).items():
+        if count > 1:
+            raise MappingError(f"{what}: angle {angle!r} comes twice")
+    return terms
+
+
+def _check_order(names: tuple[str, ...], order: tuple[str, ...]) -> None:
+    for what, listed in (("joints", names), ("output: order", order)):
+        for name, count in Counter(listed).items():
+            if count > 1:
+                raise MappingError(f"{what}: joint {name!r} comes twice")
+    for name in names:
+        if name not in order:
+            raise MappingError(f"unknown joint {name!r}: the controller's order has none{_hint(name, order)}")
+    for name in order:
+        if name not in names:
+            raise MappingError(f"joint {name!r} of the controller's order is missing among the joints")
+    for place, (name, wanted) in enumerate(zip(names, order, strict=True), 1):
+        if name != wanted:
+            raise MappingError(f"wrong order: joint {place} is {name!r}, but {wanted!r} in the controller's order")
+
+
+def _check_motion(joint: dict[str, Any], safety: SafetyLimits) -> None:
+    what, lower, upper = f"joint {joint['name']!r}", joint["lower"], joint["upper"]
+    if lower > upper:
+        raise MappingError(f"{what}: inverted limits: lower {lower:g} is above upper {upper:g}")
+    if lower == upper:
+        raise MappingError(
+            f"{what}: empty limits: lower and upper are {lower:g}; for a joint that stands, use constant"
+        )
+    for key, value in (("home", joint["home"]), *((("constant", joint["offset"]),) if not joint["terms"] else ())):
+        if not lower <= value <= upper:
+            raise MappingError(f"{what}: {key} {value:g} is beyond its limits {lower:g} to {upper:g}")
+    if joint["rate"] / joint["acceleration"] > safety.stop_after:
+        raise MappingError(f"{what}: cannot brake within stop_after {safety.stop_after:g} s")
+    if joint["max_stddev"] is None:
+        joint["max_stddev"] = safety.max_stddev
+
+
+def _section(content: object, what: str) -> Mapping[str, object]:
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise MappingError(f"{what}: expected names and values")
+    return content
+
+
+def _known(given: Mapping[str, object], known: Sequence[str], what: str) -> None:
+    for key in given:
+        if key not in known:
+            raise MappingError(f"{what}: unknown key {key!r}{_hint(key, known)}")
+
+
+def _required(given: Mapping[str, object], keys: Sequence[str], what: str) -> None:
+    for key in keys:
+        if key not in given:
+            raise MappingError(f"{what}: {key} is missing")
+
+
+def _checked(table: Sequence[Parameter], given: Mapping[str, object], what: str) -> dict[str, Value]:
+    _known(given, [item.name for item in table], what)
+    try:
+        return check_all(table, given)
+    except ParameterError as error:
+        raise MappingError(f"{what}: {error}") from None
+
+
+def _text(value: object, what: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise MappingError(f"{what}: {value!r}, expected a name")
+    return value
+
+
+def _hint(name: str, known: Sequence[str]) -> str:
+    similar = get_close_matches(name, known, n=1)
+    return f"; did you mean {similar[0]!r}?" if similar else f"; known: {', '.join(known)}"

@@ -1,0 +1,396 @@
+"""Streams the bodies that a Kinect v2 sees to another computer, where ``kinect_skeleton`` takes them.
+
+Runs on Windows without ROS and without this package: copy kinect_sender.py and kinect_protocol.py into one folder,
+install PyKinect2 (docs/sensors.md says which), and
+
+    python kinect_sender.py --make-key kinect.key
+    python kinect_sender.py --sensor kinect1 --to 192.168.1.20:7525 --key-file kinect.key
+
+The receiving computer needs the same key file. With --replay a recording takes the place of the sensor (needs the
+package body_tracking). What is absent, receiver, network or sensor, is waited for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import ipaddress
+import os
+import secrets
+import select
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING or __package__:
+    from body_tracking.sensors import kinect_protocol as protocol
+else:  # a plain file beside kinect_protocol.py
+    protocol = importlib.import_module("kinect_protocol")
+
+STATUS_PERIOD = 5.0
+RETRY_PERIOD = 2.0
+SILENT_AFTER, SILENT_PERIOD = 2.0, 0.5
+"""Seconds without a frame after which the receiver is told that the sensor is silent, and how often."""
+
+_REQUEST_RATE, _REQUEST_BURST = 100.0, 50.0
+_POLL = 0.002
+_TICKS_NS = 100
+"""The SDK counts its ``RelativeTime`` in units of 100 ns."""
+
+
+class SenderError(Exception):
+    """It cannot start; the text says why, in one line."""
+
+
+def now_ns() -> int:
+    """The sender's clock. Not ``time.monotonic``, which on Windows counts in steps of 16 ms."""
+    return time.perf_counter_ns()
+
+
+# --- where bodies come from
+
+
+class Kinect:
+    """The sensor, by PyKinect2."""
+
+    def __init__(self) -> None:
+        # PyKinect2 was last released in 2014 and uses names that have gone since from Python and numpy.
+        try:
+            numpy = importlib.import_module("numpy")
+            for module, name, value in ((time, "clock", time.perf_counter), (numpy, "object", object)):
+                if name not in vars(module):
+                    setattr(module, name, value)
+            self._api: Any = importlib.import_module("pykinect2.PyKinectV2")
+            self._runtime: Any = importlib.import_module("pykinect2.PyKinectRuntime")
+        except (ImportError, AssertionError, AttributeError, OSError) as error:
+            raise SenderError(
+                f"PyKinect2 cannot be used here ({type(error).__name__}: {error}). It needs Windows, the Kinect for "
+                "Windows SDK 2.0 and PyKinect2 from its repository; see docs/sensors.md. --replay FILE needs none of it"
+            ) from error
+        self._sensor: Any = None
+
+    ended = False
+
+    def read(self, timeout: float) -> protocol.Frame | None:
+        """The next frame; None when none is within the timeout, seconds."""
+        try:
+            if self._sensor is None:
+                self._sensor = self._runtime.PyKinectRuntime(self._api.FrameSourceTypes_Body)
+            end = time.perf_counter() + timeout
+            while time.perf_counter() < end:
+                if self._sensor.has_new_body_frame():
+                    seen = self._sensor.get_last_body_frame()
+                    if seen is not None:
+                        return self._frame(seen)
+                time.sleep(_POLL)
+        except Exception as error:  # whatever COM says when there is no sensor
+            print(f"kinect_sender: the sensor cannot be read ({error}); trying again", file=sys.stderr)
+            self._sensor = None
+            time.sleep(timeout)
+        return None
+
+    def _frame(self, seen: Any) -> protocol.Frame:
+        bodies = []
+        for index, body in enumerate(seen.bodies):
+            if not body.is_tracked:
+                continue
+            joints = [body.joints[k] for k in range(protocol.N_JOINTS)]
+            turned = [body.joint_orientations[k].Orientation for k in range(protocol.N_JOINTS)]
+            bodies.append(
+                protocol.Body(
+                    index,
+                    int(body.tracking_id) % (1 << 64),
+                    tuple((joint.Position.x, joint.Position.y, joint.Position.z) for joint in joints),
+                    tuple(int(joint.TrackingState) for joint in joints),
+                    tuple((each.x, each.y, each.z, each.w) for each in turned),
+                )
+            )
+        floor = seen.floor_clip_plane
+        plane = None if floor is None else (floor.x, floor.y, floor.z, floor.w)
+        # The SDK tells of no floor by a normal of zero.
+        known = plane is not None and any(plane[:3])
+        return protocol.Frame(int(seen.relative_time) * _TICKS_NS, tuple(bodies), plane if known else None)
+
+    def close(self) -> None:
+        """Let go of the sensor."""
+        if self._sensor is not None:
+            self._sensor.close()
+
+
+class Replay:
+    """A recording in real time, as a sensor would deliver it: its own clock goes on when the recording begins again."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        try:
+            importlib.import_module("body_tracking.recording.source")  # registers the backend
+            self._live: Any = importlib.import_module("body_tracking.sensors.live")
+            self._kinect: Any = importlib.import_module("body_tracking.sensors.kinect")
+            self._errors: Any = importlib.import_module("body_tracking.errors")
+        except ImportError as error:
+            raise SenderError(f"--replay needs the package body_tracking ({error})") from error
+        settings = self._live.SourceSettings(
+            args.sensor,
+            file=args.replay,
+            recorded_sensor=args.recorded_sensor,
+            rate=args.rate,
+            loop=args.loop,
+            start_time=args.start_time,
+        )
+        try:
+            self._source: Any = self._live.open_source("recording", settings)
+        except self._errors.BodyTrackingError as error:
+            raise SenderError(str(error)) from error
+        self._rate = args.rate
+        self._zero_ns = self._recorded_ns = self._last_ns = 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether the recording is over."""
+        return bool(self._source.ended)
+
+    def read(self, timeout: float) -> protocol.Frame | None:
+        """The next frame; None when none is within the timeout, seconds."""
+        frame = self._source.read(timeout)
+        if frame is None:
+            return None
+        stamp_ns = frame.skeletons[0].stamp_ns
+        if not self._zero_ns or stamp_ns < self._last_ns:
+            self._zero_ns, self._recorded_ns = now_ns(), stamp_ns
+        self._last_ns = stamp_ns
+        time_ns = self._zero_ns + round((stamp_ns - self._recorded_ns) / self._rate)
+        bodies = []
+        for index, skeleton in enumerate(frame.skeletons[: protocol.MAX_BODIES]):
+            bodies.append(
+                protocol.Body(
+                    skeleton.body if skeleton.body < protocol.MAX_BODIES else index,
+                    skeleton.body,
+                    tuple(map(tuple, self._kinect.camera_space_to_optical(skeleton.positions).tolist())),
+                    tuple(skeleton.states.tolist()),
+                    ((0.0, 0.0, 0.0, 0.0),) * protocol.N_JOINTS,
+                )
+            )
+        return protocol.Frame(time_ns, tuple(bodies))
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._source.close()
+
+
+# --- the socket
+
+
+class Sender:
+    """Sends frames and answers clock requests, whatever the network does.
+
+    Args:
+        sensor: the name under which frames are sent.
+        host: the receiver's name or address.
+        port: its port.
+        key: of the signatures.
+
+    Raises:
+        SenderError: an address beyond this computer without a key.
+    """
+
+    def __init__(self, sensor: str, host: str, port: int, key: bytes) -> None:
+        self._sensor, self._host, self._port, self._key = sensor, host, port, key
+        self._session = secrets.randbits(64)
+        self._sequence = 0
+        self._limit = protocol.RateLimit(_REQUEST_RATE, _REQUEST_BURST, 16)
+        self._lock = threading.Lock()
+        self._socket: socket.socket | None = None
+        self._address: Any = None
+        self._retry_at = 0.0
+        self.sent = self.answered = self.failures = 0
+        self.last_error = ""
+        self._closed = threading.Event()
+        self._open()
+        threading.Thread(target=self._answer, daemon=True).start()
+
+    def _open(self) -> None:
+        """Look the receiver up and make a socket; what fails is tried again later."""
+        try:
+            family, kind, number, _, address = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            self._failed(error)
+            return
+        loopback = ipaddress.ip_address(address[0]).is_loopback
+        if not self._key and not loopback:
+            raise SenderError(f"{self._host} is another computer: frames for it are signed; give --key-file")
+        old = self._socket
+        made = socket.socket(family, kind, number)
+        made.bind((address[0] if loopback else "", 0))
+        with self._lock:
+            self._socket, self._address = made, address
+        if old is not None:
+            old.close()
+
+    def _failed(self, error: OSError) -> None:
+        self.failures += 1
+        self.last_error = error.strerror or str(error)
+        self._retry_at = time.monotonic() + RETRY_PERIOD
+
+    def send(self, frame: protocol.Frame) -> None:
+        """Send a frame; one that cannot be sent is lost."""
+        self._sequence += 1
+        if self._socket is None or (self._retry_at and time.monotonic() > self._retry_at):
+            self._retry_at = 0.0
+            self._open()
+        if self._socket is None:
+            return
+        header = protocol.Header(protocol.FRAME, self._sensor, self._session, self._sequence, now_ns())
+        try:
+            self._socket.sendto(protocol.pack_frame(frame, header, self._key), self._address)
+            self.sent += 1
+        except OSError as error:
+            if not self._retry_at:
+                self._failed(error)
+
+    def _answer(self) -> None:
+        """In a thread of its own: answer clock requests as soon as they come."""
+        while not self._closed.is_set():
+            with self._lock:
+                current = self._socket
+            if current is None:
+                self._closed.wait(0.1)
+                continue
+            try:
+                if not select.select([current], [], [], 0.2)[0]:
+                    continue
+                packet, source = current.recvfrom(protocol.MAX_PACKET + 1)
+                received_ns = now_ns()
+                header = protocol.read_header(packet)
+                if (header.kind, header.sensor, header.session) != (
+                    protocol.CLOCK_REQUEST,
+                    self._sensor,
+                    self._session,
+                ) or not self._limit.allows(source, received_ns):
+                    continue
+                protocol.check_signature(packet, self._key)
+                asked_ns = protocol.read_clock(packet).asked_ns
+                reply = header._replace(kind=protocol.CLOCK_ANSWER)
+                times = protocol.ClockTimes(asked_ns, received_ns, now_ns())
+                current.sendto(protocol.pack_clock(times, reply, self._key), source)
+                self.answered += 1
+            except protocol.ProtocolError:
+                continue
+            except (OSError, ValueError):
+                self._closed.wait(0.01)  # nobody listens at the other end, or the socket was made anew
+
+    def close(self) -> None:
+        """Stop answering."""
+        self._closed.set()
+        if self._socket is not None:
+            self._socket.close()
+
+
+# --- the command
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="kinect_sender", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument(
+        "--to",
+        metavar="HOST:PORT",
+        default=f"127.0.0.1:{protocol.DEFAULT_PORT}",
+        help="the computer that runs kinect_skeleton, and its port (default %(default)s)",
+    )
+    made.add_argument(
+        "--sensor", default="kinect1", metavar="NAME", help="the sensor's name there (default %(default)s)"
+    )
+    made.add_argument("--key-file", metavar="FILE", help="the shared key; not needed for 127.0.0.1")
+    made.add_argument("--make-key", metavar="FILE", help="write a new key into a new file, and end")
+    replay = made.add_argument_group("a recording in place of the sensor")
+    replay.add_argument("--replay", metavar="FILE", help="a bag, a .csv, .csv.gz or .skeleton file")
+    replay.add_argument(
+        "--recorded-sensor", default="", metavar="NAME", help="the sensor's name in it (default: --sensor)"
+    )
+    replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="play it X times as fast (default 1)")
+    replay.add_argument("--loop", action="store_true", help="begin again at its end")
+    replay.add_argument(
+        "--start-time",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="wall time, seconds, at which it begins, to keep several in step (default: now)",
+    )
+    return made
+
+
+def make_key(path: str) -> None:
+    """A new key in a new file that only its owner may read.
+
+    Raises:
+        SenderError: the file is there already, or cannot be written.
+    """
+    try:
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except OSError as error:
+        raise SenderError(f"{path}: cannot be made ({error.strerror})") from error
+    with os.fdopen(number, "w") as file:
+        file.write(secrets.token_hex(32) + "\n")
+    print(f"{Path(path)}: a new key; copy it to both computers, and show it to nobody")
+
+
+def stream(sender: Sender, source: Any) -> None:
+    """Until the source ends: its frames, and a line on stderr now and then that says how it is going."""
+    begin = last = time.monotonic()
+    silent_at = begin + SILENT_AFTER
+    while not source.ended:
+        frame = source.read(0.2)
+        now = time.monotonic()
+        if frame is not None:
+            sender.send(frame)
+            silent_at = now + SILENT_AFTER
+        elif now >= silent_at:
+            sender.send(protocol.Frame(0, (), None, True))
+            silent_at = now + SILENT_PERIOD
+        if now - last >= STATUS_PERIOD:
+            last = now
+            bodies = "the sensor is silent" if frame is None else f"{len(frame.bodies)} bodies"
+            heard = (
+                f"answered {sender.answered} clock requests" if sender.answered else "the receiver has not asked yet"
+            )
+            error = f"; {sender.last_error}, {sender.failures} times" if sender.failures else ""
+            text = f"{now - begin:.0f} s: sent {sender.sent} frames, {bodies}, {heard}{error}"
+            print(f"kinect_sender: {text}", file=sys.stderr, flush=True)
+
+
+def main() -> int:
+    """The command: 0 at the end of a recording or on Ctrl-C, 2 with one line when it cannot start."""
+    args = parser().parse_args()
+    try:
+        if args.make_key:
+            make_key(args.make_key)
+            return 0
+        host, colon, port = args.to.rpartition(":")
+        if not colon or not port.isdigit() or not 0 < int(port) < 1 << 16:
+            raise SenderError(f"--to {args.to}: expected HOST:PORT")
+        protocol.sensor_bytes(args.sensor)
+        key = protocol.read_key(args.key_file) if args.key_file else protocol.NO_KEY
+        source = Replay(args) if args.replay else Kinect()
+        sender = Sender(args.sensor, host.strip("[]"), int(port), key)
+    except (SenderError, protocol.ProtocolError) as error:
+        print(f"kinect_sender: {error}", file=sys.stderr)
+        return 2
+    try:
+        stream(sender, source)
+    except SenderError as error:
+        print(f"kinect_sender: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sender.close()
+        source.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""Joint angles over the last seconds as curves with their 95 % bands, with no more points than a plot can show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray
+
+BAND: Final = 1.959963984540054
+"""Half the width of a band with 95 % of a normal distribution, in standard deviations."""
+WIDEST: Final = 60.0
+"""A band is drawn no farther than this from its angle, degrees; with an infinite deviation it goes that far."""
+_JUMP_BACK_NS: Final = NANOSECONDS
+_PREFERRED: Final = ("elbow_flexion", "shoulder_elevation", "shoulder_flexion", "trunk_flexion", "p_shoulder", "elbow")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """An angle over time.
+
+    Attributes:
+        times: (n,) seconds before the newest, ascending to 0.
+        values: (n,) degrees; the last known one where the angle is not known.
+        low: (n,) degrees, the band's lower edge.
+        high: (n,) degrees, its upper edge.
+        latest_stddev: degrees; infinite where nothing observes the angle now.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    low: FloatArray
+    high: FloatArray
+    latest_stddev: float
+
+
+class AngleHistory:
+    """Keeps the angles of the last seconds.
+
+    Args:
+        window: seconds.
+        capacity: messages that are kept at most.
+    """
+
+    def __init__(self, window: float, capacity: int = 4096) -> None:
+        self.window = window
+        self.names: tuple[str, ...] = ()
+        self._capacity = capacity
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps = np.empty(self._capacity, np.int64)
+        self._rows = np.empty((self._capacity, 2, len(self.names)))
+        self._begin = self._end = 0  # of what is kept; numbers of messages, which grow
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    def add(self, stamp_ns: int, names: Sequence[str], positions: FloatArray, stddevs: FloatArray) -> None:
+        """Take one message; late ones are left out, and other names or a jump back in time start anew.
+
+        Args:
+            stamp_ns: capture time.
+            names: of n angles.
+            positions: (n,) radians.
+            stddevs: (n,) radians, infinity where not known.
+        """
+        last = self._stamps[(self._end - 1) % self._capacity] if len(self) else None
+        if tuple(names) != self.names or (last is not None and stamp_ns < last - _JUMP_BACK_NS):
+            self.names = tuple(names)
+            self.clear()
+        elif last is not None and stamp_ns <= last:
+            return
+        place = self._end % self._capacity
+        self._stamps[place] = stamp_ns
+        self._rows[place] = np.degrees(positions), np.degrees(stddevs)
+        self._end += 1
+        oldest = max(self._begin, self._end - self._capacity)
+        limit = stamp_ns - round(self.window * NANOSECONDS)
+        while self._stamps[oldest % self._capacity] < limit:
+            oldest += 1
+        self._begin = oldest
+
+    def curve(self, name: str, count: int) -> Curve | None:
+        """The curve of one angle, with at most ``count`` points; None where there is none."""
+        if name not in self.names or not len(self):
+            return None
+        places = np.arange(self._begin, self._end) % self._capacity
+        values, stddevs = self._rows[places, :, self.names.index(name)].T
+        known = np.isfinite(values)
+        if not known.any():
+            return None
+        latest = np.maximum.accumulate(np.where(known, np.arange(len(values)), 0))
+        values = values[np.maximum(latest, known.argmax())]
+        reach = np.minimum(np.where(known & np.isfinite(stddevs), BAND * stddevs, np.inf), WIDEST)
+        low, high = values - reach, values + reach
+        kept = extremes(np.stack([values, low, high]), count)
+        times = (self._stamps[places[kept]] - self._stamps[places[-1]]) / NANOSECONDS
+        latest_stddev = float(stddevs[-1]) if known[-1] else float("inf")
+        return Curve(times, values[kept], low[kept], high[kept], latest_stddev)
+
+
+def extremes(series: FloatArray, count: int) -> IntArray:
+    """Which samples to draw so that nobody sees that others were left out: the first, the last and the extremes.
+
+    The samples are split into stretches of equal length, and of each stretch the least and the greatest value of every
+    series are kept.
+
+    Args:
+        series: (k, n) finite numbers, all over the same times.
+        count: at most so many are kept; at least 2 + 2 k.
+
+    Returns:
+        (m,) ascending indices, m at most ``count``; all of them where n is.
+    """
+    k, n = series.shape
+    if n <= count:
+        return np.arange(n, dtype=np.intp)
+    stretches = max(1, (count - 2) // (2 * k))
+    length = -(-n // stretches)
+    begin = np.arange(0, n, length, dtype=np.intp)
+    # the last stretch is filled up with its last sample
+    padded = np.pad(series, ((0, 0), (0, len(begin) * length - n)), mode="edge").reshape(k, len(begin), length)
+    found = np.concatenate([padded.argmin(axis=2), padded.argmax(axis=2)]) + begin
+    kept: IntArray = np.unique(np.concatenate([[0, n - 1], np.minimum(found, n - 1).ravel()])).astype(np.intp)
+    return kept
+
+
+def first_choice(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """The angles that are plotted before anybody has chosen: elbows and shoulders first, where there are any."""
+
+    def rank(name: str) -> int:
+        return next((place for place, word in enumerate(_PREFERRED) if word in name), len(_PREFERRED))
+
+    return tuple(sorted(names, key=rank)[:count])

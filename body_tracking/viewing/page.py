@@ -1,0 +1,503 @@
+"""The page itself: a viser server with scene, curves and buttons. It shows what it is given, and decides nothing.
+
+All methods but :attr:`Page.watched` are for one thread; what people press is handed to the controls in threads of
+the server's own.
+"""
+
+from __future__ import annotations
+
+import html
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any, Final
+
+import numpy as np
+import viser
+from viser import uplot
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics import so3
+from body_tracking.skeleton import FloatArray, Skeleton
+from body_tracking.viewing.colours import (
+    BODY,
+    FILTERED,
+    FUSED,
+    INFERRED,
+    PALETTE,
+    UNCERTAINTY,
+    Colour,
+    ColourArray,
+    linear,
+    sensor_colours,
+)
+from body_tracking.viewing.curves import AngleHistory, first_choice
+from body_tracking.viewing.shapes import (
+    KINECT_VIEW,
+    Mesh,
+    ball,
+    capsules,
+    ellipsoids,
+    figure,
+    floor_height,
+    in_world,
+    tube,
+)
+from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
+from body_tracking.viewing.status import NodeStatus, table
+
+PLOTS: Final = 4
+"""Angles that are plotted at a time."""
+POINTS: Final = 200
+"""Points of a plotted curve at most: about one per two pixels."""
+
+_STALE: Final[Colour] = (190, 190, 190)
+_HEAD_START: Final = np.array([2.2, 0.0, 0.0])
+"""Where a person is looked for before one is seen: in front of the reference sensor, metres in world."""
+_BEHIND: Final = np.array([-3.3, 1.5, 0.9])
+"""From there to where people look from at first: behind the sensor and beside it, and from above, metres."""
+
+LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
+    "sensors": ("skeletons of sensors", True),
+    "frustums": ("sensors", True),
+    "fused": ("fused skeleton", False),
+    "filtered": ("filtered skeleton", True),
+    "body": ("body", True),
+    "uncertainty": ("95 % ellipsoids", True),
+    "frames": ("frames of segments", False),
+    "floor": ("floor", True),
+}
+"""What can be shown: name, what people read, and whether it is shown at first."""
+
+BUTTONS: Final[Mapping[str, Mapping[str, str]]] = {
+    "calibration": {"calibrate": "calibration/start", "reset": "calibration/reset"},
+    "recording": {"record": "recorder/start", "stop": "recorder/stop"},
+    "bag": {"pause": "bag_player/pause", "resume": "bag_player/resume"},
+}
+"""What can be pressed, and the service that it calls."""
+
+
+class Page:
+    """Serves the page.
+
+    Args:
+        host: address to listen at.
+        port: the first that is tried; the next ones where it is taken.
+        sensors: their names.
+        controls: takes what people press.
+        filters: that can be chosen.
+        conventions: likewise.
+        window: seconds that the plots show.
+
+    Raises:
+        PageError: the address is not one of this machine.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        sensors: Sequence[str],
+        controls: Controls,
+        filters: Sequence[str],
+        conventions: Sequence[str],
+        window: float,
+    ) -> None:
+        _check_address(host)
+        with redirect_stdout(StringIO()):  # it has much to say
+            self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
+        self._controls = controls
+        self._visible = {name: shown for name, (_, shown) in LAYERS.items()}
+        self._floor: float | None = None
+        self._looked_at = _HEAD_START
+        self._scene(sensors)
+        self._panels(filters, conventions, window)
+        self._server.on_client_connect(self._look_at_person)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        host = self._server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+
+    @property
+    def watched(self) -> int:
+        """How many browsers show it."""
+        return len(self._server.get_clients())
+
+    def close(self) -> None:
+        """Stop serving."""
+        with redirect_stdout(StringIO()):
+            self._server.stop()
+
+    # --- the scene
+
+    def _scene(self, sensors: Sequence[str]) -> None:
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        self._server.initial_camera.position = tuple(_HEAD_START + _BEHIND)
+        self._server.initial_camera.look_at = tuple(_HEAD_START)
+        self._server.initial_camera.fov = float(np.radians(45.0))
+        self._grid = scene.add_grid(
+            "/floor",
+            12.0,
+            12.0,
+            cell_size=0.5,
+            section_size=1.0,
+            cell_color=(228, 230, 234),
+            section_color=(205, 209, 215),
+            position=(2.0, 0.0, -1.0),
+        )
+        scene.add_frame("/world", axes_length=0.2, axes_radius=0.006)
+        self._drawn: dict[str, _Drawn] = {}
+        self._cameras: dict[str, Any] = {}
+        self._colours = sensor_colours(sensors)
+        for sensor, colour in self._colours.items():
+            self._drawn[sensor] = _Drawn(scene, f"/sensors/{sensor}/skeleton", colour, 0.018, 0.009)
+            camera = scene.add_camera_frustum(
+                f"/sensors/{sensor}/view",
+                fov=float(KINECT_VIEW[1]),
+                aspect=float(np.tan(KINECT_VIEW[0] / 2.0) / np.tan(KINECT_VIEW[1] / 2.0)),
+                scale=0.18,
+                thickness=0.006,
+                color=linear(colour),
+                visible=False,
+                cast_shadow=False,
+            )
+            scene.add_label(f"/sensors/{sensor}/view/name", sensor, position=(0.0, -0.1, 0.0), anchor="bottom-center")
+            self._cameras[sensor] = camera
+        self._drawn["fused"] = _Drawn(scene, "/fused", FUSED, 0.02, 0.01)
+        self._drawn["filtered"] = _Drawn(scene, "/filtered", FILTERED, 0.022, 0.014)
+        self._limbs = _Shapes(scene, "/body/limbs", tube(), BODY, 0.55)
+        self._ends = _Shapes(scene, "/body/ends", ball(), BODY, 0.55)
+        self._clouds = _Shapes(scene, "/uncertainty", ball(), UNCERTAINTY, 0.3)
+        self._axes = scene.add_batched_axes(
+            "/segments",
+            np.array([[1.0, 0.0, 0.0, 0.0]]),
+            np.zeros((1, 3)),
+            np.zeros(1),
+            axes_length=0.12,
+            axes_radius=0.005,
+        )
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show what is there now."""
+        with self._server.atomic():
+            standing: list[Skeleton] = []
+            for sensor, seen in snapshot.sensors.items():
+                pose = snapshot.poses.get(sensor)
+                camera, drawn = self._cameras[sensor], self._drawn[sensor]
+                _show(camera, self._visible["frustums"] and pose is not None)
+                if pose is None:
+                    drawn.hide()
+                    continue
+                camera.position, camera.wxyz = pose.translation, np.roll(pose.quat_xyzw, 1)
+                placed = tuple(in_world(skeleton, pose) for skeleton in seen.skeletons)
+                standing += placed if not seen.stale else ()
+                drawn.draw(Seen(placed, seen.stale), self._visible["sensors"])
+            self._drawn["fused"].draw(snapshot.fused, self._visible["fused"])
+            self._drawn["filtered"].draw(snapshot.filtered, self._visible["filtered"])
+            self._draw_body(snapshot.filtered)
+            self._draw_uncertainty(snapshot)
+            self._draw_frames(snapshot)
+            self._floor = floor_height([*standing, *snapshot.filtered.skeletons], self._floor)
+            self._grid.position = (2.0, 0.0, -1.0 if self._floor is None else self._floor)
+            _show(self._grid, self._visible["floor"])
+        bodies = snapshot.filtered.skeletons or tuple(standing)
+        if bodies:
+            points = np.concatenate([each.positions[each.valid] for each in bodies])
+            if len(points):
+                self._looked_at = np.median(points, axis=0)
+
+    def _draw_body(self, seen: Seen) -> None:
+        shapes = capsules(seen.skeletons if self._visible["body"] else ())
+        colour = _STALE if seen.stale else BODY
+        radii = shapes.radii
+        self._limbs.draw(
+            shapes.centres, shapes.quats_xyzw, np.stack([radii, radii, shapes.lengths], axis=1), colour=colour
+        )
+        self._ends.draw(shapes.ends.reshape(-1, 3), None, np.repeat(radii, 2)[:, None].repeat(3, axis=1), colour=colour)
+
+    def _draw_uncertainty(self, snapshot: Snapshot) -> None:
+        """Of the filtered skeleton, or of the fused one where only that is shown."""
+        seen = snapshot.filtered if self._visible["filtered"] or not self._visible["fused"] else snapshot.fused
+        shapes = ellipsoids(seen.skeletons if self._visible["uncertainty"] and not seen.stale else ())
+        self._clouds.draw(shapes.centres, so3.matrix_to_quat(shapes.rotations), shapes.radii)
+
+    def _draw_frames(self, snapshot: Snapshot) -> None:
+        there = len(snapshot.origins) if self._visible["frames"] else 0
+        if there and len(self._axes.batched_positions) != there:
+            scales, still = np.ones(there), np.tile([1.0, 0.0, 0.0, 0.0], (there, 1))
+            self._axes.batched_scales, self._axes.batched_wxyzs = scales.astype(np.float32), still.astype(np.float32)
+        if there:
+            self._axes.batched_wxyzs = np.roll(snapshot.quats_xyzw, 1, axis=1).astype(np.float32)
+            self._axes.batched_positions = snapshot.origins.astype(np.float32)
+        _show(self._axes, bool(there))
+
+    def _look_at_person(self, client: viser.ClientHandle) -> None:
+        target = self._looked_at
+        with client.atomic():
+            client.camera.position = target + _BEHIND
+            client.camera.look_at = target
+
+    # --- panels
+
+    def _panels(self, filters: Sequence[str], conventions: Sequence[str], window: float) -> None:
+        gui = self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=PALETTE[0])
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(330)
+        self._legend = gui.add_html(self._legend_text())
+        with gui.add_folder("Control"):
+            for label, services in BUTTONS.items():
+                self._buttons(label, services)
+            self._filter = self._choice("filter", filters, self._controls.choose_filter)
+            self._convention = self._choice("angles", conventions, self._controls.choose_convention)
+            self._body = self._choice("person", (_NONE,), self._controls.choose_body)
+        with gui.add_folder("Show"):
+            for name, (label, shown) in LAYERS.items():
+                self._checkbox(name, label, shown)
+        angles = gui.add_panel()
+        with angles.add_tab("Joint angles", viser.Icon.CHART_LINE):
+            self._plots = [_Plot(gui, window) for _ in range(PLOTS)]
+        angles.dock_left()
+        angles.set_width(330)
+        with gui.add_folder("Nodes"):
+            self._table = gui.add_html("nothing heard yet")
+
+    def _legend_text(self) -> str:
+        entries = [*self._colours.items(), ("filtered", FILTERED), ("inferred or not tracked", INFERRED)]
+        dots = "".join(
+            f"<span style='white-space:nowrap;margin-right:0.9em'><span style='color:rgb{colour}'>&#9679;</span> "
+            f"{html.escape(name)}</span> "
+            for name, colour in entries
+        )
+        return f"<div style='font-size:0.8em;padding:0.3em 0.6em'>{dots}</div>"
+
+    def _buttons(self, label: str, services: Mapping[str, str]) -> None:
+        buttons = self._server.gui.add_button_group(label, tuple(services))
+
+        @buttons.on_click
+        def _(event: viser.GuiEvent[Any]) -> None:
+            pressed = buttons.value
+            self._answer(f"{label}: {pressed}", lambda: self._controls.call(services[pressed]))
+
+    def _choice(self, label: str, options: Sequence[str], choose: Callable[[str], str]) -> Any:
+        dropdown = self._server.gui.add_dropdown(label, tuple(options))
+
+        @dropdown.on_update
+        def _(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:  # not we ourselves, who show what it is
+                self._answer(label, lambda: choose(dropdown.value))
+
+        return dropdown
+
+    def _checkbox(self, layer: str, label: str, shown: bool) -> None:
+        checkbox = self._server.gui.add_checkbox(label, shown)
+
+        @checkbox.on_update
+        def _(event: viser.GuiEvent[Any]) -> None:
+            self._visible[layer] = checkbox.value
+
+    def _answer(self, what: str, ask: Callable[[], str]) -> None:
+        """Show everybody that somebody asked, and what came of it."""
+        clients = self._server.get_clients().values()
+        notes = [client.add_notification(what, "waits for an answer", loading=True) for client in clients]
+        try:
+            text, refused = ask(), False
+        except BodyTrackingError as error:
+            text, refused = str(error), True
+        for note in notes:
+            note.body, note.color = text, "red" if refused else "teal"
+            note.loading, note.auto_close_seconds = False, 8.0
+
+    # --- what changes slowly
+
+    def draw_curves(self, history: AngleHistory) -> None:
+        """Show the chosen angles."""
+        with self._server.atomic():
+            for plot, name in zip(self._plots, first_choice(history.names, PLOTS), strict=False):
+                plot.draw(history, name)
+
+    def draw_status(self, statuses: Mapping[str, NodeStatus], now: float) -> None:
+        """Show what the nodes say, and which filter and which angles run."""
+        self._table.content = table(statuses, now)
+        for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
+            running = statuses[node].text.partition(" ")[0] if node in statuses else ""
+            if running in dropdown.options and dropdown.value != running:
+                dropdown.value = running
+
+    def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
+        """Show which persons' angles there are."""
+        options = tuple(bodies) or (_NONE,)
+        if self._body.options != options:
+            self._body.options = options
+        if chosen in options and self._body.value != chosen:
+            self._body.value = chosen
+
+
+class _Plot:
+    """One angle with its band; which one, people choose.
+
+    Args:
+        gui: where it is added.
+        window: seconds.
+    """
+
+    def __init__(self, gui: viser.GuiApi, window: float) -> None:
+        self._choice: Any = gui.add_dropdown("angle", (_NONE,))
+        self._chosen = False
+        empty = np.array([-window, 0.0])
+        nothing = np.zeros(2)
+        hidden = uplot.Series(label="", stroke="rgba(0,0,0,0)", width=0.0, points={"show": False})
+        self._plot = gui.add_uplot(
+            (empty, nothing, nothing, nothing),
+            (
+                uplot.Series(label="s"),
+                uplot.Series(label="deg", stroke="rgb(38,108,190)", width=1.6, points={"show": False}),
+                hidden,
+                hidden,
+            ),
+            bands=(uplot.Band(series=(3, 2), fill="rgba(38,108,190,0.18)"),),
+            scales={"x": uplot.Scale(time=False, range=(-window, 0.0)), "y": uplot.Scale(auto=True)},
+            axes=(uplot.Axis(size=30), uplot.Axis(size=40)),
+            legend=uplot.Legend(show=False),
+            height=118,
+            padding=(6, 8, 0, 0),
+        )
+
+        @self._choice.on_update
+        def _(event: viser.GuiEvent[Any]) -> None:
+            self._chosen = self._chosen or event.client is not None
+
+    def draw(self, history: AngleHistory, usual: str) -> None:
+        """Show the chosen angle, or the usual one while nobody has chosen."""
+        if self._choice.options != history.names:
+            kept = self._choice.value if self._chosen else usual
+            self._chosen = self._chosen and kept in history.names
+            self._choice.options = history.names
+            self._choice.value = kept if kept in history.names else usual
+        curve = history.curve(self._choice.value, POINTS)
+        if curve is not None:
+            self._plot.data = (curve.times, curve.values, curve.low, curve.high)
+            now = f"{curve.values[-1]:.1f}°"
+            known = np.isfinite(curve.latest_stddev)
+            self._choice.label = f"{now} ± {1.96 * curve.latest_stddev:.1f}°" if known else f"{now} ± ?"
+
+
+class _Drawn:
+    """Skeletons of one source: joints as balls, bones as lines."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
+        self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
+        self._radius = radius
+        self._joints = _Shapes(scene, f"{name}/joints", ball(), colour)
+        self._lines: Any = None
+
+    def hide(self) -> None:
+        """Show nothing."""
+        self.draw(Seen(), False)
+
+    def draw(self, seen: Seen, visible: bool) -> None:
+        """Show what is seen."""
+        drawn = figure(seen.skeletons if visible else (), self._colour)
+        colours: Any = _STALE if seen.stale else drawn.joint_colours
+        count = len(drawn.joints)
+        self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius), colour=colours)
+        colour = _STALE if seen.stale else self._colour
+        if self._lines is None or len(drawn.bones) > len(self._lines.points):
+            room = max(24, len(drawn.bones))
+            self._lines = self._scene.add_line_segments(
+                f"{self._name}/bones", np.zeros((room, 2, 3)), colour, thickness=self._thickness
+            )
+        # what is not there has no length
+        points = np.zeros_like(self._lines.points)
+        points[: len(drawn.bones)] = drawn.bones
+        if len(drawn.bones):
+            points[len(drawn.bones) :] = drawn.bones[0, 0]
+            self._lines.points = points
+            self._lines.colors = linear(colour)
+        _show(self._lines, bool(len(drawn.bones)))
+
+
+class _Shapes:
+    """Any number of one mesh, turned, stretched and placed."""
+
+    def __init__(
+        self, scene: viser.SceneApi, name: str, mesh: Mesh, colour: Colour, opacity: float | None = None
+    ) -> None:
+        self._scene, self._name, self._mesh, self._colour, self._opacity = scene, name, mesh, colour, opacity
+        self._room = 0
+        self._handle: Any = None
+
+    def draw(
+        self,
+        positions: FloatArray,
+        quats_xyzw: FloatArray | None,
+        scales: FloatArray,
+        colour: Colour | ColourArray | None = None,
+    ) -> None:
+        """Show these.
+
+        Args:
+            positions: (n, 3) metres.
+            quats_xyzw: (n, 4) unit quaternions; None for all upright.
+            scales: (n, 3) along the mesh's own axes.
+            colour: of all, or (n, 3) of each.
+        """
+        count = len(positions)
+        if count == 0:
+            if self._handle is not None:
+                _show(self._handle, False)
+            return
+        if count > self._room:
+            self._make(max(25, count))
+        room = self._room
+        # those that are not there have no size
+        batch, wxyz, sizes = (np.zeros((room, size), np.float32) for size in (3, 4, 3))
+        wxyz[:, 0] = 1.0
+        batch[:count], sizes[:count] = positions, scales
+        batch[count:] = positions[0]
+        if quats_xyzw is not None:
+            wxyz[:count] = np.roll(quats_xyzw, 1, axis=1)
+        colours = np.zeros((room, 3), np.uint8)
+        colours[:count] = linear(self._colour if colour is None else colour)
+        handle = self._handle
+        handle.batched_positions, handle.batched_scales, handle.batched_colors = batch, sizes, colours
+        if quats_xyzw is not None:
+            handle.batched_wxyzs = wxyz
+        _show(handle, True)
+
+    def _make(self, room: int) -> None:
+        self._room = room
+        self._handle = self._scene.add_batched_meshes_simple(
+            self._name,
+            self._mesh.vertices,
+            self._mesh.faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (room, 1)),
+            np.zeros((room, 3)),
+            batched_scales=np.zeros((room, 3)),
+            batched_colors=np.tile(np.array(self._colour, np.uint8), (room, 1)),
+            opacity=self._opacity,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+_NONE: Final = "none yet"
+
+
+def _show(handle: Any, visible: bool) -> None:
+    if handle.visible != visible:
+        handle.visible = visible
+
+
+def _check_address(host: str) -> None:
+    """The server tries one port after the other, forever, where the address is not of this machine."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.bind((host, 0))
+    except OSError as error:
+        raise PageError(f"host {host!r}: cannot listen there ({error.strerror or error})") from error

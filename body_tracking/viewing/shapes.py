@@ -1,0 +1,269 @@
+"""Shapes in space, as arrays: joints and bones of skeletons, capsules, ellipsoids of uncertainty, views of sensors.
+
+What is not known is left out, so that every number here is finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.calibration.result import SensorPose
+from body_tracking.skeleton import BONES, MAX_RANGE, BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.viewing.colours import Colour, ColourArray, joint_colours
+
+ELLIPSOID_RADIUS: Final = 2.7954834829151074
+"""Of an ellipsoid with 95 % of a normal distribution in space, in standard deviations: the square root of chi-square's
+95 % quantile with 3 degrees of freedom."""
+LARGEST_RADIUS: Final = 1.0
+"""An ellipsoid is drawn no longer than this to each side, metres: beyond, it would hide everything else."""
+
+KINECT_VIEW: Final = (np.radians(70.6), np.radians(60.0))
+"""Horizontal and vertical angle that a Kinect v2's depth camera sees."""
+
+_PARENTS: Final[IntArray] = np.array([parent for parent, _ in BONES], dtype=np.intp)
+_CHILDREN: Final[IntArray] = np.array([child for _, child in BONES], dtype=np.intp)
+
+_RADII: Final = {
+    Joint.SPINE_MID: 0.085,
+    Joint.SPINE_SHOULDER: 0.085,
+    Joint.NECK: 0.045,
+    Joint.HEAD: 0.075,
+    Joint.SHOULDER_LEFT: 0.05,
+    Joint.ELBOW_LEFT: 0.042,
+    Joint.WRIST_LEFT: 0.033,
+    Joint.HAND_LEFT: 0.028,
+    Joint.HAND_TIP_LEFT: 0.018,
+    Joint.THUMB_LEFT: 0.012,
+    Joint.HIP_LEFT: 0.07,
+    Joint.KNEE_LEFT: 0.06,
+    Joint.ANKLE_LEFT: 0.045,
+    Joint.FOOT_LEFT: 0.035,
+}
+"""Metres, by the joint at the far end of the segment, of the left half."""
+
+
+def _bone_radii() -> FloatArray:
+    """(24,) of each bone; the right half is as the left."""
+    by_name = {joint.name: radius for joint, radius in _RADII.items()}
+    return np.array([by_name[child.name.replace("RIGHT", "LEFT")] for _, child in BONES])
+
+
+BONE_RADII: Final[FloatArray] = _bone_radii()
+"""(24,) metres: how thick a person's segments are drawn, in the order of ``BONES``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Figure:
+    """Skeletons as points and lines.
+
+    Attributes:
+        joints: (n, 3) metres.
+        joint_colours: (n, 3) RGB.
+        bones: (m, 2, 3) metres, from end to end.
+    """
+
+    joints: FloatArray
+    joint_colours: ColourArray
+    bones: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsules:
+    """Cylinders with round ends.
+
+    Attributes:
+        ends: (n, 2, 3) metres, the centres of the round ends.
+        radii: (n,) metres.
+    """
+
+    ends: FloatArray
+    radii: FloatArray
+
+    @property
+    def centres(self) -> FloatArray:
+        """(n, 3) metres."""
+        middle: FloatArray = self.ends.mean(axis=1)
+        return middle
+
+    @property
+    def lengths(self) -> FloatArray:
+        """(n,) metres between the centres of the ends."""
+        result: FloatArray = np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
+        return result
+
+    @property
+    def quats_xyzw(self) -> FloatArray:
+        """(n, 4) unit quaternions that turn z into the capsule's axis, by the shorter way."""
+        axis = (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-9)[:, None]
+        x, y, z = axis.T
+        quats = np.stack([-y, x, np.zeros_like(x), 1.0 + z], axis=1)
+        length = np.linalg.norm(quats, axis=1)
+        quats[length < 1e-6] = 1.0, 0.0, 0.0, 0.0  # straight down: half a turn about x
+        quats /= np.linalg.norm(quats, axis=1)[:, None]
+        return quats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipsoids:
+    """Where something is with some probability.
+
+    Attributes:
+        centres: (n, 3) metres.
+        rotations: (n, 3, 3) rotation matrices; their columns are the axes.
+        radii: (n, 3) metres, along each axis, none above :data:`LARGEST_RADIUS`.
+    """
+
+    centres: FloatArray
+    rotations: FloatArray
+    radii: FloatArray
+
+
+def in_world(skeleton: Skeleton, pose: SensorPose) -> Skeleton:
+    """What a sensor sees, placed by the sensor's pose."""
+    placed = pose.apply(skeleton.positions)
+    return Skeleton(skeleton.stamp_ns, "world", placed, skeleton.states, skeleton.body)
+
+
+def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
+    """The joints that have a position, and the bones between them.
+
+    Joints that are not tracked are drawn where the source still gives them a place.
+
+    Args:
+        skeletons: any number, in one frame.
+        own: the colour of tracked joints.
+    """
+    joints, colours, bones = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)], [np.empty((0, 2, 3))]
+    for skeleton in skeletons:
+        placed = _placed(skeleton)
+        joints.append(skeleton.positions[placed])
+        colours.append(joint_colours(skeleton.states[placed], own))
+        bones.append(_bones(skeleton, placed)[0])
+    return Figure(np.concatenate(joints), np.concatenate(colours), np.concatenate(bones))
+
+
+def capsules(skeletons: Sequence[Skeleton]) -> Capsules:
+    """A capsule for each segment both ends of which are known."""
+    ends, radii = [np.empty((0, 2, 3))], [np.empty(0)]
+    for skeleton in skeletons:
+        bones, there = _bones(skeleton, skeleton.valid)
+        ends.append(bones)
+        radii.append(BONE_RADII[there])
+    return Capsules(np.concatenate(ends), np.concatenate(radii))
+
+
+def _placed(skeleton: Skeleton) -> BoolArray:
+    """(25,) which joints have a place, in whatever state."""
+    placed: BoolArray = np.all(np.abs(skeleton.positions) < MAX_RANGE, axis=1)
+    return placed
+
+
+def _bones(skeleton: Skeleton, known: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """(m, 2, 3) of the bones between known joints, and (24,) which these are."""
+    there = np.logical_and(known[_PARENTS], known[_CHILDREN])
+    ends = np.stack([skeleton.positions[_PARENTS[there]], skeleton.positions[_CHILDREN[there]]], axis=1)
+    return ends, there
+
+
+def ellipsoids(skeletons: Sequence[Skeleton]) -> Ellipsoids:
+    """For each joint with a covariance the ellipsoid in which it is with 95 % probability.
+
+    With the covariance ``C = R diag(s) R'`` its points are ``c + k R sqrt(s) u`` for unit vectors u, and k is
+    :data:`ELLIPSOID_RADIUS`. A covariance that is not finite has none; one with a negative eigenvalue, by rounding, is
+    flat there.
+    """
+    centres, covariances = [np.empty((0, 3))], [np.empty((0, 3, 3))]
+    for skeleton in skeletons:
+        if skeleton.covariances is not None:
+            known = skeleton.valid & np.isfinite(skeleton.covariances).all(axis=(1, 2))
+            centres.append(skeleton.positions[known])
+            covariances.append(skeleton.covariances[known])
+    variances, axes = np.linalg.eigh(np.concatenate(covariances))
+    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
+    radii = np.minimum(ELLIPSOID_RADIUS * np.sqrt(np.maximum(variances, 0.0)), LARGEST_RADIUS)
+    return Ellipsoids(np.concatenate(centres), axes, radii)
+
+
+def frustum(depth: float, view: tuple[float, float] = KINECT_VIEW) -> FloatArray:
+    """(8, 2, 3) the edges of what a camera sees up to a depth, in its optical frame (x right, y down, z forward).
+
+    Four edges from the camera to the corners, then four around.
+
+    Args:
+        depth: metres.
+        view: horizontal and vertical angle, radians.
+    """
+    x, y = (depth * np.tan(angle / 2.0) for angle in view)
+    corners = np.array([[-x, -y, depth], [x, -y, depth], [x, y, depth], [-x, y, depth]])
+    rays = np.stack([np.zeros((4, 3)), corners], axis=1)
+    around = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    return np.concatenate([rays, around])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """A surface of triangles, seen from outside.
+
+    Attributes:
+        vertices: (v, 3).
+        faces: (f, 3) vertices of each triangle, counterclockwise from outside.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+
+
+def ball(around: int = 16) -> Mesh:
+    """A sphere of radius 1."""
+    heights = np.linspace(-0.5 * np.pi, 0.5 * np.pi, around // 2 + 1)
+    return _turned(np.cos(heights), np.sin(heights), around)
+
+
+def tube(around: int = 16) -> Mesh:
+    """An open cylinder of radius 1 and length 1 along z, about its middle."""
+    return _turned(np.ones(2), np.array([-0.5, 0.5]), around)
+
+
+def _turned(radii: FloatArray, heights: FloatArray, around: int) -> Mesh:
+    """The surface that a line of (n,) points beside the z axis makes when it is turned about that, upwards."""
+    angles = np.arange(around) * (2.0 * np.pi / around)
+    rings = [np.multiply.outer(radii, np.cos(angles)), np.multiply.outer(radii, np.sin(angles))]
+    vertices = np.stack([*rings, np.repeat(heights[:, None], around, axis=1)], axis=-1).reshape(-1, 3)
+    ring, place = np.divmod(np.arange((len(radii) - 1) * around), around)
+    lower, next_lower = ring * around + place, ring * around + (place + 1) % around
+    upper, next_upper = lower + around, next_lower + around
+    faces = np.concatenate(
+        [np.stack([lower, next_lower, next_upper], axis=1), np.stack([lower, next_upper, upper], axis=1)]
+    )
+    return Mesh(vertices, faces.astype(np.intp))
+
+
+_FEET: Final[IntArray] = np.array(
+    [Joint.ANKLE_LEFT, Joint.FOOT_LEFT, Joint.ANKLE_RIGHT, Joint.FOOT_RIGHT], dtype=np.intp
+)
+_FLOOR_STEP: Final = 0.03
+
+
+def floor_height(skeletons: Sequence[Skeleton], before: float | None) -> float | None:
+    """Where the floor is drawn: under the feet, but not moved by every tremor.
+
+    Args:
+        skeletons: in world, z up.
+        before: metres; None where it is not known.
+
+    Returns:
+        The height of the lowest tracked ankle or foot if that is lower than before by 3 cm, else what it was before,
+        raised slowly (1 mm a call) while the feet are higher by more than that; None while no foot was ever seen.
+    """
+    feet = [each.positions[_FEET, 2][each.valid[_FEET] & (each.states[_FEET] == 2)] for each in skeletons]
+    heights = np.concatenate([np.empty(0), *feet])
+    if not len(heights):
+        return before
+    lowest = float(heights.min())
+    if before is None or lowest < before - _FLOOR_STEP:
+        return lowest
+    return before + 0.001 if lowest > before + _FLOOR_STEP else before

@@ -1,0 +1,185 @@
+"""Who is whom: laws of the assignment of bodies to people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from body_tracking.fusion.association import HOLD, Association, torso_distances, torso_points
+from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Skeleton
+from walkers import performed
+
+FIGURE = performed("standing_still", np.zeros(1))[0]
+"""(25, 3) metres: somebody who stands at the origin."""
+
+START_NS = 40 * NANOSECONDS
+TRACKED = np.full(25, 2, np.uint8)
+
+Who = dict[int, int | None]
+"""The number of each true person."""
+
+
+def body(place: Sequence[float], stamp_ns: int, number: int, rng: np.random.Generator | None = None) -> Skeleton:
+    noise = 0.0 if rng is None else 0.02 * rng.normal(size=(25, 3))
+    return Skeleton(stamp_ns, "world", FIGURE + [*place, 0.0] + noise, TRACKED, number)
+
+
+def walked(
+    seconds: float, paths: Mapping[int, tuple[Sequence[float], Sequence[float]]], rate: float = 30.0
+) -> Iterator[tuple[int, dict[int, FloatArray]]]:
+    """Stamps, and where each person is: from one place to another, at a constant speed."""
+    times = np.arange(0.0, seconds, 1.0 / rate)
+    for time in times:
+        share = time / seconds
+        yield (
+            START_NS + round(time * NANOSECONDS),
+            {who: (1.0 - share) * np.array(a) + share * np.array(b) for who, (a, b) in paths.items()},
+        )
+
+
+def tell(
+    association: Association,
+    sensor: str,
+    stamp_ns: int,
+    places: Mapping[int, FloatArray],
+    numbers: Mapping[int, int] | None = None,
+    rng: np.random.Generator | None = None,
+) -> Who:
+    """One frame of a sensor, which sees these people."""
+    bodies = [
+        body(place.tolist(), stamp_ns, who if numbers is None else numbers[who], rng) for who, place in places.items()
+    ]
+    return dict(zip(places, association.assign(sensor, bodies), strict=True))
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10_000), order=st.permutations(range(5)))
+def test_the_order_of_bodies_changes_nothing(seed: int, order: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    starts, ends = rng.uniform(-2.0, 2.0, (2, 5, 2))
+    paths = {who: (starts[who].tolist(), ends[who].tolist()) for who in range(5)}
+    ordered, other = Association(), Association()
+    for stamp_ns, places in walked(1.5, paths, rate=10.0):
+        noise = [np.random.default_rng([seed, stamp_ns % 10_000]) for _ in range(2)]
+        bodies = [body(places[who].tolist(), stamp_ns, who, noise[0]) for who in range(5)]
+        expected = ordered.assign("kinect1", bodies)
+        assert other.assign("kinect1", [bodies[who] for who in order]) == tuple(expected[who] for who in order)
+
+
+def test_torsos_are_the_same_with_left_and_right_exchanged_and_a_joint_astray() -> None:
+    points = torso_points(np.stack([FIGURE, FIGURE[MIRROR]]))
+    assert torso_distances(points[:1], points[1:])[0, 0] == pytest.approx(0.0, abs=1e-12)
+    astray = FIGURE.copy()
+    astray[0] += 3.0
+    partly = np.full((25, 3), np.nan)
+    partly[7] = FIGURE[7]  # a hand alone
+    apart = torso_distances(points[:1], torso_points(np.stack([astray, partly])))[0]
+    assert apart[0] == pytest.approx(0.0, abs=1e-12) and 0.0 < apart[1] < 1.0
+    nobody = torso_points(np.full((1, 25, 3), np.nan))
+    assert torso_distances(points[:1], nobody)[0, 0] == np.inf
+
+
+@pytest.mark.parametrize("gap", [0.5, 0.8 * HOLD])
+def test_who_is_hidden_for_a_while_keeps_the_number_and_who_is_away_for_long_does_not(gap: float) -> None:
+    association = Association()
+    standing = {0: np.array([2.0, 0.0]), 1: np.array([2.5, 1.5])}
+    for stamp_ns, places in walked(1.0, {who: (at.tolist(), at.tolist()) for who, at in standing.items()}):
+        before = tell(association, "kinect1", stamp_ns, places)
+    end_ns = stamp_ns + round(gap * NANOSECONDS)
+    for at_ns in range(stamp_ns, end_ns, NANOSECONDS // 30):
+        tell(association, "kinect1", at_ns + 1, {0: standing[0]})
+    # with a new number of the sensor's, half a metre further
+    back = {0: standing[0], 1: standing[1] + [0.3, 0.4]}
+    assert tell(association, "kinect1", end_ns, back, numbers={0: 0, 1: 5}) == before
+    later_ns = end_ns + round((HOLD + 0.5) * NANOSECONDS)
+    for at_ns in range(end_ns, later_ns, NANOSECONDS // 30):
+        tell(association, "kinect1", at_ns + 1, {0: standing[0]})
+    for step in range(12):  # not at once: a ghost is nobody
+        after = tell(association, "kinect1", later_ns + step * NANOSECONDS // 30, back)
+        assert step > 0 or after[1] is None
+    assert after[0] == before[0] and after[1] not in (None, *before.values())
+    assert association.counters["lost"] == 1 and association.counters["new"] == 3
+
+
+@pytest.mark.parametrize("numbers", ["kept", "exchanged", "shuffled"])
+@pytest.mark.parametrize("hidden", [0.0, 0.6])
+def test_who_crosses_keeps_the_number_whatever_the_sensor_calls_them(numbers: str, hidden: float) -> None:
+    """Two pass each other 0.6 m apart at 1.2 m/s each; the farther one may be hidden meanwhile."""
+    rng = np.random.default_rng(5)
+    association = Association()
+    paths = {0: ((2.0, -1.5), (2.0, 1.5)), 1: ((2.6, 1.5), (2.6, -1.5))}
+    told: set[tuple[int | None, int | None]] = set()
+    for stamp_ns, places in walked(2.5, paths):
+        passing = abs(places[0][1] - places[1][1]) < hidden
+        middle = stamp_ns > START_NS + 1.25 * NANOSECONDS
+        names = {0: 0, 1: 1}
+        if numbers == "exchanged" and middle:
+            names = {0: 1, 1: 0}
+        elif numbers == "shuffled":
+            names = dict(enumerate(rng.permutation(6)[:2].tolist()))
+        seen = {0: places[0]} if passing else places
+        who = tell(association, "kinect1", stamp_ns, seen, names, rng)
+        if not passing:
+            told.add((who[0], who[1]))
+    assert len(told) == 1 and None not in (*told,)[0]
+    assert association.counters["new"] == 2 and association.counters["lost"] == 0
+
+
+def test_one_person_in_two_sensors_has_one_number_and_three_have_three() -> None:
+    rng = np.random.default_rng(6)
+    for count in (1, 3):
+        association = Association()
+        paths = {who: ((2.0 + who, -1.0), (2.0 + who, 1.0)) for who in range(count)}
+        off = np.array([0.12, -0.1])  # the second sensor is calibrated that badly
+        told: dict[str, set[tuple[int | None, ...]]] = {"kinect1": set(), "kinect2": set()}
+        for step, (stamp_ns, places) in enumerate(walked(3.0, paths)):
+            sensor = ("kinect1", "kinect2")[step % 2]
+            shown = {who: place + (off if step % 2 else 0.0) for who, place in places.items()}
+            numbers = dict(enumerate(np.random.default_rng(step % 2).permutation(6)[:count].tolist()))
+            told[sensor].add(tuple(tell(association, sensor, stamp_ns, shown, numbers, rng).values()))
+        assert told["kinect1"] == told["kinect2"] and len(told["kinect1"]) == 1
+        assert association.people == tuple(range(1, count + 1))
+
+
+def test_bodies_beyond_the_gate_are_two_people_and_one_when_they_turn_out_to_be() -> None:
+    association = Association()
+    for step, (stamp_ns, places) in enumerate(walked(4.0, {0: ((2.0, 0.0), (2.0, 0.0))})):
+        # the second sensor stands elsewhere than it is taken to, until that is put right
+        wrong = np.array([0.0, 0.9]) if step < 60 else np.zeros(2)
+        if step == 60:
+            association.move_sensor("kinect2", np.eye(3), np.array([0.0, -0.9, 0.0]))
+        sensor = ("kinect1", "kinect2")[step % 2]
+        tell(association, sensor, stamp_ns, {0: places[0] + (wrong if step % 2 else 0.0)})
+        if step == 59:
+            assert len(association.people) == 2
+    assert association.people == (1,)
+    assert association.counters["merged"] == 1
+
+
+def test_an_assignment_that_other_sensors_contradict_for_long_is_changed() -> None:
+    """One sensor sees both; the other has seen only the second since it was near the first, and takes it for that."""
+    association = Association()
+    told: list[int | None] = []
+    for step, (stamp_ns, places) in enumerate(walked(4.0, {0: ((2.0, 0.0), (2.0, 0.0)), 1: ((2.4, 0.1), (2.6, 0.9))})):
+        if step < 10:
+            tell(association, "kinect1", stamp_ns, {0: places[0]})
+            tell(association, "kinect2", stamp_ns + 1, {0: places[1]}, numbers={0: 4})
+            continue
+        who = tell(association, "kinect1", stamp_ns, places)
+        told.append(tell(association, "kinect2", stamp_ns + 1, {0: places[1]}, numbers={0: 4})[0])
+    assert who[1] is not None and who[0] != who[1]
+    assert told[0] == who[0] and told[-1] == who[1]
+    assert association.counters["exchanged"] >= 1 and association.counters["lost"] == 0
+
+
+def test_everybody_is_forgotten_at_once_and_numbers_go_on() -> None:
+    association = Association()
+    assert tell(association, "kinect1", START_NS, {0: np.zeros(2), 1: np.ones(2)}) == {0: 1, 1: 2}
+    assert association.assign("kinect1", []) == ()
+    association.reset()
+    assert association.people == ()
+    assert tell(association, "kinect1", START_NS - 10 * NANOSECONDS, {0: np.zeros(2)}) == {0: 3}

@@ -1,0 +1,204 @@
+"""Every node as a process, asked by its real parameter services: what is live takes effect, the rest says why not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from running import Running
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from body_tracking import graph
+from body_tracking.parameters import ParameterError
+
+BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_wave"
+PARAMETERS: dict[str, dict[str, object]] = {
+    "joint_angles": {},
+    "skeleton_filter": {},
+    "fusion": {"reliable": True},
+    "calibration": {},
+    "imu_skeleton": {"segments": "[forearm_left]"},
+    "bag_recorder": {"start_recording": False},
+    "kinect_skeleton": {"sensor": "kinect9", "file": BAG, "recorded_sensor": "kinect1", "loop": True},
+    "bag_player": {"bag": BAG, "loop": True, "reliable": True, "topics": "[/kinect1/skeleton, /kinect2/skeleton]"},
+}
+
+
+class Graph(Running):
+    """The nodes, over a bag that begins again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        for name, parameters in PARAMETERS.items():
+            more = {"folder": folder / "first"} if name == "bag_recorder" else {}
+            self.start(name, **parameters, **more)
+        self.angles = self.collect(JointState, graph.joint_states_topic("body1"))
+
+    def call(self, kind: type[Any], name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(30.0), name
+        future = client.call_async(request)
+        assert self.until(future.done), name
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set(self, node: str, **values: object) -> list[tuple[bool, str]]:
+        """Whether each is set, and why not."""
+        parameters = [Parameter(name=name, value=_value(value)) for name, value in values.items()]
+        answer = self.call(SetParameters, f"/{node}/set_parameters", SetParameters.Request(parameters=parameters))
+        return [(result.successful, result.reason) for result in answer.results]
+
+    def get(self, node: str, names: Sequence[str]) -> list[ParameterValue]:
+        answer = self.call(GetParameters, f"/{node}/get_parameters", GetParameters.Request(names=names))
+        return list(answer.values)
+
+    def number(self, node: str, key: str) -> float:
+        return float(self.diagnostics.get(node, {}).get(key, 0))
+
+
+def _value(value: object) -> ParameterValue:
+    if isinstance(value, ParameterValue):
+        return value
+    if isinstance(value, bool):
+        return ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=value)
+    if isinstance(value, int):
+        return ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=value)
+    if isinstance(value, float):
+        return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(value))
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+    with Graph(tmp_path_factory.mktemp("graph")) as graph_:
+        assert graph_.until(lambda: PARAMETERS.keys() <= graph_.diagnostics.keys(), 240.0), graph_.diagnostics.keys()
+        assert graph_.until(lambda: graph_.angles, 120.0)
+        yield graph_
+
+
+# --- /diagnostics
+
+
+def test_every_node_reports_what_comes_in_and_goes_out(running: Graph) -> None:
+    flows = {
+        "bag_player": f"rate out {graph.skeleton_topic('kinect1')}",
+        "kinect_skeleton": f"rate out {graph.skeleton_topic('kinect9')}",
+        "calibration": f"rate in {graph.skeleton_topic('kinect2')}",
+        "fusion": f"rate out {graph.FUSED}",
+        "skeleton_filter": f"rate in {graph.FUSED}",
+        "joint_angles": f"rate in {graph.FILTERED}",
+        "imu_skeleton": f"rate in {graph.FUSED}",
+    }
+    assert running.until(lambda: all(running.number(node, key) > 5.0 for node, key in flows.items())), (
+        running.diagnostics
+    )
+    assert running.number("joint_angles", "delay median ms") > 0.0
+
+
+# --- parameters
+
+
+@pytest.mark.parametrize("executable", graph.EXECUTABLES)
+def test_every_parameter_is_live_or_has_a_reason(executable: str) -> None:
+    for item in graph.parameters_of(executable):
+        if item.live:
+            assert item.check_change(item.default) == item.default
+            assert not item.fixed, item.name
+        else:
+            with pytest.raises(ParameterError, match=r"cannot change while the node runs: .+ Start it anew"):
+                item.check_change(item.default)
+
+
+@pytest.mark.parametrize("node", sorted(PARAMETERS))
+def test_what_is_live_is_taken_and_the_rest_says_why_not_and_what_to_do(running: Graph, node: str) -> None:
+    table = graph.parameters_of(node)
+    names = [item.name for item in table]
+    values = dict(zip(names, running.get(node, names), strict=True))
+    answers = running.set(node, **values)
+    for item, (done, reason) in zip(table, answers, strict=True):
+        assert done == item.live, (item.name, reason)
+        if not item.live:
+            assert reason == (
+                f"{node}: parameter {item.name!r} cannot change while the node runs: "
+                f"{item.fixed or 'it is read at the start'}. Start it anew with the value in --params-file, or with "
+                f"-p {item.name}:=VALUE"
+            )
+
+
+def test_a_wrong_name_or_value_is_refused_in_our_words_and_nothing_changes(running: Graph) -> None:
+    refused = {
+        "silense": (0.2, "fusion: unknown parameter 'silense'; did you mean 'silence'?"),
+        "silence": (99.0, "fusion: parameter 'silence': 99.0, expected 0.02 to 5"),
+        "method": ("mean", "fusion: parameter 'method': 'mean', expected one of covariance, thesis_text"),
+        "gate": ("wide", "fusion: parameter 'gate': 'wide', expected a number"),
+    }
+    before = running.get("fusion", ["silence", "method", "gate"])
+    answers = running.set("fusion", **{name: value for name, (value, _) in refused.items()})
+    for (done, reason), (_, expected) in zip(answers, refused.values(), strict=True):
+        assert not done
+        assert reason.startswith(expected)
+    assert running.get("fusion", ["silence", "method", "gate"]) == before
+
+
+def test_a_whole_number_serves_as_a_number(running: Graph) -> None:
+    assert running.set("fusion", gate=4) == [(True, "")]
+    [gate] = running.get("fusion", ["gate"])
+    assert gate.type == ParameterType.PARAMETER_DOUBLE
+    assert gate.double_value == 4.0
+
+
+def test_the_fusion_drops_a_sensor_sooner_and_keeps_its_poses(running: Graph) -> None:
+    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated", 60.0)
+    before = running.number("fusion", "silent")
+    uncalibrated = running.number("fusion", "uncalibrated")
+    assert running.set("fusion", silence=0.02) == [(True, "")]
+    # of two sensors at 30 Hz the other's newest frame is often older than that
+    assert running.until(lambda: running.number("fusion", "silent") > before + 30), running.diagnostics["fusion"]
+    assert running.number("fusion", "uncalibrated") <= uncalibrated + 5
+    assert running.set("fusion", silence=0.1) == [(True, "")]
+
+
+def test_the_calibration_warns_by_another_limit(running: Graph) -> None:
+    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated", 60.0)
+    assert running.set("calibration", max_rotation_stddev=0.001) == [(True, "")]
+    assert running.until(lambda: "roughly calibrated" in running.diagnostics["calibration"][""])
+    assert running.set("calibration", max_rotation_stddev=0.05) == [(True, "")]
+    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated")
+
+
+def test_filter_and_angles_become_others(running: Graph) -> None:
+    assert running.set("skeleton_filter", filter="lkf_zero_velocity") == [(True, "")]
+    assert running.until(lambda: running.diagnostics["skeleton_filter"][""] == "lkf_zero_velocity")
+    assert running.set("joint_angles", convention="isb") == [(True, "")]
+    running.angles.clear()
+    assert running.until(lambda: running.angles and "thorax_extension_body1" in running.angles[-1].name)
+
+
+def test_the_player_plays_faster(running: Graph) -> None:
+    assert running.set("bag_player", rate=3) == [(True, "")]
+    rate = f"rate out {graph.skeleton_topic('kinect1')}"
+    assert running.until(lambda: running.number("bag_player", rate) > 45.0)
+    assert running.set("bag_player", rate=1.0) == [(True, "")]
+
+
+def test_the_recorder_changes_its_bag_between_two_recordings_only(running: Graph) -> None:
+    first, second = running.folder / "first", running.folder / "second"
+    assert running.call(Trigger, "/recorder/start", Trigger.Request()).success
+    [(done, reason)] = running.set("bag_recorder", folder=second)
+    assert not done
+    assert "call recorder/stop first" in reason
+    assert running.until(lambda: running.number("bag_recorder", f"rate in {graph.FUSED}") > 5.0)
+    assert running.call(Trigger, "/recorder/stop", Trigger.Request()).success
+    assert running.set("bag_recorder", folder=second) == [(True, "")]
+    assert running.call(Trigger, "/recorder/start", Trigger.Request()).success
+    assert running.until(lambda: running.diagnostics["bag_recorder"].get("bag") == str(second))
+    assert running.call(Trigger, "/recorder/stop", Trigger.Request()).success
+    assert {path.suffix for folder in (first, second) for path in folder.iterdir()} == {".mcap", ".yaml"}

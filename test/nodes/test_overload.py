@@ -1,0 +1,91 @@
+"""A node that is too slow for what comes drops the oldest frames, handles those of now, and says so."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+
+from body_tracking.cdr import encode_skeletons  # noqa: E402
+from body_tracking.nodes.common import RELIABLE, GraphNode  # noqa: E402
+from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+from body_tracking.skeleton import Skeleton  # noqa: E402
+
+TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")
+WORK = 0.06
+"""Seconds for a frame, of which two come in a thirtieth of a second: three of four cannot be handled."""
+
+
+class Slow(GraphNode):
+    """Takes its time for every frame."""
+
+    NAME = "slow"
+    PARAMETERS = (RELIABLE,)
+
+    def start(self) -> None:
+        self.waited: list[tuple[str, float]] = []
+        for topic in TOPICS:
+            self.listen_to_skeletons(topic, lambda skeletons, sent_ns, topic=topic: self.work(topic, sent_ns))
+
+    def work(self, topic: str, sent_ns: int) -> None:
+        self.waited.append((topic, (time.time_ns() - sent_ns) / 1e9))
+        time.sleep(WORK)
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Slow]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init(domain_id=random.randint(1, 100))
+    yield Slow()
+    rclpy.try_shutdown()
+
+
+def test_who_is_too_slow_handles_what_is_new_and_says_what_was_dropped(slow: Slow) -> None:
+    told: list[Any] = []
+    slow._diagnostics.publish = told.append
+    source = rclpy.create_node("source")
+    publishers = [source.create_publisher(PointCloud2, topic, slow.skeleton_qos()) for topic in TOPICS]
+    executor = LeanExecutor(slow)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    end = time.monotonic() + 20.0
+    while not all(publisher.get_subscription_count() for publisher in publishers) and time.monotonic() < end:
+        time.sleep(0.05)
+    body = Skeleton(0, "kinect1_optical_frame", np.ones((25, 3)), np.full(25, 2, np.uint8))
+    sent = 0
+    begin = time.monotonic()
+    while time.monotonic() - begin < 6.0:
+        stamp_ns = 10**9 + sent * 33_000_000
+        cloud = encode_skeletons([Skeleton(stamp_ns, body.frame_id, body.positions, body.states)])
+        for publisher in publishers:
+            publisher.publish(cloud)
+        sent += 1
+        time.sleep(max(0.0, begin + sent / 30 - time.monotonic()))
+    before = len(slow.waited)
+    time.sleep(1.5)  # what is left is worked on, and told of
+    backlog, lost = slow.backlog.dropped, slow.sequences.lost
+    assert set(backlog) == set(TOPICS)
+    for topic in TOPICS:
+        handled = sum(each == topic for each, _ in slow.waited)
+        assert handled + backlog[topic] + lost[topic] == sent
+        assert backlog[topic] > lost[topic]
+    # no queue that lasts: what was handled at the end is of now, and little is left
+    late = [seconds for _, seconds in slow.waited[before // 2 : before]]
+    assert np.median(late) < 0.3 and len(slow.waited) - before <= 16
+    statuses = [message.status[0] for message in told]
+    warned = [status for status in statuses if status.message.startswith("too slow: dropped ")]
+    assert warned and all(status.level == b"\x01" and TOPICS[0] in status.message for status in warned)
+    values = {item.key: item.value for item in statuses[-1].values}
+    assert values[f"dropped {TOPICS[0]}"] == str(backlog[TOPICS[0]])
+    executor.stop()
+    thread.join(10.0)
+    assert not thread.is_alive()

@@ -1,0 +1,336 @@
+"""Two simulated arms follow a recorded motion through real processes; then the sensor dies, and comes back."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from running import RELIABLE, Running, environment, stop  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from simulated_arm import SimulatedArm  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory  # noqa: E402
+
+from body_tracking import graph  # noqa: E402
+from body_tracking.cdr import encode_angles  # noqa: E402
+from body_tracking.kinematics.conventions import angles_of  # noqa: E402
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
+from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
+from body_tracking.messages import joint_state_to_model, to_nanoseconds  # noqa: E402
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
+from body_tracking.recording.qos import SENSOR_DATA  # noqa: E402
+from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize  # noqa: E402
+from body_tracking.robot.follower import State  # noqa: E402
+from body_tracking.robot.mapping import RobotMapping, load  # noqa: E402
+from body_tracking.skeleton import NANOSECONDS, FloatArray  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+BAG = ROOT / "bags" / "tpose_wave"
+SENSOR = graph.skeleton_topic("kinect1")
+LATENCY_NS = 20_000_000
+BODIES = {"two_joint_arm": "body1", "iiwa7": "body2"}
+PERIOD = 0.01
+
+
+def mapping_file(robot: str) -> Path:
+    return ROOT / "config" / "robots" / f"{robot}.yaml"
+
+
+# --- what is refused
+
+
+def _inverted(content: dict[str, Any]) -> None:
+    content["joints"][1]["lower"], content["joints"][1]["upper"] = 1.0, 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda content: content["joints"][0].update(name="sholder"), "unknown joint 'sholder'"),
+        (_inverted, "joint 'elbow': empty limits"),
+        (lambda content: content["joints"].reverse(), "wrong order: joint 1 is 'elbow'"),
+    ],
+)
+def test_a_wrong_mapping_is_refused_at_the_start_by_name(change: Any, said: str, tmp_path: Path) -> None:
+    content = yaml.safe_load(mapping_file("two_joint_arm").read_text())
+    change(content)
+    file = tmp_path / "robot.yaml"
+    file.write_text(yaml.safe_dump(content))
+    command = [sys.executable, "-m", "body_tracking.nodes", "robot_commands", "--ros-args", "-p", f"mapping:={file}"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment())
+    assert result.returncode == 2
+    (line,) = result.stderr.strip().splitlines()
+    assert line.startswith(f"robot_commands: {file}: ")
+    assert said in line
+
+
+# --- a recording of the angles that the graph would find, if it saw everything
+
+
+def write_angles(path: Path, seconds: float = np.inf) -> None:
+    """A bag with the frames of one sensor, and the true angles of the same moments, of two people who move alike.
+
+    Args:
+        path: of the bag.
+        seconds: of the recording that are used.
+    """
+    model = UpperBody()
+    covariance = 1e-3 * np.eye(2 * model.nv)
+    with BagReader(BAG) as reader, BagWriter(path) as writer:
+        writer.add_topic(SENSOR, reader.topics[SENSOR].type_name, SENSOR_DATA)
+        for body in BODIES.values():
+            for topic in (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body)):
+                writer.add_topic(topic, "sensor_msgs/msg/JointState", RELIABLE_QOS)
+        for raw in reader.messages([SENSOR, graph.TRUE_MODEL_STATE]):
+            if raw.log_time_ns - reader.start_ns > seconds * NANOSECONDS:
+                break
+            if raw.topic == SENSOR:
+                writer.write(SENSOR, raw.cdr, raw.log_time_ns)
+                continue
+            state = joint_state_to_model(deserialize("sensor_msgs/msg/JointState", raw.cdr), model)
+            angles = angles_of(state_estimate(model, *state, covariance), model, "isb")
+            for body in BODIES.values():
+                topics = (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body))
+                for topic, cdr in zip(topics, encode_angles(angles, body, "world"), strict=True):
+                    writer.write(topic, cdr, raw.log_time_ns + LATENCY_NS)
+
+
+@dataclass
+class Arm:
+    """A simulated arm and what it was told."""
+
+    mapping: RobotMapping
+    body: SimulatedArm
+    told: list[tuple[float, float, FloatArray]] = field(default_factory=list)
+    """When a command came and when it was made (wall time, seconds; NaN where it does not say), and what it was."""
+    stood: list[tuple[float, FloatArray]] = field(default_factory=list)
+
+    def moving(self) -> bool:
+        """Whether the last commands move a joint by more than 0.15 rad/s."""
+        if len(self.told) < 11:
+            return False
+        return bool(np.abs(self.told[-1][2] - self.told[-11][2]).max() > 0.015)
+
+
+class Robots(Running):
+    """Two arms in this process, a node each that commands them, and a player in place of the graph."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.bag = folder / "angles"
+        write_angles(self.bag)
+        names = {name: angle_names(name) for name in ALL_CONVENTIONS}
+        self.arms: dict[str, Arm] = {}
+        self.states: dict[str, Any] = {}
+        for robot in BODIES:
+            mapping = load(mapping_file(robot), names)
+            model = ROOT / "examples" / "robot_arms" / f"{robot}.xml"
+            arm = self.arms[robot] = Arm(mapping, SimulatedArm(model, mapping.joints, mapping.home))
+            kind = JointTrajectory if robot == "two_joint_arm" else Float64MultiArray
+            self.node.create_subscription(kind, mapping.output.topic, self._listener(arm), RELIABLE)
+            self.states[robot] = self.node.create_publisher(JointState, mapping.output.state_topic, RELIABLE)
+        self.advanced = time.monotonic()
+        self.node.create_timer(0.02, self._advance)
+        self.start("calibration", sensors="[kinect1]", use_sim_time=True)
+        # One goes by the wall clock and stamps its commands by it; the other by /clock, which ends with the player.
+        self.command("two_joint_arm")
+        self.command("iiwa7", use_sim_time=True)
+
+    def _listener(self, arm: Arm) -> Any:
+        def on_trajectory(message: JointTrajectory) -> None:
+            (point,) = message.points
+            assert message.joint_names == list(arm.mapping.joints)
+            self._told(arm, to_nanoseconds(message.header.stamp) / NANOSECONDS, point.positions)
+            arm.body.go_to(arm.told[-1][2], point.time_from_start.nanosec / NANOSECONDS)
+
+        def on_array(message: Float64MultiArray) -> None:
+            self._told(arm, np.nan, message.data)
+            arm.body.go_to(arm.told[-1][2])
+
+        return on_trajectory if arm.mapping.output.kind == "joint_trajectory" else on_array
+
+    @staticmethod
+    def _told(arm: Arm, stamp: float, position: Any) -> None:
+        arm.told.append((time.time(), stamp, np.array(position)))
+
+    def _advance(self) -> None:
+        now = time.monotonic()
+        passed, self.advanced = now - self.advanced, now
+        for robot, arm in self.arms.items():
+            arm.body.advance(min(passed, 0.1))
+            arm.stood.append((time.time(), arm.body.position))
+            message = JointState(name=list(arm.mapping.joints), position=arm.body.position.tolist())
+            self.states[robot].publish(message)
+
+    def command(self, robot: str, **parameters: object) -> None:
+        """Start a robot's ``robot_commands`` under the robot's name."""
+        given = {"mapping": mapping_file(robot), "body": BODIES[robot], "sensors": "[kinect1]", **parameters}
+        words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+        with (self.folder / f"{robot}.log").open("wb") as log:
+            self.processes[robot] = subprocess.Popen(
+                [sys.executable, "-m", "body_tracking.nodes", "robot_commands", "--ros-args"]
+                + ["-r", f"__node:={robot}_commands", *words],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+            )
+
+    def play(self) -> None:
+        """Start the sensor."""
+        self.start("bag_player", bag=self.bag, loop=True, wait_for_subscribers=f"['{SENSOR}:3']", wait_timeout=60.0)
+
+    def said(self, robot: str) -> dict[str, str]:
+        return self.diagnostics.get(f"{robot}_commands", {})
+
+    def in_state(self, *states: State) -> bool:
+        """Whether the last diagnostics of every robot say one of these."""
+        return all(self.said(robot).get("state") in states for robot in self.arms)
+
+    def kill_while_moving(self) -> float:
+        """End the sensor as a crash does, while both arms follow and move; the wall time of it."""
+        moving = {name: arm.moving for name, arm in self.arms.items()}
+        assert self.until(lambda: self.in_state(State.FOLLOWING) and all(m() for m in moving.values()), 90.0), {
+            name: (self.said(name), self.log(name)[-2000:]) for name in self.arms
+        }
+        player = self.processes.pop("bag_player")
+        killed = time.time()
+        player.kill()
+        player.wait()
+        return killed
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run left behind: the arms, and per killing its time and what was said and heard after it."""
+
+    arms: dict[str, Arm]
+    killed: tuple[float, ...]
+    followed: int
+    reasons: dict[str, list[str]]
+    quiet_at: tuple[dict[str, int], ...]
+    logs: dict[str, str]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    with Robots(tmp_path_factory.mktemp("robots")) as robots:
+        killed, quiet = [], []
+        reasons: dict[str, list[str]] = {robot: [] for robot in BODIES}
+        for _ in range(2):
+            robots.play()
+            killed.append(robots.kill_while_moving())
+            followed = len(robots.arms["iiwa7"].told)
+            assert robots.until(lambda: robots.in_state(State.HOLDING)), robots.diagnostics
+            assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.diagnostics
+            for robot in BODIES:
+                reasons[robot].append(robots.said(robot)[""])
+            robots.until(lambda: False, timeout=1.0)  # commands that were on their way
+            quiet.append({robot: len(arm.told) for robot, arm in robots.arms.items()})
+            robots.until(lambda: False, timeout=0.5)
+            assert quiet[-1] == {robot: len(arm.told) for robot, arm in robots.arms.items()}
+        for robot in (*BODIES, "calibration"):
+            assert stop(robots.processes.pop(robot)) == 0, robots.log(robot)
+        logs = {robot: robots.log(robot) for robot in BODIES}
+        yield Run(dict(robots.arms), tuple(killed), followed, reasons, tuple(quiet), logs)
+
+
+def of_one_run(run: Run, arm: Arm, number: int) -> list[tuple[float, float, FloatArray]]:
+    """The commands up to a stop, from the one before."""
+    robot = arm.mapping.robot
+    return arm.told[run.quiet_at[number - 1][robot] if number else 0 : run.quiet_at[number][robot]]
+
+
+def stall(times: list[float]) -> float:
+    """Seconds that a process was held up beyond its period, as the times of its commands show."""
+    return float(np.maximum(np.diff(times) - 2 * PERIOD, 0.0).sum())
+
+
+def test_both_arms_follow_the_recorded_motion(run: Run) -> None:
+    for arm in run.arms.values():
+        told = np.array([position for _, _, position in arm.told])
+        assert np.ptp(told, axis=0).max() > 0.5
+        times = np.array([came for came, _, _ in arm.told])
+        stood_at = np.array([at for at, _ in arm.stood])
+        stood = np.array([position for _, position in arm.stood])
+        behind = [np.interp(times + 0.04, stood_at, stood[:, k]) - told[:, k] for k in range(told.shape[1])]
+        assert np.median(np.abs(behind)) < 0.03
+        assert np.sqrt(np.mean(np.square(behind))) < 0.15
+
+
+def test_commands_are_within_every_limit_and_jump_nowhere(run: Run) -> None:
+    for arm in run.arms.values():
+        told = np.array([position for _, _, position in arm.told])
+        assert np.isfinite(told).all()
+        assert (told >= arm.mapping.lower).all()
+        assert (told <= arm.mapping.upper).all()
+        np.testing.assert_allclose(told[0], arm.mapping.home, atol=0.05)
+        # over the stops and new beginnings, too: the arm stands where it was left
+        assert (np.abs(np.diff(told, axis=0)) <= arm.mapping.rate * 2 * PERIOD + 0.05).all()
+        within = [np.diff([p for _, _, p in of_one_run(run, arm, number)], axis=0) for number in range(2)]
+        for moved in within:
+            assert (np.abs(moved) <= arm.mapping.rate * 2 * PERIOD + 1e-9).all()
+
+
+def test_the_arm_stands_within_a_tenth_of_a_second_of_the_sensors_death(run: Run) -> None:
+    for number, killed in enumerate(run.killed):
+        for arm in run.arms.values():
+            commands = of_one_run(run, arm, number)
+            # made when, by their stamps; an array has none, and is taken to be made when it came
+            made = [came if np.isnan(stamp) else stamp for came, stamp, _ in commands]
+            last = max(k for k in range(1, len(commands)) if (commands[k][2] != commands[k - 1][2]).any())
+            braking = np.where(np.isfinite(arm.mapping.acceleration), arm.mapping.rate / arm.mapping.acceleration, 0.0)
+            held_up = stall([at for at in made if killed - 0.1 < at <= made[last] + 2 * PERIOD])
+            assert made[last] - killed <= 0.1 + braking.max() + held_up
+
+
+def test_it_stops_as_stated_and_says_why(run: Run) -> None:
+    for robot, arm in run.arms.items():
+        for number, said in enumerate(run.reasons[robot]):
+            assert said.startswith("stopped: held for 2."), said
+            assert "no new angles for" in said or "no frame of kinect1 for" in said
+            commands = of_one_run(run, arm, number)
+            last = max(k for k in range(1, len(commands)) if (commands[k][2] != commands[k - 1][2]).any())
+            standing = [came for came, _, _ in commands[last:]]
+            assert 1.7 < standing[-1] - standing[0] < 2.3 + stall(standing)
+        assert "following -> holding: no " in run.logs[robot]
+        assert "holding -> stopped: held for 2." in run.logs[robot]
+
+
+def test_it_recovers_after_good_data_alone_and_slowly(run: Run) -> None:
+    for robot, arm in run.arms.items():
+        told = run.logs[robot]
+        assert told.count("stopped -> approaching: everything was good for 0.5") >= 2
+        commands = of_one_run(run, arm, 1)
+        before = of_one_run(run, arm, 0)[-1][2]
+        np.testing.assert_allclose(commands[0][2], before, atol=0.05)
+        begun = [position for _, _, position in itertools.islice(commands, 20)]
+        # a fifth of a second into an approach of 1.5 s
+        assert (np.abs(np.diff(begun, axis=0)) <= arm.mapping.rate * 2 * PERIOD * 0.4 / 1.5 + 1e-9).all()
+
+
+def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
+    write_angles(tmp_path / "angles", 8.0)
+    example = ROOT / "examples" / "robot_arms" / "drive.py"
+    picture = tmp_path / "arm.png"
+    words = ["iiwa7", "--bag", tmp_path / "angles", "--angles", "-o", picture]
+    done = subprocess.run(
+        [sys.executable, example, *words], capture_output=True, text=True, timeout=120, env=environment(), check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "robot_commands: approaching: everything was good for 0.5" in done.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    rows = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.startswith("joint_a")}
+    assert len(rows) == 7
+    assert all(float(row[3]) < 5.0 for row in rows.values())

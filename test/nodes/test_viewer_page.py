@@ -1,0 +1,220 @@
+"""The viewer in a real browser: what is drawn is what the graph says, it moves, and its buttons do what they say.
+
+With ``BODY_TRACKING_SCREENSHOTS=docs/images`` the pictures of the documentation are written there on the way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("viser", reason="viser is not installed")
+
+from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from running import Running, stop  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+
+from body_tracking import graph  # noqa: E402
+from body_tracking.messages import cloud_to_skeletons  # noqa: E402
+from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
+from body_tracking.viewing.shapes import figure  # noqa: E402
+
+BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_torso_twist"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+PICTURES = os.environ.get("BODY_TRACKING_SCREENSHOTS")
+EVERY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+PATIENCE = 120.0
+"""Seconds: software draws a frame in one of them where processors are shared."""
+
+JOINTS = """name => {
+  const node = window.__viserSceneTree?.getState()[name];
+  if (!node || !node.message.props.batched_positions) return null;
+  const bytes = node.message.props.batched_positions;
+  return Array.from(new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4));
+}"""
+CURVES = """() => Object.values(window.__viserTestpoints?.uplots ?? {})
+  .map(plot => plot.chart.data.map(series => Array.from(series)))"""
+
+
+class Browser:
+    """A page and the graph that it shows; what that says is heard in a thread of its own, however slow the page is."""
+
+    def __init__(self, running: Running, page: Any, clouds: list[PointCloud2]) -> None:
+        self.running, self.page, self.clouds = running, page, clouds
+
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Wait for something to be so; it failing is the test failing."""
+        end = time.monotonic() + PATIENCE
+        while not (found := condition()):
+            assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log('viewer')}"
+            self.page.wait_for_timeout(100)
+        return found
+
+    def joints(self, name: str) -> np.ndarray | None:
+        """(n, 3) what the page draws there."""
+        numbers = self.page.evaluate(JOINTS, name)
+        return None if numbers is None else np.array(numbers).reshape(-1, 3)
+
+    def press(self, button: str) -> None:
+        self.page.get_by_role("button", name=button, exact=True).dispatch_event("click")
+
+    def answer(self, pattern: str) -> str:
+        """The notification that matches."""
+        text = re.compile(pattern)
+        return str(self.until(lambda: self._found(text), f"an answer like {pattern!r}"))
+
+    def _found(self, pattern: re.Pattern[str]) -> str:
+        texts = self.page.locator("[role=alert], .mantine-Notification-root").all_inner_texts()
+        return next((text for text in texts if pattern.search(text) and "waits for an answer" not in text), "")
+
+    def picture(self) -> bytes:
+        """The middle of the scene, where the person stands."""
+        size = self.page.viewport_size
+        clip = {"x": 0.42 * size["width"], "y": 0.3 * size["height"], "width": 0.2 * size["width"], "height": 200}
+        return bytes(self.page.screenshot(clip=clip, timeout=1e3 * PATIENCE))
+
+    def save(self, name: str) -> None:
+        """A picture for the documentation, if these are asked for."""
+        if PICTURES:
+            file = Path(PICTURES) / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            for note in self.page.locator(".mantine-Notification-closeButton").all():
+                note.dispatch_event("click")
+            self.page.wait_for_timeout(5e3)
+            self.page.screenshot(path=file, timeout=1e3 * PATIENCE)
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    """The whole graph over a bag that plays again and again, and a browser that shows it."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    with Running(tmp_path) as running:
+        # The picture shows the filter that knows a body; it takes six times as long.
+        name = "ekf" if PICTURES else "lkf_constant_velocity"
+        role = graph.ROLES[name]
+        running.start("bag_recorder", folder=tmp_path / "recorded", start_recording=False, use_sim_time=True)
+        running.start("joint_angles", input=role.angles_input, convention=role.convention, use_sim_time=True)
+        running.start("skeleton_filter", filter=name, use_sim_time=True)
+        running.start("fusion", use_sim_time=True)
+        running.start("calibration", use_sim_time=True)
+        running.start("viewer", port=0, rate=5.0, use_sim_time=True)
+        topics = "['/kinect1/skeleton', '/kinect2/skeleton']"
+        count = 4 if role.input == graph.SENSORS_INPUT else 3
+        waited = f"['/kinect1/skeleton:{count}', '/kinect2/skeleton:{count}']"
+        clouds = running.collect(PointCloud2, graph.FILTERED, EVERY)
+        running.start("bag_player", bag=BAG, topics=topics, loop=True, clock_rate=20.0, wait_for_subscribers=waited)
+        assert running.until(lambda: "open http" in running.log("viewer"), PATIENCE), running.log("viewer")
+        address = re.search(r"http://\S+", running.log("viewer"))
+        assert address is not None and address[0].startswith("http://127.0.0.1:")
+        with playwright.sync_playwright() as driver:
+            # Software draws as fast as it can; what it draws comes first.
+            gentle = tmp_path / "chromium"
+            gentle.write_text(f'#!/bin/sh\nexec nice -n 19 {CHROMIUM} "$@"\n')
+            gentle.chmod(0o755)
+            chromium = driver.chromium.launch(executable_path=gentle, args=list(SOFTWARE), timeout=1e3 * PATIENCE)
+            width, height, sharpness = (1360, 820, 1.0) if PICTURES else (900, 560, 0.4)
+            page = chromium.new_page(viewport={"width": width, "height": height})
+            page.set_default_timeout(1e3 * PATIENCE)
+            page.goto(f"{address[0]}/?fixedDpr={sharpness}")
+            listener = threading.Thread(target=_spin, args=(running.executor,), daemon=True)
+            listener.start()
+            yield Browser(running, page, clouds)
+            chromium.close()
+            running.executor.shutdown()
+            listener.join(10.0)
+
+
+def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_path: Path) -> None:
+    running, page, clouds = browser.running, browser.page, browser.clouds
+
+    # The joints that are drawn are those of one of the messages, all of them and to the last digit of the float.
+    def drawn() -> bool:
+        joints = browser.joints("/filtered/joints")
+        if joints is None or not len(clouds):
+            return False
+        sent = [figure(cloud_to_skeletons(cloud), (0, 0, 0)).joints for cloud in clouds[-1000:]]
+        return any(len(each) and np.allclose(joints[: len(each)], each, atol=1e-6) for each in sent)
+
+    browser.until(drawn, "the filtered skeleton as it was published")
+    first = browser.joints("/filtered/joints")
+    browser.until(lambda: not np.allclose(browser.joints("/filtered/joints"), first, atol=1e-3), "it to move")
+    for name in ("/sensors/kinect1/skeleton/joints", "/sensors/kinect2/skeleton/joints", "/uncertainty"):
+        browser.until(lambda name=name: browser.joints(name) is not None, name)
+
+    # Curves grow, and their bands enclose them.
+    def curves() -> list[Any]:
+        return [plot for plot in page.evaluate(CURVES) if len(plot[0]) > 20]
+
+    browser.until(curves, "curves of joint angles")
+    for times, values, low, high in curves():
+        assert (np.diff(times) > 0.0).all() and times[-1] == 0.0
+        assert (np.array(low) <= values).all() and (np.array(values) <= high).all()
+
+    # The nodes say how they are.
+    browser.until(lambda: re.search(r"skeleton_filter\s+\d+ Hz", page.inner_text("body")), "rates of the nodes")
+    if PICTURES:
+        end = time.monotonic() + 30.0
+        browser.until(lambda: time.monotonic() > end, "a while, for the picture")
+    browser.save("viewer.png")
+
+    # A paused bag stands still on the page, and moves again.
+    browser.press("pause")
+    assert "paused at" in browser.answer("bag: pause")
+    still = [browser.picture()]
+
+    def stands_still() -> bool:
+        still.append(browser.picture())
+        return still[-1] == still[-2]
+
+    browser.until(stands_still, "two equal pictures of a paused bag")
+    browser.press("resume")
+    browser.answer("bag: resume")
+    browser.until(lambda: browser.picture() != still[-1], "the picture to move again")
+
+    # Buttons.
+    browser.press("calibrate")
+    assert "calibration/start" not in browser.answer("calibration: calibrate")
+    browser.press("record")
+    assert "recording into" in browser.answer("recording: record")
+    recorded = "bag_recorder"
+    browser.until(
+        lambda: int(running.diagnostics.get(recorded, {}).get("messages", 0)) > 100, "messages in the recording"
+    )
+    browser.press("stop")
+    assert "messages in" in browser.answer("recording: stop")
+    with BagReader(tmp_path / "recorded") as reader:
+        assert {graph.skeleton_topic("kinect1"), graph.FILTERED, graph.DIAGNOSTICS_TOPIC} <= set(reader.topics)
+        assert sum(1 for _ in reader.messages([graph.FILTERED])) > 10
+
+    # What cannot be done is said, with the reason.
+    assert stop(running.processes.pop("bag_recorder")) == 0
+    browser.until(lambda: not services_of(running, "bag_recorder"), "the recorder to be gone")
+    browser.press("record")
+    assert "no node that offers it runs" in browser.answer("no node that offers it")
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    with contextlib.suppress(ExternalShutdownException, ShutdownException):
+        executor.spin()
+
+
+def services_of(running: Running, node: str) -> list[Any]:
+    """What a node offers; nothing when it is gone."""
+    if node not in running.node.get_node_names():
+        return []
+    return list(running.node.get_service_names_and_types_by_node(node, "/"))

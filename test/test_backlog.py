@@ -1,0 +1,88 @@
+"""What is left out where a node is too slow: nothing while it was held up once, and then the oldest."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from body_tracking.backlog import AT_ONCE, INTERVAL, TARGET, Backlog, Sequences
+from body_tracking.skeleton import NANOSECONDS
+
+PERIOD_NS = NANOSECONDS // 30
+TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")
+DEPTH = 16
+"""Frames that a reader keeps."""
+
+
+def run(
+    work_s: float, seconds: float, stall: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Backlog, list[int], Counter[str]]:
+    """A node that works so long on each frame of two sensors, and once is held up.
+
+    Returns:
+        Its backlog, how long each frame that it handled had waited, and how many were lost in full readers.
+    """
+    backlog, waited, lost = Backlog(), [], Counter[str]()
+    queue: list[tuple[str, int]] = []
+    now_ns, sent = 0, 0
+    while now_ns < seconds * NANOSECONDS:
+        while sent * PERIOD_NS <= now_ns:
+            queue += [(topic, sent * PERIOD_NS) for topic in TOPICS]
+            sent += 1
+        for topic in TOPICS:
+            mine = [each for each in queue if each[0] == topic]
+            lost[topic] += max(0, len(mine) - DEPTH)
+            queue = [each for each in queue if each[0] != topic or each in mine[-DEPTH:]]
+        late = set(backlog.late(queue, now_ns))
+        handled, queue = [each for place, each in enumerate(queue) if place not in late], []
+        waited += [now_ns - at_ns for _, at_ns in handled]
+        now_ns += round(work_s * NANOSECONDS) * len(handled)
+        backlog.done(now_ns)
+        now_ns = now_ns if handled else sent * PERIOD_NS
+        if now_ns >= stall[0] * NANOSECONDS and stall[1]:
+            now_ns, stall = now_ns + round(stall[1] * NANOSECONDS), (0.0, 0.0)
+    return backlog, waited, lost
+
+
+@pytest.mark.parametrize("work_s", [0.001, 0.012])
+@pytest.mark.parametrize("stall_s", [0.0, 0.4])
+def test_who_is_fast_enough_loses_nothing_even_when_held_up(work_s: float, stall_s: float) -> None:
+    backlog, waited, lost = run(work_s, 10.0, (3.0, stall_s))
+    assert not backlog.dropped and not +lost
+    assert len(waited) >= 2 * 10 * 30 - 2 * DEPTH
+    assert max(waited[-60:]) <= TARGET * NANOSECONDS
+
+
+@pytest.mark.parametrize("work_s", [0.02, 0.03, 0.08])
+def test_who_is_too_slow_drops_the_oldest_and_what_is_handled_is_of_now(work_s: float) -> None:
+    backlog, waited, lost = run(work_s, 20.0)
+    sent = 2 * 20 * 30
+    assert sum(backlog.dropped.values()) + sum(lost.values()) + len(waited) == pytest.approx(sent, abs=2 * DEPTH)
+    # of both sensors alike, and no more than it has to
+    assert abs(backlog.dropped[TOPICS[0]] - backlog.dropped[TOPICS[1]]) <= 0.05 * sent
+    assert len(waited) > 0.9 * 20.0 / work_s
+    # two frames at least are worked on while others wait, and the target and a part of the interval is allowed
+    assert max(waited) <= (2.0 * work_s + AT_ONCE + TARGET) * NANOSECONDS
+    assert max(waited[len(waited) // 4 :]) <= (4.0 * work_s + 2.0 * TARGET + 0.1 * INTERVAL) * NANOSECONDS
+    assert sum(lost.values()) <= 2 * DEPTH
+
+
+def test_the_newest_frame_of_each_sensor_is_never_dropped() -> None:
+    backlog = Backlog()
+    frames = [("one", 0), ("two", 5), ("one", 10), ("two", 2)]
+    assert backlog.late(frames, NANOSECONDS) == []
+    assert backlog.late(frames, round((1.0 + INTERVAL) * NANOSECONDS)) == [0, 3]
+    assert backlog.late([], 10 * NANOSECONDS) == []
+    assert backlog.dropped == {"one": 1, "two": 1}
+
+
+def test_lost_messages_are_counted_by_their_numbers() -> None:
+    sequences = Sequences()
+    for number in (5, 6, 9, 10):
+        sequences.note("one", number)
+    assert sequences.lost == {"one": 2}
+    # the publisher is started again, and another one is there too
+    for number in (1, 2, 100_000, 3, 100_001, 4, 100_003):
+        sequences.note("one", number)
+    assert sequences.lost == {"one": 3}

@@ -1,0 +1,96 @@
+"""The pages in ``docs/``: every command in them runs, or says at its top why not.
+
+The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of the
+repository (and nothing of the page before), and must all end with exit code 0. A block that needs a device, ROS's own
+``ros2``, or more time than a test has begins with the line ``# needs hardware: ...``, ``# needs ROS: ...`` or ``# takes
+long: ...``. A block of another language that begins with ``# name.ext`` is written to that file first, so that commands
+can use it.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+MARK = re.compile(r"# (needs hardware|needs ROS|takes long): \S")
+FILE = re.compile(r"# ([\w-]+\.\w+)\n")
+TIMEOUT = 300.0
+"""Seconds for a page on a busy machine; they take some ten together on an idle one."""
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """(language, text) of each fenced block."""
+    return FENCE.findall(page.read_text(encoding="utf-8"))
+
+
+def commands(page: Path) -> list[str]:
+    """What of a page is to be run."""
+    return [text for language, text in blocks(page) if language == "sh" and not MARK.match(text)]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+    for item in ROOT.iterdir():
+        if not item.name.startswith("."):
+            (tmp_path / item.name).symlink_to(item)
+    for language, text in blocks(page):
+        name = FILE.match(text)
+        if language != "sh" and name:
+            (tmp_path / name[1]).write_text(text, encoding="utf-8")
+    # `body_tracking` and `python` are this Python's, whatever is installed
+    tools = tmp_path / ".bin"
+    tools.mkdir()
+    for tool, arguments in (("body_tracking", "-m body_tracking.cli"), ("python", "")):
+        (tools / tool).write_text(f'#!/bin/sh\nexec "{sys.executable}" {arguments} "$@"\n', encoding="utf-8")
+        (tools / tool).chmod(0o755)
+    environment = {
+        **os.environ,
+        "PATH": f"{tools}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "ROS_DOMAIN_ID": str(random.randint(1, 100)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(tmp_path / "log"),
+        "MPLBACKEND": "Agg",
+    }
+    output = tmp_path / "output.txt"
+    for text in commands(page):
+        with output.open("wb") as file:
+            # a page's background processes end with their group
+            process = subprocess.Popen(
+                ["bash", "-euo", "pipefail", "-c", text],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                cwd=tmp_path,
+                env=environment,
+            )
+            try:
+                code = process.wait(TIMEOUT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                raise
+        assert code == 0, f"{page.name}: exit code {code} of\n{text}\n{output.read_text(errors='replace')}"
+
+
+def test_what_is_not_run_says_why() -> None:
+    """So that no block is left out by a misspelt mark."""
+    for page in PAGES:
+        for language, text in blocks(page):
+            first = text.partition("\n")[0]
+            assert language != "sh" or MARK.match(text) or not first.startswith(("# need", "# take")), (
+                page.name,
+                first,
+            )
+            assert language not in ("bash", "shell", "console"), f"{page.name}: fence commands as sh"

@@ -1,0 +1,131 @@
+"""Curves of angles: nothing that matters is lost when samples are left out, and what is not known is not hidden."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from body_tracking.skeleton import NANOSECONDS
+from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice
+
+NAMES = ("elbow_flexion_left", "trunk_axial")
+STEP_NS = NANOSECONDS // 60
+
+
+def filled(count: int, window: float = 1000.0, stddev: float = 0.01) -> AngleHistory:
+    history = AngleHistory(window)
+    for k in range(count):
+        history.add(k * STEP_NS, NAMES, np.array([np.sin(0.1 * k), 0.5]), np.full(2, stddev))
+    return history
+
+
+# --- decimation
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 400), st.integers(8, 60), st.booleans())
+@settings(max_examples=60)
+def test_of_many_samples_the_extremes_and_the_ends_are_kept(seed: int, k: int, n: int, count: int, ties: bool) -> None:
+    series = np.random.default_rng(seed).normal(scale=2.0, size=(k, n))
+    series = np.round(series) if ties else series
+    kept = extremes(series, count)
+    assert len(kept) <= count
+    assert (np.diff(kept) > 0).all()
+    assert kept[0] == 0 and kept[-1] == n - 1
+    assert (series[:, kept].max(axis=1) == series.max(axis=1)).all()
+    assert (series[:, kept].min(axis=1) == series.min(axis=1)).all()
+    if n <= count:
+        assert len(kept) == n
+
+
+@given(st.integers(100, 2000), st.integers(8, 100))
+@settings(max_examples=40)
+def test_no_gap_between_kept_samples_is_longer_than_two_stretches(n: int, count: int) -> None:
+    series = np.random.default_rng(n).normal(size=(1, n))
+    kept = extremes(series, count)
+    stretch = -(-n // max(1, (count - 2) // 2))
+    assert np.diff(kept).max(initial=0) <= 2 * stretch
+
+
+def test_a_single_peak_among_thousands_is_drawn() -> None:
+    history = AngleHistory(1000.0)
+    for k in range(4000):
+        history.add(k * STEP_NS, NAMES, np.array([1.0 if k == 1777 else 0.0, 0.0]), np.full(2, 0.01))
+    curve = history.curve(NAMES[0], 200)
+    assert curve is not None
+    assert len(curve.times) <= 200
+    assert curve.values.max() == pytest.approx(np.degrees(1.0))
+
+
+# --- the band
+
+
+def test_the_band_has_95_percent_of_a_normal_distribution() -> None:
+    curve = filled(50, stddev=0.02).curve(NAMES[0], 200)
+    assert curve is not None
+    assert curve.high - curve.values == pytest.approx(np.degrees(BAND * 0.02))
+    assert curve.values - curve.low == pytest.approx(np.degrees(BAND * 0.02))
+    samples = np.random.default_rng(0).normal(size=100_000)
+    assert (np.abs(samples) < BAND).mean() == pytest.approx(0.95, abs=0.003)
+
+
+def test_what_nothing_observes_has_a_wide_band_and_no_invented_angle() -> None:
+    history = filled(10)
+    history.add(10 * STEP_NS, NAMES, np.array([0.3, 0.5]), np.array([np.inf, 0.01]))
+    history.add(11 * STEP_NS, NAMES, np.array([np.nan, 0.5]), np.array([np.nan, 0.01]))
+    curve = history.curve(NAMES[0], 200)
+    assert curve is not None
+    assert np.isfinite([curve.values, curve.low, curve.high]).all()
+    assert curve.values[-1] == curve.values[-2] == pytest.approx(np.degrees(0.3))
+    assert curve.high[-2:] - curve.low[-2:] == pytest.approx(2 * WIDEST)
+    assert curve.latest_stddev == np.inf
+    other = history.curve(NAMES[1], 200)
+    assert other is not None and other.latest_stddev == pytest.approx(np.degrees(0.01))
+
+
+# --- what is kept
+
+
+def test_the_window_is_kept_and_the_newest_is_at_zero() -> None:
+    curve = filled(600, window=2.0).curve(NAMES[0], 1000)
+    assert curve is not None
+    assert curve.times[-1] == 0.0
+    assert curve.times[0] == pytest.approx(-2.0, abs=1e-6)
+    assert (np.diff(curve.times) > 0).all()
+
+
+def test_more_messages_than_there_is_room_for_push_the_oldest_out() -> None:
+    history = AngleHistory(1e6, capacity=100)
+    for k in range(1000):
+        history.add(k * STEP_NS, NAMES, np.array([float(k), 0.0]), np.zeros(2))
+    assert len(history) == 100
+    curve = history.curve(NAMES[0], 1000)
+    assert curve is not None
+    assert np.radians(curve.values) == pytest.approx(np.arange(900, 1000))
+
+
+def test_late_ones_are_left_out_and_a_jump_back_or_other_names_start_anew() -> None:
+    history = filled(100)
+    history.add(98 * STEP_NS, NAMES, np.zeros(2), np.zeros(2))
+    assert len(history) == 100
+    history.add(-2 * NANOSECONDS, NAMES, np.zeros(2), np.zeros(2))
+    assert len(history) == 1
+    history.add(NANOSECONDS, ("waist",), np.zeros(1), np.zeros(1))
+    assert (len(history), history.names) == (1, ("waist",))
+    assert history.curve(NAMES[0], 100) is None
+
+
+def test_an_angle_of_which_nothing_is_known_yet_has_no_curve() -> None:
+    history = AngleHistory(10.0)
+    assert history.curve(NAMES[0], 100) is None
+    history.add(0, NAMES, np.array([np.nan, 0.0]), np.array([np.inf, 0.1]))
+    assert history.curve(NAMES[0], 100) is None
+    assert history.curve(NAMES[1], 100) is not None
+
+
+def test_elbows_come_first_where_there_are_any() -> None:
+    names = ("lumbar_flexion", "shoulder_flexion_left", "elbow_flexion_left", "elbow_flexion_right")
+    assert first_choice(names, 2) == ("elbow_flexion_left", "elbow_flexion_right")
+    assert set(first_choice(names, 9)) == set(names)
+    assert first_choice((), 3) == ()
