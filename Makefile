@@ -87,6 +87,8 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	with imu benchmarks/imu_recordings.py; \
 	run benchmarks/calibrate_simulator.py; \
 	run benchmarks/imu_and_camera.py --seeds 1; \
+	run benchmarks/imu_live.py; \
+	run benchmarks/imu_only.py --motions reaching,punching; \
 	run benchmarks/accuracy.py --seeds 2 --layout-seeds 1 --sensitivity-seeds 1; \
 	with kinect_vs_vicon benchmarks/kinect_vs_vicon.py; \
 	if $(BIN)/python -c 'import biorbd, opensim' 2>/dev/null; then run benchmarks/estimators.py; \

@@ -620,9 +620,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     ]
     if worn:
         specs.append(
-            NodeSpec(
-                "imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **common, **skeletons, **subject}
-            )
+            NodeSpec("imu_skeleton", "imu_skeleton", parameters={"segments": options.imus, **several, **subject})
         )
     if options.robot:
         specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))

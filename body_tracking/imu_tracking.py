@@ -113,6 +113,10 @@ class ImuStage:
             raise
         self._fields[segment] = stamp_ns, vector
 
+    def on_frame(self, stamp_ns: int, received_ns: int) -> None:
+        """When a frame of the reference sensor came."""
+        self.tracker.hear(stamp_ns, received_ns)
+
     def on_skeleton(self, skeleton: Skeleton, received_ns: int) -> None:
         """One fused skeleton."""
         self.tracker.see(skeleton, received_ns)

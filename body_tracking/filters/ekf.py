@@ -183,6 +183,9 @@ _SLIPPED = 30.0
 """Squared normalised sum that a source which fits does not come to (chi-square with 3 degrees of freedom)."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
 """Metres and radians: of the base where orientations alone start the body."""
+_BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
+"""Joints that show which way an arm is bent, and how many times the usual distance their centres are off for that: a
+Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simulated as calibrated with recordings)."""
 _ANOTHER_SIZE = 1.2
 """Times that a person is larger or smaller than the one before, who must be another one."""
 
@@ -527,7 +530,7 @@ class ExtendedKalmanFilter:
         self._turned_since: int | None = None
         self._newest_of: dict[str, int] = {}
         self._started_by: tuple[str, int] | None = None
-        self._last_handed_out: tuple[_State, Linearisation, FloatArray] | None = None
+        self._last_handed_out: tuple[_State, FloatArray, Linearisation, FloatArray] | None = None
         self._last_displaced: tuple[int, FloatArray] | None = None
         self.innovation_distance = np.nan
         self.innovation_dimension = 0
@@ -945,6 +948,30 @@ class ExtendedKalmanFilter:
         unseen = self._thumbs[state.sources.segments].any(axis=0)
         return replace(measurement, measured=measurement.measured & ~unseen)
 
+    def _unlearnt(self, state: _State) -> tuple[FloatArray, FloatArray] | None:
+        """What a camera must not teach of sources: how their forearm or hand is turned about itself.
+
+        Thumbs apart (:meth:`_without_thumbs`) nothing shows a camera that but which way an arm is bent, of which it is
+        sure and wrong for as long as the arm looks the same. That combination of a source's numbers is only considered
+        (Schmidt 1966): its gain is zero, along the direction in which what is known of the source varies with it.
+
+        Returns:
+            (n, 85 and more) combinations, and (85 and more, n) what takes them from a correction; None where there are
+            none.
+        """
+        hidden = np.flatnonzero(self._thumbs[state.sources.segments].any(axis=1))
+        if not len(hidden):
+            return None
+        axes = self.model.forward(state.q, state.lengths).rotations[state.sources.segments[hidden], :, 2]
+        combinations = np.zeros((len(hidden), len(state.covariance)))
+        back = np.zeros((len(state.covariance), len(hidden)))
+        for place, (number, axis) in enumerate(zip(hidden, axes, strict=True)):
+            own = slice(self._size + PER_SOURCE * int(number), self._size + PER_SOURCE * (int(number) + 1))
+            combinations[place, own] = orientation.about(axis)
+            spread = state.covariance[own, own] @ combinations[place, own]
+            back[own, place] = spread / (combinations[place, own] @ spread)
+        return combinations, back
+
     def _contradicts(self, state: _State, q: FloatArray) -> bool:
         """Whether another pose turns a segment far from where a source that fits has it."""
         segments = state.sources.segments[state.sources.unfit_for == 0.0]
@@ -1188,6 +1215,12 @@ class ExtendedKalmanFilter:
             # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
             seen = self._expected(state, measurement, sensor, correction[: self._observed], covariance)
         observation, basis = seen.observation, seen.basis
+        unlearnt = self._unlearnt(state) if state.sources.names else None
+        if unlearnt is not None:
+            combinations, back = unlearnt
+            taken = gain @ combinations.T
+            correction -= back @ (combinations @ correction)
+            covariance += back @ (taken.T @ taken) @ back.T
         # errors are told in the tangent of what is found
         turns = [(ball, so3.right_jacobian(correction[ball])) for ball in self.model.ball_v] if turned >= _FAR else []
         for ball, turn in turns:
@@ -1214,6 +1247,8 @@ class ExtendedKalmanFilter:
             kalman = gain.T @ whitening  # (85, k)
             if state.settled:
                 kalman[self._lengths] = 0.0
+            if unlearnt is not None:
+                kalman -= back @ (combinations @ kalman)
             change = kalman @ observation[rows] @ crosses[: self._observed]
             if basis is not None:
                 place = names.index(measurement.sensor) * self._slow_size
@@ -1801,6 +1836,11 @@ class ExtendedKalmanFilter:
 
     def _pose_prior(self) -> None:
         """What is known of a pose and of velocities without any measurement."""
+        names = self.model.coordinate_names[6:]
+        self._of_arms = np.isin(
+            self.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
+        )
+        self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
         self._rest_information = np.full(self._nv, 1e-4)
         self._rest_information[6:] = 1.0 / self.ranges.stddev**2
         self._velocity_variance = np.full(self._nv, _FIRST_TURN_RATE**2)
@@ -1836,7 +1876,7 @@ class ExtendedKalmanFilter:
         if unknown.any():
             state = self._told(state, gradients[unknown], -values[unknown], noise[unknown])
         vague = variance > (_VAGUE * stddev) ** 2
-        if vague.any():
+        if vague.any() and not state.sources.names:
             state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
         beyond = excess != 0.0
         if beyond.any():
@@ -1884,7 +1924,9 @@ class ExtendedKalmanFilter:
     def _drawn(self, state: _State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> _State:
         """The estimate drawn to the middle of the ranges, where nothing else holds it; the covariance stays.
 
-        Without this, an angle that nothing observes would wander with the noise of those that are.
+        Without this, an angle that nothing observes would wander with the noise of those that are. Beside orientations
+        it is done to what is handed out only (:meth:`_middled`): what cameras pull back again and again, as the
+        covariance stays, would end up in the headings and misalignments of the sources.
         """
         cross_covariance = self._free(state)[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(stddev**2)
@@ -1990,15 +2032,34 @@ class ExtendedKalmanFilter:
         both = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
         return both.reshape(-1, self._observed)
 
-    def _handed_out(self, state: _State) -> tuple[Linearisation, FloatArray]:
-        """Where the points are, and the covariance (85, 85) to hand out: what the filter knows, and what it cannot."""
+    def _handed_out(self, state: _State) -> tuple[FloatArray, Linearisation, FloatArray]:
+        """The configuration, where its points are, and the covariance (85, 85) to hand out: what the filter knows, and
+        what it cannot.
+        """
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
             lines, covariance = self.model.linearise(state.q, state.lengths), state.covariance
             if self.parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
                 covariance = covariance.copy()
                 covariance[: self._observed, : self._observed] += self._displaced(state, lines)
-            self._last_handed_out = state, lines, covariance
+            q = state.q
+            if state.sources.names:
+                q = self._middled(q, state.covariance[self._tangent, self._tangent])
+                lines = self.model.linearise(q, state.lengths)
+            self._last_handed_out = state, q, lines, covariance
         return self._last_handed_out[1:]
+
+    def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(35,) a configuration of covariance (32, 32) told the middle of the ranges once, where it is vague."""
+        soft = self.ranges.soft_coordinates(q)
+        gradients = np.zeros((self._nv - 6, self._nv))
+        gradients[:, 6:] = soft.gradients
+        stddev = self.ranges.stddev
+        vague = ((gradients @ covariance) * gradients).sum(axis=1) > (_VAGUE * stddev) ** 2
+        vague &= self._twists
+        rows = gradients[vague]
+        cross = covariance @ rows.T
+        away = soft.values[vague] - self.ranges.centre[vague]
+        return self.model.integrate(q, -cross @ np.linalg.solve(rows @ cross + np.diag(stddev[vague] ** 2), away))
 
     def _displaced(self, state: _State, lines: Linearisation) -> FloatArray:
         """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
@@ -2022,6 +2083,8 @@ class ExtendedKalmanFilter:
             weighted = observation.T * weights.repeat(_DIMENSIONS)
             gain = np.linalg.solve(weighted @ observation + information, weighted)
             offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
+            if state.sources.names:
+                offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
             displacement = gain * offsets.repeat(_DIMENSIONS)
             self._last_displaced = period, displacement @ displacement.T
         return self._last_displaced[1]
@@ -2036,7 +2099,7 @@ class ExtendedKalmanFilter:
         return information
 
     def _estimate(self, state: _State) -> ModelEstimate:
-        _, told = self._handed_out(state)
+        q, _, told = self._handed_out(state)
         covariance = np.empty((2 * self._nv, 2 * self._nv))
         for row, rows in enumerate((self._tangent, self._velocities)):
             for column, columns in enumerate((self._tangent, self._velocities)):
@@ -2046,7 +2109,7 @@ class ExtendedKalmanFilter:
             state.stamp_ns,
             self._frame_id,
             self._body(),
-            state.q,
+            q,
             state.velocity,
             covariance,
             state.lengths,
@@ -2054,7 +2117,7 @@ class ExtendedKalmanFilter:
         )
 
     def _output(self, state: _State, skeleton: Skeleton) -> Skeleton:
-        lines, told = self._handed_out(state)
+        _, lines, told = self._handed_out(state)
         joints = self.model.joints
         observation = self._observation(lines)
         spread = observation @ told[: self._observed, : self._observed] @ observation.T

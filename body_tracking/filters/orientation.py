@@ -267,6 +267,11 @@ def advance(
     return share
 
 
+def about(axis: FloatArray) -> FloatArray:
+    """(7,) by how much a source's numbers turn its segment about its own z axis, (3,) in world; to first order."""
+    return np.array([0.0, 0.0, 1.0, axis[2], *axis])
+
+
 def slipped(covariance: FloatArray, own: slice, parameters: OrientationParameters) -> FloatArray:
     """The covariance of all after a source (its ``own`` rows) has slipped, or was switched off and on."""
     covariance = covariance.copy()

@@ -354,9 +354,11 @@ class HeadingTracker:
 
 def _limits(parent: str, child: str) -> FloatArray:
     """(3, 2) radians: least and greatest turn of a child in its parent about y, x and z, one after the other."""
-    side = child.rpartition("_")[2]
-    kind = (parent.removesuffix(f"_{side}"), child.removesuffix(f"_{side}"))
-    if kind not in JOINTS or (side in ("left", "right") and parent not in (f"{kind[0]}_{side}", kind[0])):
+    name, _, side = child.rpartition("_")
+    if side not in ("left", "right"):
+        name, side = child, ""
+    kind = (parent.removesuffix(f"_{side}"), name)
+    if kind not in JOINTS or parent not in (kind[0], f"{kind[0]}_{side}"):
         raise AlignmentError(f"{parent} and {child}: no joint between them has a range")
     y, x, z = JOINTS[kind]
     if side == "right":  # the mirror image at the sagittal plane

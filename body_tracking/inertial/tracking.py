@@ -5,7 +5,9 @@ its alignment and heading by a pose, by elbows and by what a camera sees (``alig
 (``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``posture``).
 
 Clocks: everything comes out in the clock of the camera's skeletons, or in that of receipt where there is no camera. The
-times of receipt of both tell the offset to within what their transports differ by; motion tells that difference.
+times of receipt of both tell the offset to within what their transports differ by; motion tells that difference. Of the
+camera those of its own frames count, where these are heard: skeletons in ``world`` come later by what fusion takes,
+which is another time in every run.
 
 Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
 all headings drifts, and says so.
@@ -25,6 +27,7 @@ from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
     Pose,
+    StillPeriod,
     Stream,
     align_in_pose,
     mean_rotation,
@@ -253,6 +256,7 @@ class InertialTracker:
         self._magnetic = np.zeros(k, dtype=np.bool_)
         self._all_clocks = ReceiptClock()
         self._camera_clock = ReceiptClock()
+        self._frame_ns: int | None = None
         self._transports = {name: _Transports() for name in self.segments}
         self._pending: deque[Skeleton] = deque()
         self._seen: deque[Skeleton] = deque()
@@ -361,6 +365,23 @@ class InertialTracker:
             self._step(now, stamp_ns)
         return Told(self._orientation(sensor, felt, stamp_ns), self._body(stamp_ns))
 
+    def hear(self, stamp_ns: int, received_ns: int) -> None:
+        """Note when a frame of the camera whose clock is that of ``world`` was received.
+
+        Args:
+            stamp_ns: of the frame, whatever is in it.
+            received_ns: as above.
+        """
+        if not self.parameters.camera:
+            return
+        self._receive(received_ns)
+        before, self._frame_ns = self._frame_ns, stamp_ns
+        if before is None or stamp_ns <= before - _JUMP_NS:
+            self._camera_clock.reset()
+        known = self._camera_clock.delay_ns is not None
+        if not self._camera_clock.add(stamp_ns, received_ns) or not known:
+            self._rebase()
+
     def see(self, skeleton: Skeleton, received_ns: int) -> None:
         """Take a camera's skeleton in ``world``; left out with the parameter ``camera`` false.
 
@@ -371,14 +392,15 @@ class InertialTracker:
         if not self.parameters.camera:
             return
         self._receive(received_ns)
-        newest, first = self._newest_ns, self._camera_clock.delay_ns is None
+        newest, heard = self._newest_ns, self._frame_ns is not None
+        first = not heard and self._camera_clock.delay_ns is None
         if newest is not None and newest - _JUMP_NS < skeleton.stamp_ns <= newest:
             self.counters["camera's late frames"] += 1
             return
         jumped = newest is not None and skeleton.stamp_ns <= newest
-        if jumped:
+        if jumped and not heard:
             self._camera_clock.reset()
-        jumped |= not self._camera_clock.add(skeleton.stamp_ns, received_ns)
+        jumped |= not heard and not self._camera_clock.add(skeleton.stamp_ns, received_ns)
         if jumped:
             self.counters["camera's time jumped"] += 1
             self._pending.clear()
@@ -407,7 +429,7 @@ class InertialTracker:
 
     def _waits_for_camera(self, received_ns: int) -> bool:
         """Until its first skeleton nobody knows which clock and which world are meant."""
-        if not self.parameters.camera or self._camera_clock.delay_ns is not None:
+        if not self.parameters.camera or self._newest_ns is not None:
             return False
         assert self._first_ns is not None
         return received_ns - self._first_ns < _ALONE_S * NANOSECONDS
@@ -673,8 +695,19 @@ class InertialTracker:
             return
         if seen is None and not asked and not arms:
             return  # forearms alone do not tell a pose from hands on a table
-        self._align(name, listening, [stream.between(period.begin, period.end) for stream in streams], seen)
+        held = [stream.between(period.begin, period.end) for stream in streams]
+        facing = 0.0 if seen is None else self._faced(period)
+        if facing is not None:
+            self._align(name, listening, held, facing if seen is not None else None)
         self._asked_until = None
+
+    def _faced(self, period: StillPeriod) -> float | None:
+        """Radians from world's x, which way the person faced in a pose, as the camera saw it."""
+        assert self._epoch_ns is not None
+        begin, end = (self._epoch_ns + round(each * NANOSECONDS) for each in (period.begin, period.end))
+        found = [_facing(each) for each in self._seen if begin <= each.stamp_ns <= end]
+        turns = np.exp(1j * np.array([each for each in found if each is not None]))
+        return float(np.angle(turns.mean())) if len(turns) else None
 
     def _looks_like(self, skeleton: Skeleton, name: str) -> bool:
         """Whether a camera sees the arms in a pose, as far as it sees them."""
@@ -697,15 +730,22 @@ class InertialTracker:
         return True
 
     def _align(
-        self, name: str, listening: Sequence[tuple[int, WornSensor]], held: Sequence[Stream], seen: Skeleton | None
+        self, name: str, listening: Sequence[tuple[int, WornSensor]], held: Sequence[Stream], faced: float | None
     ) -> None:
-        """The sensors that were there are aligned by a pose; of others nothing changes."""
+        """The sensors that were there are aligned by a pose; of others nothing changes.
+
+        Args:
+            name: of the pose.
+            listening: the sensors.
+            held: what they felt meanwhile.
+            faced: which way a camera saw the person face, radians; None without one.
+        """
         numbers = [number for number, _ in listening]
         segments = [self.segments[number] for number in numbers]
         measured = np.array([mean_rotation(stream.rotations) for stream in held])
         posed = self._poses[name][[self._model.segment_names.index(each) for each in segments]]
         meant = self._meant[numbers]
-        if seen is None and len(segments) > 1:
+        if faced is None and len(segments) > 1:
             table = likelihood_by_pose(
                 segments, measured, posed, meant, common_heading=bool(self._magnetic[numbers].all())
             )
@@ -714,17 +754,21 @@ class InertialTracker:
                 self._exchange([sensor for _, sensor in listening], found.segments)
                 if self.parameters.swap_exchanged:
                     return  # aligned as what they are the next time
-        facing = 0.0 if seen is None else _facing(seen)
-        if facing is None:
-            return
+        facing = 0.0 if faced is None else faced
         spread = pose_covariance(self._model, _POSES[name], segments)
-        if seen is not None:
+        if faced is not None:
             up = (yaw(facing) @ posed)[:, 2].reshape(-1)
             spread = spread + _FACING**2 * np.outer(up, up)
         a = self.alignment
         places = [4 * number + 3 for number in numbers]
         own = a.covariance[np.ix_(places, places)]
-        known = seen is not None and float(own.diagonal().max()) < _FAR_HEADING**2
+        headings: FloatArray | None = None
+        if faced is not None and float(own.diagonal().max()) < _FAR_HEADING**2:
+            headings = a.headings[numbers]
+        elif all(sensor.has_field and not sensor.disturbed for _, sensor in listening):
+            # all face the same way, whichever that is
+            variances = [felt.covariance[2, 2] for _, sensor in listening if (felt := sensor.latest) is not None]
+            headings, own = np.zeros(len(numbers)), UNKNOWN_HEADING + np.diag(variances)
         found_alignment = align_in_pose(
             segments,
             measured,
@@ -732,16 +776,16 @@ class InertialTracker:
             spread,
             mountings=meant,
             mounting_stddev=self.parameters.mounting_stddev,
-            headings=a.headings[numbers] if known else None,
-            heading_covariance=own if known else None,
+            headings=headings,
+            heading_covariance=None if headings is None else own,
             facing=facing,
         )
-        rotations, headings, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
+        rotations, turns, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
         rows = np.concatenate([np.arange(4 * number, 4 * number + 4) for number in numbers])
-        rotations[numbers], headings[numbers] = found_alignment.rotations, found_alignment.headings
+        rotations[numbers], turns[numbers] = found_alignment.rotations, found_alignment.headings
         covariance[rows], covariance[:, rows] = 0.0, 0.0
         covariance[np.ix_(rows, rows)] = found_alignment.covariance
-        self._tracker = self._new_tracker(Alignment(a.segments, rotations, wrapped(headings), covariance))
+        self._tracker = self._new_tracker(Alignment(a.segments, rotations, wrapped(turns), covariance))
         self._detectors = {each: self._new_detectors(each) for each in self.segments}
         for each in segments:
             self._slips.pop(each, None)

@@ -21,12 +21,19 @@ from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.tracking import TrackingParameters
 from body_tracking.messages import orientation_to_message
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import RELIABLE, ROS, WORLD_FRAME, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of
 from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import Skeleton
 
-PARAMETERS = (*IMU_PARAMETERS, *(item for item in PEOPLE if item.name == "subject"), WORLD_FRAME, RELIABLE)
+PARAMETERS = (
+    *IMU_PARAMETERS,
+    *(item for item in PEOPLE if item.name == "subject"),
+    SENSORS,
+    REFERENCE,
+    WORLD_FRAME,
+    RELIABLE,
+)
 
 _READINGS = 64
 """Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
@@ -58,6 +65,10 @@ class ImuSkeletonNode(GraphNode):
             self.listen(topic, Imu, waiting, partial(self.on_imu, topic))
         self.wearer = HeldSubject(HOLD) if self.values["subject"] == ALL else SubjectSelector()
         self.listen_to_skeletons(graph.FUSED, self.on_skeletons)
+        given: dict[str, Any] = dict(self.values)
+        reference = given["reference"] or next(iter(given["sensors"]), "")
+        if reference:
+            self.listen_to_skeletons(graph.skeleton_topic(reference), self.on_frame)
         self.create_service(Trigger, graph.ALIGN_SERVICE, self.on_align)
 
     def on_imu(self, topic: str, message: Any, sent_ns: int) -> None:
@@ -78,6 +89,10 @@ class ImuSkeletonNode(GraphNode):
         wearer = self.wearer.pick(skeletons)
         if wearer is not None:
             self.stage.on_skeleton(wearer, self.now_ns())
+
+    def on_frame(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        """Note when the reference sensor's frames come."""
+        self.stage.on_frame(skeletons[0].stamp_ns, self.now_ns())
 
     def on_align(self, request: Any, response: Any) -> Any:
         """``imu_skeleton/align``."""

@@ -164,6 +164,7 @@ class Upstream:
             self.calibration.load(load(settings.calibration_file))
         self.fusion = PeopleFusion(settings.sensors, settings.fusion, settings.people, reference)
         self.imus = None if settings.imus is None else ImuStage(settings.imus)
+        self._reference = reference or settings.sensors[0]
         self._subjects = {sensor: SubjectSelector() for sensor in settings.sensors}
         self._last_ns: dict[str, int] = {}
         several = settings.people.subject == ALL
@@ -177,6 +178,8 @@ class Upstream:
     def push(self, sensor: str, skeletons: Sequence[Skeleton], log_time_ns: int) -> None:
         """One frame of one sensor, with all bodies in it."""
         stamp_ns = skeletons[0].stamp_ns
+        if self.imus is not None and sensor == self._reference:
+            self.imus.on_frame(stamp_ns, log_time_ns)
         if stamp_ns < self._last_ns.get(sensor, stamp_ns) - JUMP_BACK_NS:
             self._subjects[sensor].reset()
         self._last_ns[sensor] = stamp_ns

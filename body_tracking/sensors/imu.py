@@ -133,8 +133,9 @@ def _listed(values: FloatArray) -> str:
 _WINDOW_S: Final = 3.0
 _EVERY_S: Final = 0.5
 _LEAST_SAMPLES: Final = 30
-_LEAST_FORCE, _MOST_FORCE = 0.6 * STANDARD_GRAVITY, 1.7 * STANDARD_GRAVITY
-"""Bounds of the median specific force of seconds: a body that falls half the time, or a runner's."""
+_LEAST_FORCE, _MOST_FORCE = 0.6 * STANDARD_GRAVITY, 5.0 * STANDARD_GRAVITY
+"""Bounds of the median specific force of seconds: a body that falls half the time, and twice that of forearms that
+punch without a rest; the nearest wrong unit makes it 9.81 times too much."""
 _IN_G: Final = 0.15
 """How near to 1 g a median is, and how little half of the readings spread, that are in units of g."""
 _CALM: Final = 3.0

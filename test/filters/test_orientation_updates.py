@@ -325,6 +325,35 @@ def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, f
     assert sound.mean() > 0.97
 
 
+def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turned_about_itself() -> None:
+    q = MODEL.neutral()
+    q[MODEL.scalar_q[[NAMES[v].startswith("elbow") for v in MODEL.scalar_v]]] = np.radians(16.0)
+    posture = MODEL.forward(q, MODEL.default_lengths())
+    positions = np.full((25, 3), np.nan)
+    positions[MODEL.joints] = posture.positions
+    forearm = posture.rotations[SEGMENT_NUMBER["forearm_right"]]
+    estimator, tracked = ExtendedKalmanFilter(), np.full(25, 2, np.uint8)
+
+    def said() -> FloatArray:
+        sources = estimator._state.sources  # type: ignore[union-attr]
+        turn = so3.quat_to_matrix(so3.exp(np.array([[0.0, 0.0, sources.heading[0]], sources.slow[0]])))
+        return np.asarray(turn[0] @ turn[1] @ forearm @ sources.misalignment[0])
+
+    taught = np.zeros(3)
+    for k in range(30):
+        stamp_ns = START_NS + k * NANOSECONDS // 30
+        if k == 20:  # a Kinect v2 sees a hanging arm bent to where it is not
+            positions[Joint.ELBOW_RIGHT] += [0.05, -0.03, 0.0]
+        before = said() if k >= 20 else None
+        estimator.take(Skeleton(stamp_ns, "world", positions, tracked))
+        if before is not None:
+            taught += np.abs(so3.log(so3.matrix_to_quat(before.T @ said())))
+        estimator.take_orientation(
+            SegmentOrientation(stamp_ns + 5_000_000, "imu", "forearm_right", forearm, 0.03**2 * np.eye(3))
+        )
+    assert taught[2] < 0.2 * np.hypot(*taught[:2])
+
+
 def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
     observed = np.array([k for k, name in enumerate(NAMES) if name not in UNOBSERVED and k >= 6])
     p, normalised = EkfParameters(), []

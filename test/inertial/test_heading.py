@@ -150,6 +150,20 @@ def test_a_limit_pulls_back_only_what_is_beyond_it(seed: int) -> None:
     assert again is None or np.abs(again.residual).sum() < np.abs(found.residual).sum()
 
 
+@pytest.mark.parametrize("child", ["upper_trunk", "head", "clavicle_right"])
+def test_the_trunks_joints_have_ranges_too(child: str) -> None:
+    parent = "pelvis" if child == "upper_trunk" else "upper_trunk"
+    upright = Alignment((parent, child), np.tile(np.eye(3), (2, 1, 1)), np.zeros(2), 0.1 * np.eye(8))
+    tracker = HeadingTracker(upright)
+    assert tracker.observe_range(0.0, parent, child, (np.eye(3), np.eye(3))) is None
+    # turned half around against the other: what they share stays, what is between them shrinks
+    found = tracker.observe_range(1.0, parent, child, (np.eye(3), yaw(2.5)))
+    assert found is not None
+    assert abs(tracker.alignment.headings[1] - tracker.alignment.headings[0]) > 0.1
+    with pytest.raises(AlignmentError, match="no joint"):
+        tracker.observe_range(2.0, child, parent, (np.eye(3), np.eye(3)))
+
+
 def test_one_wild_skeleton_moves_nothing_much() -> None:
     wearer = Wearer(4, 20.0, np.radians(5.0))
     tracker = HeadingTracker(wearer.start)

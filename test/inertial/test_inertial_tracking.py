@@ -7,18 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worn_people import FOREARMS, Fed, feed, recorded, sensor
+from worn_people import FOREARMS, MODEL, Fed, feed, recorded, sensor
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.inertial.alignment import pose_rotations
 from body_tracking.inertial.mounting import mounting, mountings
 from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackingParameters
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample
 from body_tracking.simulation.imus import Slip, usual_mounting
 from body_tracking.simulation.scene import START_NS
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
 
@@ -146,6 +148,69 @@ def test_without_a_camera_a_pose_aligns_and_what_drifts_is_stated() -> None:
     assert stddev[-1] > stddev[10]
     assert fed.skeletons[-1].states[Joint.WRIST_LEFT] == TrackingState.TRACKED
     assert fed.skeletons[-1].states[Joint.HAND_LEFT] == TrackingState.INFERRED
+
+
+def held(
+    tracker: InertialTracker, fused_late_ns: int | None = None, *, heard: bool = False
+) -> list[SegmentOrientation]:
+    """What is told of three seconds of T-pose with sensors whose straps are turned by 8 degrees, and magnetometers."""
+    names = tracker.segments
+    posed = pose_rotations(MODEL, "t")[[SEGMENTS.index(name) for name in names]]
+    off = so3.quat_to_matrix(so3.exp(np.radians(8.0) * np.eye(3)[0]))
+    rotations = so3.matrix_to_quat(posed @ mountings(names).swapaxes(-1, -2) @ off)
+    rng = np.random.default_rng(0)
+    skeleton = Skeleton(0, "world", tposed(), np.full(25, TrackingState.TRACKED, np.uint8))
+    told, level, field = [], np.diag([1e-4, 1e-4, 1e-3]), np.array([2e-5, 0.0, -4e-5])
+    for k in range(150):
+        stamp_ns = (100 * NANOSECONDS) + k * NANOSECONDS // 50
+        for number, name in enumerate(names):
+            to_sensor = so3.quat_to_matrix(rotations[number]).T
+            force = to_sensor @ [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=3)
+            rate = 0.005 * rng.normal(size=3)
+            sample = ImuSample(stamp_ns, name, rotations[number], level, rate, force, to_sensor @ field)
+            orientation = tracker.add(name, sample, stamp_ns + 10_000_000).orientation
+            told += [] if orientation is None else [orientation]
+        if fused_late_ns is not None:
+            received_ns = stamp_ns + 15_000_000
+            if heard:
+                tracker.hear(stamp_ns + 5 * NANOSECONDS, received_ns)
+            tracker.see(replace(skeleton, stamp_ns=stamp_ns + 5 * NANOSECONDS), received_ns + fused_late_ns)
+    return told
+
+
+def tposed() -> FloatArray:
+    """(25, 3) metres, of somebody who looks along x."""
+    positions = np.full((25, 3), np.nan)
+    q = MODEL.neutral()
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        q[MODEL.quaternion_of(f"upper_arm_{side}")] = so3.exp(np.array([sign * 0.5 * np.pi, 0.0, 0.0]))
+    positions[MODEL.joints] = MODEL.forward(q, MODEL.default_lengths()).positions
+    return positions
+
+
+def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_turned() -> None:
+    tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
+    told = held(tracker)
+    assert tracker.aligned
+    assert told
+    headings = tracker.alignment.headings
+    assert np.abs(headings - headings[0]).max() < np.radians(1.5)
+    apart = tracker.alignment.covariance[3::4, 3::4]
+    assert apart[0, 0] + apart[1, 1] - 2.0 * apart[0, 1] < np.radians(10.0) ** 2
+
+
+def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_come() -> None:
+    parameters = TrackingParameters(clock="own")
+    told = [
+        held(InertialTracker(FOREARMS, parameters), late, heard=heard)
+        for late, heard in ((0, True), (30_000_000, True), (30_000_000, False))
+    ]
+    first, late, unheard = ([(each.stamp_ns, each.segment) for each in one] for one in told)
+    assert len(first) > 100
+    assert first == late
+    # a sensor's reading of the same instant, which came 5 ms sooner
+    assert (first[-1][0] - 5 * NANOSECONDS - 100 * NANOSECONDS) % (NANOSECONDS // 50) == 15_000_000
+    assert unheard[-1][0] == first[-1][0] - 30_000_000
 
 
 def test_a_pose_may_be_asked_for_again(wrists: Fed) -> None:

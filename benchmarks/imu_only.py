@@ -1,0 +1,348 @@
+"""Seven inertial sensors and no camera, for ten minutes: the angles of both arms, and what is stated of them.
+
+Chest, pelvis, head, both upper arms and both forearms (the back of the wrist) carry a sensor that errs like a
+consumer's (``simulation.imus``: raw data, noise, biases, scales, straps that are off by 5 degrees per axis, flesh that
+gives and follows the twist in part, a clock of its own each, lost packets, outages). A person takes a T-pose as people
+do, which aligns the sensors, and does one thing of the repertoire over and over. ``imu_skeleton``'s tracker makes
+orientations of the readings in the order of their receipt, and the filter ``ekf`` at its defaults angles of these.
+
+Eight angles, as many as OpenSenseRT judges (Slade et al., IEEE TBME 69 (2022) 664: 5.6 degrees): of both sides the
+rotation of the upper arm against the chest about the chest's three axes (as the model's errors are; Euler angles would
+divide by the sine of an angle that the T-pose makes zero), and the elbow's flexion. Pronation is told beside them. RMS
+errors in degrees from the end of the first pose on, of each sensor's own alignment nothing is told to anybody.
+
+  with magnetometers in a clean field: RMSE over the eight angles, bar 5.6 deg
+  without: error and stated standard deviation by the minute, and the share of the frames within 1.96 of the latter
+
+``--perfect-pose`` takes people without habits of their own; ``--ideal`` takes sensors that do not err but for
+how they are put on. What was changed of the library was chosen on seeds below 6000; the default takes others.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import multiprocessing
+import sys
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from body_tracking.filters.ekf import ExtendedKalmanFilter
+from body_tracking.inertial.alignment import rotation_vectors
+from body_tracking.inertial.tracking import InertialTracker, TrackingParameters
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.simulation.bags import draw_clock
+from body_tracking.simulation.imus import IDEAL, ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.simulation.layouts import around
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.repertoire import TPOSE_S
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, simulate
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+SEGMENTS = (
+    "pelvis",
+    "upper_trunk",
+    "head",
+    "upper_arm_left",
+    "forearm_left",
+    "upper_arm_right",
+    "forearm_right",
+)
+MOTIONS = ("reaching", "arm_raises", "punching", "hair_combing", "forearm_rolling", "squat")
+ANGLES = tuple(
+    f"{name}_{side}" for side in ("left", "right") for name in ("shoulder_x", "shoulder_y", "shoulder_z", "elbow")
+) + ("pronation_left", "pronation_right")
+EIGHT = 8
+_FIRST_SEED = 6000
+_EVERY_S = 0.1
+_NORMAL = 1.959964
+BAR, COVERED = 5.6, 0.9
+_TRUNK = MODEL.segment_names.index("upper_trunk")
+_ARMS = [MODEL.segment_names.index(f"upper_arm_{side}") for side in ("left", "right")]
+_ELBOWS, _PRONATIONS = (
+    [MODEL.coordinate_names.index(f"{name}_{side}") for side in ("left", "right")]
+    for name in ("elbow_flexion", "forearm_pronation")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Who does what, with which sensors."""
+
+    motion: str
+    seed: int
+    seconds: float
+    rate: float
+    magnetometer: bool
+    oriented: bool
+    perfect_pose: bool
+    ideal: bool
+
+    def recording(self) -> SimulatedRecording:
+        """Simulate it."""
+        imus = []
+        for number, segment in enumerate(SEGMENTS):
+            imu = SimulatedImu(
+                segment,
+                segment,
+                usual_mounting(segment),
+                self.rate,
+                oriented=self.oriented,
+                magnetometer=self.magnetometer,
+                clock=draw_clock(np.random.default_rng([self.seed, 7, number])),
+            )
+            imus.append(replace(imu, errors=replace(IDEAL, misalignment=5.0)) if self.ideal else imu)
+        setup = Setup(
+            self.motion,
+            around((0.0,)),
+            imus=tuple(imus),
+            seconds=self.seconds,
+            seed=self.seed,
+            standard=self.perfect_pose,
+        )
+        return simulate(setup)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Figures:
+    """Of one run.
+
+    Attributes:
+        times: (n,) seconds from the beginning.
+        error: (n, 10) radians, of ``ANGLES``.
+        stddev: (n, 10) radians, stated.
+            problems: what the tracker named, once each.
+        counters: of tracker and filter.
+        seconds: of computing.
+    """
+
+    times: FloatArray
+    error: FloatArray
+    stddev: FloatArray
+    problems: tuple[str, ...]
+    counters: dict[str, int]
+    seconds: float
+
+
+def readings(imu: SimulatedImu, said: ImuSamples) -> list[tuple[int, str, int]]:
+    """Receipt, segment, number of the sample."""
+    return [(int(received), imu.segment, k) for k, received in enumerate(said.received_ns.tolist())]
+
+
+def sample(imu: SimulatedImu, said: ImuSamples, k: int) -> ImuSample:
+    """One reading as the node would take it."""
+    return ImuSample(
+        int(said.stamps_ns[k]),
+        f"{imu.name}_link",
+        None if said.orientation is None else said.orientation[k],
+        None if said.orientation is None else said.orientation_covariance[k],
+        said.angular_velocity[k],
+        said.linear_acceleration[k],
+        None if said.magnetic_field is None else said.magnetic_field[k],
+    )
+
+
+def measure(run: Run) -> Figures:
+    """Simulate a run, and make angles of its readings."""
+    recording = run.recording()
+    worn = {imu.segment: (imu, said) for imu, said in recording.imus}
+    events = sorted(each for imu, said in recording.imus for each in readings(imu, said))
+    # ten orientations a second of each are what is judged; the skeleton of the node is not looked at
+    tracker = InertialTracker(SEGMENTS, TrackingParameters(camera=False, rate=1.0, orientation_rate=1.0 / _EVERY_S))
+    estimator = ExtendedKalmanFilter()
+    times, configurations, stddevs = [], [], []
+    named: dict[str, None] = {}
+    due = TPOSE_S
+    begin = time.process_time()
+    for received_ns, segment, k in events:
+        told = tracker.add(segment, sample(*worn[segment], k), received_ns)
+        if told.orientation is None:
+            continue
+        estimator.take_orientation(told.orientation)
+        now = (told.orientation.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS
+        if now < due:
+            continue
+        due += _EVERY_S
+        named.update(dict.fromkeys(tracker.problems(received_ns)))
+        estimate = estimator.estimate
+        if estimate is None or not tracker.aligned:
+            continue
+        times.append((estimate.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS)
+        configurations.append(estimate.q)
+        stddevs.append(np.sqrt(_variances(estimate.q, estimate.covariance)))
+    seconds = time.process_time() - begin
+    at, q = np.array(times), np.array(configurations)
+    return Figures(
+        at,
+        _errors(q, _true(recording, at)),
+        np.array(stddevs),
+        tuple(named),
+        dict(tracker.counters) | dict(estimator.counters),
+        seconds,
+    )
+
+
+def _variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(10,) rad2 of ``ANGLES``, by the covariance of the tangent and more."""
+    lines = MODEL.linearise(q, MODEL.default_lengths())
+    turning = lines.rotation_jacobian
+    to_chest = lines.posture.rotations[_TRUNK].T
+    rows = []
+    for side in range(2):
+        rows += list(to_chest @ (turning[_ARMS[side]] - turning[_TRUNK]))
+        rows.append(np.eye(MODEL.nv)[_ELBOWS[side]])
+    rows += list(np.eye(MODEL.nv)[_PRONATIONS])
+    jacobian = np.array(rows)
+    spread = covariance[: MODEL.nv, : MODEL.nv].copy()
+    spread[:3] = spread[:, :3] = 0.0  # where the base is, nobody knows, and no angle asks
+    result: FloatArray = np.einsum("ij,jk,ik->i", jacobian, spread, jacobian)
+    return result
+
+
+def _true(recording: SimulatedRecording, times: FloatArray) -> FloatArray:
+    """(n, 35) between the instants at which the truth is known."""
+    truth = recording.truths[0]
+    stamps = (truth.stamps_ns - START_NS) / NANOSECONDS
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    share = (times - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    return MODEL.integrate(truth.q[after - 1], share[:, None] * MODEL.difference(truth.q[after - 1], truth.q[after]))
+
+
+def _errors(q: FloatArray, true: FloatArray) -> FloatArray:
+    """(n, 10) radians, of ``ANGLES``."""
+    found, right = (MODEL.forward(each, MODEL.default_lengths()).rotations for each in (q, true))
+    scalars = MODEL.difference(true, q)
+    columns = []
+    for side in range(2):
+        arms = [each[:, _TRUNK].swapaxes(-1, -2) @ each[:, _ARMS[side]] for each in (found, right)]
+        columns += list(rotation_vectors(arms[0] @ arms[1].swapaxes(-1, -2)).T)
+        columns.append(scalars[:, _ELBOWS[side]])
+    columns += list(scalars[:, _PRONATIONS].T)
+    return np.stack(columns, axis=1)
+
+
+def rms(values: FloatArray) -> float:
+    """Degrees."""
+    return float(np.degrees(np.sqrt((values**2).mean())))
+
+
+def show(name: str, figures: list[Figures]) -> dict[str, float]:
+    """Print what some runs show."""
+    error = np.concatenate([each.error for each in figures])
+    stddev = np.concatenate([each.stddev for each in figures])
+    constant = np.concatenate([each.error.mean(axis=0, keepdims=True) for each in figures])
+    varying = np.concatenate([each.error - each.error.mean(axis=0) for each in figures])
+    inside = np.abs(error) < _NORMAL * stddev
+    eight = rms(error[:, :EIGHT])
+    print(
+        f"{name}: eight angles {eight:.2f} deg RMS (constant {rms(constant[:, :EIGHT]):.2f}, varying "
+        f"{rms(varying[:, :EIGHT]):.2f}), stated {rms(stddev[:, :EIGHT]):.2f}, covered "
+        f"{100.0 * inside[:, :EIGHT].mean():.0f} %; pronation {rms(error[:, EIGHT:]):.1f} deg, stated "
+        f"{rms(stddev[:, EIGHT:]):.1f}, covered {100.0 * inside[:, EIGHT:].mean():.0f} %; "
+        f"{sum(each.seconds for each in figures) / sum(float(np.ptp(each.times)) for each in figures):.2f} s of "
+        "computing per second"
+    )
+    return {"eight": eight, "covered": float(inside[:, :EIGHT].mean())}
+
+
+def by_angle(figures: list[Figures]) -> None:
+    """Print each angle."""
+    for kind in ("shoulder_x", "shoulder_y", "shoulder_z", "elbow", "pronation"):
+        columns = [place for place, name in enumerate(ANGLES) if name.startswith(kind)]
+        error = np.concatenate([each.error[:, columns] for each in figures])
+        stddev = np.concatenate([each.stddev[:, columns] for each in figures])
+        constant = np.concatenate([each.error[:, columns].mean(axis=0, keepdims=True) for each in figures])
+        covered = 100.0 * float((np.abs(error) < _NORMAL * stddev).mean())
+        print(
+            f"  {kind:11s} {rms(error):5.2f} deg RMS, constant {rms(constant):5.2f}, stated {rms(stddev):5.2f}, "
+            f"covered {covered:3.0f} %"
+        )
+
+
+def over_time(figures: list[Figures], seconds: float) -> None:
+    """Print error, deviation and coverage by the minute (or a tenth of what is shorter)."""
+    step = min(60.0, seconds / 10.0)
+    print("  from s   error deg   stated deg   covered")
+    for start in np.arange(0.0, seconds, step):
+        parts = [(each.times >= start) & (each.times < start + step) for each in figures]
+        if not any(part.any() for part in parts):
+            continue
+        error, stddev = (
+            np.concatenate([getattr(each, name)[part, :EIGHT] for each, part in zip(figures, parts, strict=True)])
+            for name in ("error", "stddev")
+        )
+        covered = 100.0 * float((np.abs(error) < _NORMAL * stddev).mean())
+        print(f"  {start:6.0f}   {rms(error):9.2f}   {rms(stddev):10.2f}   {covered:5.0f} %")
+
+
+def main() -> int:
+    """The benchmark: 1 where a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="people per motion, all different (default: 1)"
+    )
+    parser.add_argument("--first-seed", type=int, default=_FIRST_SEED, metavar="N", help=f"default: {_FIRST_SEED}")
+    parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: %(default)s")
+    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="of each (default: 600)")
+    parser.add_argument("--rate", type=float, default=50.0, metavar="HZ", help="of each sensor (default: 50)")
+    parser.add_argument("--only", choices=("with", "without"), help="only with, or without, magnetometers")
+    parser.add_argument("--oriented", action="store_true", help="drivers tell orientations instead of raw data")
+    parser.add_argument("--perfect-pose", action="store_true", help="people without habits of their own")
+    parser.add_argument("--ideal", action="store_true", help="sensors err only by how they are put on")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+    parser.add_argument("--raw", action="store_true", help="the figures of each run")
+    args = parser.parse_args()
+    kinds = [kind for kind in ("with", "without") if args.only in (None, kind)]
+    runs = [
+        Run(
+            motion,
+            args.first_seed + number,
+            args.seconds,
+            args.rate,
+            kind == "with",
+            args.oriented,
+            args.perfect_pose,
+            args.ideal,
+        )
+        for kind in kinds
+        for number, motion in enumerate(args.motions.split(",") * args.seeds)
+    ]
+    results: list[Figures] = []
+    begin = time.monotonic()
+    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
+        for number, result in enumerate(pool.imap(measure, runs), start=1):
+            results.append(result)
+            left = (time.monotonic() - begin) / number * (len(runs) - number)
+            print(f"\r{number} of {len(runs)} runs, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    verdicts: dict[str, bool] = {}
+    for kind in kinds:
+        own = [(run, each) for run, each in zip(runs, results, strict=True) if run.magnetometer == (kind == "with")]
+        if args.raw:
+            for run, each in own:
+                show(f"  {run.motion} {run.seed}", [each])
+                by_angle([each])
+                for line in each.problems:
+                    print(f"    named: {line}")
+                print(f"    {dict(sorted(each.counters.items()))}")
+        together = [each for _, each in own]
+        found = show(f"{kind} magnetometers, {len(own)} people, {args.seconds:g} s each", together)
+        by_angle(together)
+        over_time(together, args.seconds)
+        if kind == "with":
+            verdicts[f"with magnetometers {found['eight']:.2f} deg RMS, bar {BAR}"] = found["eight"] <= BAR
+        else:
+            text = f"without magnetometers {100.0 * found['covered']:.0f} % covered, bar {100.0 * COVERED:.0f} %"
+            verdicts[text] = found["covered"] >= COVERED
+    for text, met in verdicts.items():
+        print("met    " if met else "MISSED ", text)
+    return 0 if all(verdicts.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
