@@ -821,7 +821,8 @@ def _player(options: GraphOptions, sensors: Sequence[str], listeners: int, after
         "rate": options.rate,
         "topics": (*topics, *inertial),
         "wait_for_subscribers": (
-            *(f"{topic}:{listeners}" for topic in topics),
+            # the inertial sensors' node hears the reference, which is the first
+            *(f"{topic}:{listeners + int(bool(options.imus) and not place)}" for place, topic in enumerate(topics)),
             *(f"{topic}:1" for topic in inertial),
         ),
         "reliable": options.reliable,
