@@ -142,7 +142,7 @@ def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
         "fusion: {ros__parameters: {max_wait: 1.0}}\n"
         f"skeleton_filter: {{ros__parameters: {{filter: {filter_name}, predict_after: 1000.0, order_wait: 1.0}}}}\n"
     )
-    graph_up = up("--bag", BAG, "--record", tmp_path / "live", "--reliable", "--params-file", file)
+    graph_up = up("--bag", BAG, "--rate", "2", "--record", tmp_path / "live", "--reliable", "--params-file", file)
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
     assert graph_up.process.returncode == 0, graph_up.text()
     assert "frames of joint angles" in graph_up.text()

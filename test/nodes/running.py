@@ -88,8 +88,8 @@ class Running:
         self.processes[executable] = process
         return process
 
-    def play(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
-        """Let a ``bag_player`` that was started paused go on, once nodes have found who is to hear them.
+    def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
+        """Until nodes have found who is to hear them.
 
         Args:
             links: of nodes the number of subscribers of each topic.
@@ -105,6 +105,9 @@ class Running:
             ]
 
         assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)
+
+    def resume(self, timeout: float = 60.0) -> None:
+        """Let a ``bag_player`` that was started paused go on."""
         client = self.node.create_client(Trigger, "/bag_player/resume")
         assert client.wait_for_service(timeout)
         future = client.call_async(Trigger.Request())

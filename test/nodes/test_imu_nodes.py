@@ -71,9 +71,9 @@ class Wrists(Running):
             on_end="idle",
             start_paused=True,
         )
-        self.play(
+        self.wait_for_links(
             {
-                "bag_player": {graph.CLOCK_TOPIC: 5, "/kinect1/skeleton": 3, "/forearm_left/imu/mag": 1}
+                "bag_player": {graph.CLOCK_TOPIC: 5, "/kinect1/skeleton": 4, "/forearm_left/imu/mag": 1}
                 | dict.fromkeys(raw, 1),
                 "calibration": {graph.CALIBRATION: 2, graph.CALIBRATION_CLOCK: 2},
                 "fusion": {graph.FUSED: 1},
@@ -82,6 +82,7 @@ class Wrists(Running):
                 "joint_angles": {graph.joint_states_topic("body1"): 1},
             }
         )
+        self.resume()
 
     def truth(self) -> tuple[FloatArray, list[dict[str, float]]]:
         """Stamps in seconds, and the model's coordinates by name."""

@@ -158,11 +158,9 @@ def test_a_whole_number_serves_as_a_number(running: Graph) -> None:
 def test_the_fusion_drops_a_sensor_sooner_and_keeps_its_poses(running: Graph) -> None:
     assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated", 60.0)
     before = running.number("fusion", "silent")
-    uncalibrated = running.number("fusion", "uncalibrated")
     assert running.set("fusion", silence=0.02) == [(True, "")]
-    # of two sensors at 30 Hz the other's newest frame is often older than that
+    # of two sensors at 30 Hz the other's newest frame is often older than that; one without a pose is not counted
     assert running.until(lambda: running.number("fusion", "silent") > before + 30), running.diagnostics["fusion"]
-    assert running.number("fusion", "uncalibrated") <= uncalibrated + 5
     assert running.set("fusion", silence=0.1) == [(True, "")]
 
 
