@@ -41,13 +41,14 @@ def examine(args: argparse.Namespace, environment: Mapping[str, str]) -> Iterato
     if domain is not None:
         yield from hardware.ports(domain, local)
     yield _multicast(local)
-    progress = _progress(args.seconds + args.timeout) if sys.stderr.isatty() else None
-    seen = live.observe(environment, args.seconds, progress, args.timeout)
+    sensors = tuple(name for name in args.sensors.split(",") if name)
+    progress = _progress(args.seconds + args.timeout + live.LONGEST_WAIT) if sys.stderr.isatty() else None
+    seen = live.observe(environment, args.seconds, progress, args.timeout, sensors)
     if progress is not None:
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)
     yield live.discovery(seen, environment, local)
     if not isinstance(seen, str):
-        yield from live.sensors(seen, tuple(name for name in args.sensors.split(",") if name))
+        yield from live.sensors(seen, sensors)
         yield from live.nodes(seen)
     after = hardware.snapshot()
     yield from hardware.machine(before, after)
@@ -97,7 +98,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--bag", type=Path, metavar="BAG", help="look at this recording, too")
     parser.add_argument("--bag-only", action="store_true", help="look at the recording alone")
-    parser.add_argument("--sensors", default="", metavar="A,B", help="these must be publishing")
+    parser.add_argument("--sensors", default="", metavar="A,B", help="these must be publishing, or begin to soon")
     parser.add_argument(
         "--seconds", type=float, default=LISTEN, metavar="S", help="to listen to the graph (default %(default)g)"
     )

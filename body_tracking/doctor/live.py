@@ -22,6 +22,8 @@ Tick: TypeAlias = Callable[[float], None]
 
 START_TIMEOUT = 9.0
 """Seconds for a process to import ROS and make a node, besides the time for which it listens."""
+LONGEST_WAIT = 10.0
+"""Seconds for a sensor that was asked for to begin."""
 SLOW_RATE = 20.0
 """A Kinect has 30 Hz, and 15 Hz in the dark."""
 IMU_RATE = 50.0
@@ -107,7 +109,11 @@ def observation_from(text: str) -> Observation:
 
 
 def observe(
-    environment: Mapping[str, str], seconds: float, tick: Tick | None = None, start_timeout: float = START_TIMEOUT
+    environment: Mapping[str, str],
+    seconds: float,
+    tick: Tick | None = None,
+    start_timeout: float = START_TIMEOUT,
+    wanted: Sequence[str] = (),
 ) -> Observation | str:
     """Let two processes talk and one of them listen to everything; what was seen, or why that was not possible.
 
@@ -116,17 +122,19 @@ def observe(
         seconds: to listen.
         tick: called now and then with the seconds so far.
         start_timeout: seconds that the processes may take to start.
+        wanted: sensors that are waited for half as long, at most ``LONGEST_WAIT``, as they may just have been started.
     """
+    patience = min(0.5 * start_timeout, LONGEST_WAIT) if wanted else 0.0
     token = f"t{os.urandom(4).hex()}"
     command = [sys.executable, "-m", "body_tracking.nodes.doctor_probe"]
     with ExitStack() as stack:
         output = stack.enter_context(tempfile.TemporaryFile("w+"))
         errors = stack.enter_context(tempfile.TemporaryFile("w+"))
-        total = seconds + start_timeout
+        total = seconds + patience + start_timeout
 
-        def start(role: str, lasting: float, stdout: Any, stderr: Any) -> subprocess.Popen[bytes]:
+        def start(stdout: Any, stderr: Any, role: str, *arguments: object) -> subprocess.Popen[bytes]:
             process = subprocess.Popen(
-                [*command, role, token, str(lasting)],
+                [*command, role, token, *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=stdout,
                 stderr=stderr,
@@ -136,8 +144,9 @@ def observe(
             stack.callback(process.kill)
             return process
 
-        start("speak", total, subprocess.DEVNULL, subprocess.DEVNULL)
-        listener = start("listen", seconds, output, errors)
+        start(subprocess.DEVNULL, subprocess.DEVNULL, "speak", total)
+        topics = [graph.skeleton_topic(sensor) for sensor in wanted]
+        listener = start(output, errors, "listen", seconds, patience, *topics)
         began = time.monotonic()
         while listener.poll() is None and time.monotonic() - began < total:
             time.sleep(0.1)

@@ -1,7 +1,7 @@
 """The processes by which ``body_tracking doctor`` looks at ROS: one speaks, one listens and prints what it saw.
 
-``python -m body_tracking.nodes.doctor_probe speak TOKEN SECONDS`` and ``... listen TOKEN SECONDS``; the latter prints
-an :class:`~body_tracking.doctor.live.Observation` as JSON.
+``python -m body_tracking.nodes.doctor_probe speak TOKEN SECONDS`` and ``... listen TOKEN SECONDS PATIENCE TOPIC...``;
+the latter prints an :class:`~body_tracking.doctor.live.Observation` as JSON.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -13,7 +13,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -116,23 +116,36 @@ class Listener(Node):
         return to_nanoseconds(deserialize_message(cdr, Imu).header.stamp)
 
 
-def listen(token: str, seconds: float) -> None:
-    """Note for some seconds what is there, and print it."""
+def listen(token: str, seconds: float, patience: float, wanted: Sequence[str]) -> None:
+    """Note for some seconds what is there, and print it.
+
+    Args:
+        token: what the other process says.
+        seconds: how long.
+        patience: seconds to wait longer for what is wanted, which may just have been started.
+        wanted: topics.
+    """
     rclpy.init()
     node = Listener(token)
-    # deadline of our own: the clock of a bag does not matter here
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    # deadlines of our own: the clock of a bag does not matter here
+    began = time.monotonic()
+    end, last = began + seconds, began + seconds + patience
+    while (now := time.monotonic()) < end:
         rclpy.spin_once(node, timeout_sec=0.1)
+        if not all(topic in node.first for topic in wanted):
+            end = min(now + seconds, last)
     seen = Observation(get_rmw_implementation_identifier(), node.heard_after, node.streams, node.nodes)
     print(json.dumps(asdict(seen)), flush=True)
 
 
 def probe() -> None:
     """One of the two."""
-    role, token, seconds = sys.argv[1:4]
+    role, token, seconds, *more = sys.argv[1:]
     try:
-        (speak if role == "speak" else listen)(token, float(seconds))
+        if role == "speak":
+            speak(token, float(seconds))
+        else:
+            listen(token, float(seconds), float(more[0]), more[1:])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -81,6 +81,18 @@ def test_what_runs_is_seen_and_judged(playing: Running) -> None:
     assert level("nodes", "fusion: ") in (OK, WARNING)  # a busy machine loses messages
 
 
+def test_a_sensor_that_was_asked_for_and_is_about_to_begin_is_waited_for(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+
+        def begin(elapsed: float) -> None:
+            if elapsed > 3.0 and not running.processes:
+                running.start("kinect_skeleton", file=BAG, loop=True)
+
+        seen = live.observe(running.environment, 0.5, begin, PATIENCE, ("kinect1",))
+        assert not isinstance(seen, str), seen
+        assert next(iter(live.sensors(seen, ("kinect1",)))).level != PROBLEM
+
+
 def test_a_middleware_that_is_not_there_is_named() -> None:
     variables = {**environment(), "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
     seen = observe(variables)
