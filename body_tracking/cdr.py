@@ -152,10 +152,10 @@ def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
     Returns:
         The bodies; None where the message is anything else, right or wrong.
     """
-    if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
+    header = _read_header(cdr)
+    if header is None:
         return None
-    sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)
-    start = 16 + (length + 3 & ~3)
+    stamp_ns, frame_id, start = header
     for layout in _KNOWN:
         end = start + len(layout.table) + layout.size
         if end < len(cdr) <= end + 4 and layout.fits(cdr, start):  # behind it is_dense and, maybe, padding
@@ -164,11 +164,6 @@ def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
         return None
     points: NDArray[np.float32] = np.frombuffer(cdr, "<f4", layout.size // 4, end - layout.size)
     points = points.reshape(-1, N_JOINTS, layout.words)
-    try:
-        frame_id = cdr[16 : 15 + length].decode()
-    except UnicodeDecodeError:
-        return None
-    stamp_ns = sec * NANOSECONDS + nanosec
     skeletons: list[Skeleton] = []
     for value, label in zip(points.astype(np.float64), points.view("<u4")[:, :, 3].tolist(), strict=True):
         body = label[0] >> _BODY_BITS
@@ -324,6 +319,8 @@ def _read_header(cdr: bytes) -> tuple[int, str, int] | None:
     if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
         return None
     sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)
+    if cdr[15 + length : 16 + length] != b"\0":  # the end of the frame's name
+        return None
     try:
         frame_id = cdr[16 : 15 + length].decode()
     except UnicodeDecodeError:

@@ -104,6 +104,13 @@ def test_a_damaged_message_is_read_as_by_the_serialiser_or_left_to_it(
         assert_same(slow, fast[0])
 
 
+def test_a_name_without_its_end_is_left_to_others() -> None:
+    cdr = bytearray(encode_skeletons(skeletons(0, 10**9, "world", 1, 0)))
+    assert cdr[16:22] == b"world\0"
+    cdr[21] = 1
+    assert decode_skeletons(bytes(cdr)) is None
+
+
 @given(st.integers(0, 2**32), st.integers(0, 2), st.integers(1, 60))
 def test_a_message_that_is_cut_off_is_left_to_others(seed: int, kind: int, missing: int) -> None:
     cdr = encode_skeletons(skeletons(seed, 10**9, "world", 1, kind))
