@@ -46,6 +46,7 @@ from body_tracking.cdr import encode_skeletons
 from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.graph import GraphOptions, nodes_for
+from body_tracking.messages import statuses
 from body_tracking.parameters import SECTION, to_ros
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import frames_of, sensor_topics
@@ -260,11 +261,10 @@ class Ear:
         return come
 
     def _told(self, message: Any) -> None:
-        for status in message.status:
-            node = status.name.partition(":")[0]
-            self.values[node] = {item.key: item.value for item in status.values}
-            if status.level != b"\x00" and status.message.startswith("too slow"):
-                self.warnings[node] += 1
+        for status in statuses(message):
+            self.values[status.node] = dict(status.values)
+            if status.level and status.text.startswith("too slow"):
+                self.warnings[status.node] += 1
 
 
 def start(folder: Path, play: Play, filter_name: str, people: int) -> list[subprocess.Popen[bytes]]:

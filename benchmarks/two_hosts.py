@@ -47,7 +47,7 @@ from body_tracking.calibration.result import CalibrationResult, ClockModel, Sens
 from body_tracking.calibration.storage import save
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
-from body_tracking.messages import JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, to_nanoseconds
+from body_tracking.messages import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, statuses, to_nanoseconds
 from body_tracking.parameters import SECTION
 from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
@@ -417,8 +417,8 @@ def last_values(bag: Path) -> dict[str, dict[str, str]]:
     found = {}
     with BagReader(bag) as reader:
         for raw in reader.messages([graph.DIAGNOSTICS_TOPIC]):
-            for status in deserialize("diagnostic_msgs/msg/DiagnosticArray", raw.cdr).status:
-                found[status.name.partition(":")[0]] = {item.key: item.value for item in status.values}
+            for status in statuses(deserialize(DIAGNOSTICS, raw.cdr)):
+                found[status.node] = dict(status.values)
     return found
 
 

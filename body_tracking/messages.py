@@ -22,6 +22,7 @@ from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
+from body_tracking.node_status import NodeStatus
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample, check_magnetic_field
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
@@ -865,6 +866,20 @@ def diagnostics(
         values=[types.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()],
     )
     return types.make(DIAGNOSTICS, header=to_header(stamp_ns, "", types), status=[status])
+
+
+def statuses(message: Any, received: float = 0.0) -> tuple[NodeStatus, ...]:
+    """Those in a ``diagnostic_msgs/DiagnosticArray``, received at a steady time in seconds."""
+    return tuple(
+        NodeStatus(
+            each.name,
+            each.level[0] if isinstance(each.level, bytes) else int(each.level),
+            each.message,
+            {item.key: item.value for item in each.values},
+            received,
+        )
+        for each in message.status
+    )
 
 
 # --- markers

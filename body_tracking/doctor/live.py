@@ -10,12 +10,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from body_tracking import graph
 from body_tracking.doctor.finding import OK, PROBLEM, WARNING, Finding
 from body_tracking.messages import POINT_CLOUD
+from body_tracking.node_status import NodeStatus
 
 Tick: TypeAlias = Callable[[float], None]
 """Called now and then with the seconds so far."""
@@ -63,21 +64,6 @@ class Stream:
     def rate(self) -> float:
         """Hertz."""
         return (self.received - 1) / self.seconds if self.received > 1 and self.seconds > 0 else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class NodeStatus:
-    """The latest diagnostics of a node.
-
-    Attributes:
-        level: 0 OK, 1 warning, 2 error, 3 stale.
-        text: one line.
-        values: all else.
-    """
-
-    level: int
-    text: str
-    values: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

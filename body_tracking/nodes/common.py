@@ -358,7 +358,7 @@ class GraphNode(Node):
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
 
         def convert(cdr: bytes, sent_ns: int) -> None:
-            skeletons = decode_skeletons(cdr) or cloud_to_skeletons(_deserialized(cdr))
+            skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
                 self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
                 self.time_jumped_back(topic)
@@ -494,11 +494,16 @@ def _parameter_files() -> list[Path]:
     return [Path(sys.argv[i + 1]) for i, word in enumerate(sys.argv[:-1]) if word == "--params-file"]
 
 
-def _deserialized(cdr: bytes) -> Any:
+def deserialized(cdr: bytes, kind: type[Any]) -> Any:
+    """A message of CDR bytes.
+
+    Raises:
+        MessageError: they are no such message.
+    """
     try:
-        return deserialize_message(cdr, PointCloud2)
+        return deserialize_message(cdr, kind)
     except Exception as error:  # the client library's own kinds of errors, one per RMW
-        raise MessageError(f"{len(cdr)} bytes are no PointCloud2") from error
+        raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

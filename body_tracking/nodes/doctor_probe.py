@@ -30,9 +30,10 @@ from std_msgs.msg import Float64
 
 from body_tracking import graph
 from body_tracking.cdr import decode_skeletons
-from body_tracking.doctor.live import NodeStatus, Observation, Stream
+from body_tracking.doctor.live import Observation, Stream
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import IMU, POINT_CLOUD, cloud_to_skeletons, to_nanoseconds
+from body_tracking.messages import IMU, POINT_CLOUD, cloud_to_skeletons, statuses, to_nanoseconds
+from body_tracking.node_status import NodeStatus
 
 _LOOK_PERIOD_S = 0.3
 _QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -74,9 +75,7 @@ class Listener(Node):
             self.heard_after = time.time() - max(self.began, message.data)
 
     def on_diagnostics(self, message: Any) -> None:
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            self.nodes[status.name] = NodeStatus(status.level[0], status.message, values)
+        self.nodes |= {status.name: status for status in statuses(message)}
 
     def look(self) -> None:
         """Listen to every sensor that there is."""

@@ -9,7 +9,6 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import rclpy
@@ -22,21 +21,14 @@ from sensor_msgs.msg import JointState
 
 from body_tracking import graph
 from body_tracking.graph import GraphOptions
-from body_tracking.messages import to_nanoseconds
+from body_tracking.messages import statuses, to_nanoseconds
+from body_tracking.node_status import NodeStatus
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE
 
 _CHAIN = ("skeleton_filter", "joint_angles")
 _FRESH = 3.0
 """Seconds for which a node's diagnostics count."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Status:
-    level: int
-    text: str
-    values: dict[str, str]
-    received: float
 
 
 class GraphMonitor:
@@ -54,7 +46,7 @@ class GraphMonitor:
         self.angles = 0
         """How many angle messages have come."""
         self._angles_topics = [graph.joint_states_topic(body) for body in bodies]
-        self._statuses: dict[str, _Status] = {}
+        self._statuses: dict[str, NodeStatus] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("body_tracking_up", context=self._context)
@@ -80,10 +72,7 @@ class GraphMonitor:
             self._executor.spin()
 
     def _on_diagnostics(self, message: Any) -> None:
-        for status in message.status:
-            node = status.name.partition(":")[0]
-            values = {item.key: item.value for item in status.values}
-            self._statuses[node] = _Status(status.level[0], status.message, values, time.monotonic())
+        self._statuses |= {status.node: status for status in statuses(message, time.monotonic())}
 
     def _on_angles(self, message: Any) -> None:
         self.angles += 1
@@ -119,7 +108,7 @@ class GraphMonitor:
             parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
         return " | ".join(parts)
 
-    def _rates(self, options: GraphOptions, fresh: Mapping[str, _Status]) -> str:
+    def _rates(self, options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
         def rate(node: str, key: str) -> str:
             value = fresh[node].values.get(f"rate {key}") if node in fresh else None
             return f"{float(value):.0f}" if value is not None else "-"
@@ -132,7 +121,7 @@ class GraphMonitor:
         return f"{sensors}, fused {fused}, angles {angles} Hz"
 
     @staticmethod
-    def _delay(options: GraphOptions, fresh: Mapping[str, _Status]) -> str:
+    def _delay(options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
         """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
         by_sensor = graph.role_of(options).input == graph.SENSORS_INPUT
         chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)

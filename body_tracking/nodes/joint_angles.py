@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, JointState
 
@@ -21,8 +20,8 @@ from body_tracking.fusion.association import HOLD
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import AngleStream, state_estimate
-from body_tracking.messages import MessageError, image_to_covariance, joint_state_to_model
-from body_tracking.nodes.common import BODY, RELIABLE, GraphNode, run
+from body_tracking.messages import image_to_covariance, joint_state_to_model
+from body_tracking.nodes.common import BODY, RELIABLE, GraphNode, deserialized, run
 from body_tracking.parameters import Value
 from body_tracking.skeleton import Skeleton
 
@@ -93,7 +92,7 @@ class JointAnglesNode(GraphNode):
     def on_state(self, body: str, topic: str, cdr: bytes, sent_ns: int) -> None:
         """The coordinates of the model."""
         model = self.streams[body].model
-        state = decode_model_state(cdr, model) or joint_state_to_model(_deserialized(cdr, JointState), model)
+        state = decode_model_state(cdr, model) or joint_state_to_model(deserialized(cdr, JointState), model)
         if self.monitor.message_in(topic, state[0]):
             self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
             self.time_jumped_back(topic)
@@ -102,7 +101,7 @@ class JointAnglesNode(GraphNode):
     def on_covariance(self, body: str, cdr: bytes, sent_ns: int) -> None:
         """Their covariance."""
         model = self.streams[body].model
-        stamp_ns, covariance = decode_covariance(cdr, model) or image_to_covariance(_deserialized(cdr, Image), model)
+        stamp_ns, covariance = decode_covariance(cdr, model) or image_to_covariance(deserialized(cdr, Image), model)
         self.pair(body, stamp_ns, "covariance", covariance)
 
     def pair(self, body: str, stamp_ns: int, kind: str, value: Any) -> None:
@@ -141,13 +140,6 @@ class JointAnglesNode(GraphNode):
             fits.update(stream.fit.counters)
         convention = next(iter(self.streams.values())).convention
         return 0, f"{convention} angles of {self.source}", {f"fit {name}": count for name, count in fits.items()}
-
-
-def _deserialized(cdr: bytes, kind: type[Any]) -> Any:
-    try:
-        return deserialize_message(cdr, kind)
-    except Exception as error:  # the client library's own kinds of errors, one per RMW
-        raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error
 
 
 def main() -> None:

@@ -31,6 +31,7 @@ from body_tracking.messages import (
     command_to_array,
     command_to_trajectory,
     joint_states_to_angles,
+    statuses,
     to_nanoseconds,
     transform_to_pose,
 )
@@ -134,10 +135,9 @@ class RobotCommands(GraphNode):
 
     def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
         """How well the sensors are calibrated, if that is what it says."""
-        for status in message.status:
-            if status.name.startswith("calibration:"):
-                values = {item.key: item.value for item in status.values}
-                quality = CalibrationQuality.from_diagnostics(values, self.sensors)
+        for status in statuses(message):
+            if status.node == "calibration":
+                quality = CalibrationQuality.from_diagnostics(status.values, self.sensors)
                 self.follower.calibration.heard(quality, time.monotonic_ns())
 
     def on_robot(self, message: JointState, sent_ns: int) -> None:

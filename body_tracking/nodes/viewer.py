@@ -22,7 +22,6 @@ from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.client import Client
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2
 from std_srvs.srv import Trigger
 
@@ -38,17 +37,18 @@ from body_tracking.messages import (
     cloud_to_skeletons,
     joint_state_to_segments,
     joint_state_values,
+    statuses,
     transform_to_pose,
 )
+from body_tracking.node_status import NodeStatus
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import BODY, SENSORS, GraphNode, run
+from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run
 from body_tracking.parameters import Parameter
 from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import FloatArray, Skeleton
 from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.snapshot import PageError, Seen, Snapshot
-from body_tracking.viewing.status import NodeStatus
 
 PARAMETERS = (
     Parameter(
@@ -149,10 +149,7 @@ class ViewerNode(GraphNode):
 
     def on_diagnostics(self, message: Any, sent_ns: int) -> None:
         """What a node says of itself."""
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            name = status.name.partition(":")[0]
-            self.statuses[name] = NodeStatus(status.level[0], status.message, values, time.monotonic())
+        self.statuses |= {status.node: status for status in statuses(message, time.monotonic())}
 
     # --- drawing, in a thread of its own
 
@@ -202,7 +199,7 @@ class ViewerNode(GraphNode):
         if cdr and cdr is not self.read.get(topic):
             self.read[topic] = cdr
             try:
-                skeletons = decode_skeletons(cdr) or cloud_to_skeletons(_deserialized(cdr, PointCloud2))
+                skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             except BodyTrackingError as error:
                 self.malformed(topic, str(error))
             else:
@@ -217,7 +214,7 @@ class ViewerNode(GraphNode):
         if time.monotonic() - received > _STALE_S:
             return np.empty((0, 3)), np.empty((0, 4))
         try:
-            return joint_state_to_segments(_deserialized(cdr, MultiDOFJointState))[1:]
+            return joint_state_to_segments(deserialized(cdr, MultiDOFJointState))[1:]
         except MessageError as error:
             self.malformed(graph.segments_topic(self.body), str(error))
             return np.empty((0, 3)), np.empty((0, 4))
@@ -227,12 +224,12 @@ class ViewerNode(GraphNode):
         stddevs: dict[int, tuple[tuple[str, ...], FloatArray]] = {}
         try:
             while self.stddevs:
-                stamp_ns, names, values = joint_state_values(_deserialized(self.stddevs.popleft(), JointState))
+                stamp_ns, names, values = joint_state_values(deserialized(self.stddevs.popleft(), JointState))
                 stddevs[stamp_ns] = names, values
             newest = max(stddevs, default=0)
             # angles are sent before their deviations: those that are newer wait for the next time
             while self.angles:
-                stamp_ns, names, values = joint_state_values(_deserialized(self.angles[0], JointState))
+                stamp_ns, names, values = joint_state_values(deserialized(self.angles[0], JointState))
                 if stamp_ns > newest:
                     break
                 self.angles.popleft()
@@ -338,13 +335,6 @@ class ViewerNode(GraphNode):
         self.ended.set()
         self.thread.join(timeout=2.0)
         self.page.close()
-
-
-def _deserialized(cdr: bytes, kind: type[Any]) -> Any:
-    try:
-        return deserialize_message(cdr, kind)
-    except Exception as error:  # the client library's own kinds of errors, one per RMW
-        raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error
 
 
 def _is_loopback(host: str) -> bool:

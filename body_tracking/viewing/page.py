@@ -19,6 +19,7 @@ from viser import uplot
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
+from body_tracking.node_status import NodeStatus
 from body_tracking.skeleton import FloatArray, Skeleton
 from body_tracking.viewing.colours import (
     BODY,
@@ -45,7 +46,7 @@ from body_tracking.viewing.shapes import (
     tube,
 )
 from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
-from body_tracking.viewing.status import NodeStatus, table
+from body_tracking.viewing.status import table
 
 PLOTS: Final = 4
 """Angles that are plotted at a time."""

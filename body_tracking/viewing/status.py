@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from body_tracking.node_status import NodeStatus
 
 FRESH: Final = 3.0
 """Seconds for which what a node said of itself counts; it says so once a second."""
@@ -14,45 +15,20 @@ _COLOURS: Final = {0: "#2f9e44", 1: "#f08c00", 2: "#e03131"}
 _SILENT: Final = "#adb5bd"
 
 
-@dataclass(frozen=True, slots=True)
-class NodeStatus:
-    """The latest diagnostics of one node.
-
-    Attributes:
-        level: 0 OK, 1 warning, 2 error.
-        text: one line.
-        values: rates, counters.
-        received: steady time, seconds.
-    """
-
-    level: int
-    text: str
-    values: Mapping[str, str]
-    received: float
-
-    @property
-    def rate(self) -> str:
-        """Messages per second of the node's busiest output; empty where it has none."""
-        rates = [float(value) for name, value in self.values.items() if name.startswith("rate out ")]
-        return f"{max(rates):.0f} Hz" if rates else ""
-
-    @property
-    def delay(self) -> str:
-        """From the input's sending to the output, median."""
-        return _milliseconds(self.values.get("delay median ms"))
-
-    @property
-    def latency(self) -> str:
-        """From capture to the output, median."""
-        return _milliseconds(self.values.get("latency median ms"))
+def _rate(status: NodeStatus) -> str:
+    """Messages per second of the node's busiest output; empty where it has none."""
+    rates = [status.number(name) for name in status.values if name.startswith("rate out ")]
+    known = [rate for rate in rates if rate is not None]
+    return f"{max(known):.0f} Hz" if known else ""
 
 
-def _milliseconds(value: str | None) -> str:
-    return "" if value is None else f"{float(value):.1f} ms"
+def _milliseconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f} ms"
 
 
 def table(statuses: Mapping[str, NodeStatus], now: float) -> str:
-    """HTML: per node its state, its output's rate, delay and latency, and what it says; silent nodes are pale.
+    """HTML: per node its state, its output's rate, delay (from the input's sending), latency (from capture), the last
+    two in the median, and what it says; silent nodes are pale.
 
     Args:
         statuses: by node name.
@@ -62,11 +38,13 @@ def table(statuses: Mapping[str, NodeStatus], now: float) -> str:
     for name, status in sorted(statuses.items()):
         silent = now - status.received > FRESH
         colour = _SILENT if silent else _COLOURS.get(status.level, _COLOURS[2])
-        numbers = ("", "", "") if silent else (status.rate, status.delay, status.latency)
+        numbers = [_rate(status), *(_milliseconds(status.number(f"{what} median ms")) for what in ("delay", "latency"))]
         text = f"silent for {now - status.received:.0f} s" if silent else status.text
         rows.append(
             f"<tr><td style='color:{colour}'>&#9679;</td><td><b>{html.escape(name)}</b></td>"
-            + "".join(f"<td style='text-align:right;white-space:nowrap'>{number}</td>" for number in numbers)
+            + "".join(
+                f"<td style='text-align:right;white-space:nowrap'>{'' if silent else number}</td>" for number in numbers
+            )
             + "</tr><tr><td></td><td colspan='4' style='color:#868e96;padding-bottom:0.3em'>"
             + f"{html.escape(text)}</td></tr>"
         )

@@ -40,6 +40,7 @@ from body_tracking.graph import (
     skeleton_topic,
 )
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.messages import statuses
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
 
@@ -103,12 +104,11 @@ class Arm(Node):
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         """Why there are commands, or none."""
-        for status in message.status:
-            if status.name.startswith("bag_player:"):
-                values = {item.key: item.value for item in status.values}
-                self.played = float(values.get("position s", 0.0))
-            if status.name.startswith("robot_commands:") and status.message != self.reason:
-                self.reason = status.message
+        for status in statuses(message):
+            if status.node == "bag_player":
+                self.played = status.number("position s") or 0.0
+            if status.node == "robot_commands" and status.text != self.reason:
+                self.reason = status.text
                 print(f"robot_commands: {self.reason}")
 
     def go_to(self, position: FloatArray, seconds: float) -> None:

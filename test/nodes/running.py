@@ -18,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
+from body_tracking.messages import statuses
 from domains import domain
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -71,9 +72,8 @@ class Running:
         rclpy.try_shutdown(context=self.context)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            self.diagnostics[status.name.partition(":")[0]] = values | {"": status.message}
+        for status in statuses(message):
+            self.diagnostics[status.node] = {**status.values, "": status.text}
 
     def start(self, executable: str, **parameters: object) -> subprocess.Popen[bytes]:
         """Start a node; its output goes to a file."""

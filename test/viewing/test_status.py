@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from body_tracking.viewing.status import FRESH, NodeStatus, table
+from body_tracking.node_status import NodeStatus
+from body_tracking.viewing.status import FRESH, table
 
 VALUES = {"rate out /a": "29.9", "rate out /b": "1.0", "delay median ms": "1.53", "latency median ms": "22.4"}
 
 
 def test_a_row_has_rate_delay_and_latency() -> None:
-    text = table({"fusion": NodeStatus(0, "fine", VALUES, 100.0)}, 100.5)
+    text = table({"fusion": NodeStatus("fusion: stream", 0, "fine", VALUES, 100.0)}, 100.5)
     for part in ("fusion", "30 Hz", "1.5 ms", "22.4 ms", "fine"):
         assert part in text
 
 
 def test_a_silent_node_has_no_figures_any_more() -> None:
-    text = table({"fusion": NodeStatus(0, "fine", VALUES, 100.0)}, 101.0 + FRESH)
+    text = table({"fusion": NodeStatus("fusion: stream", 0, "fine", VALUES, 100.0)}, 101.0 + FRESH)
     assert "30 Hz" not in text and "fine" not in text
     assert "silent for 4 s" in text
 
 
 def test_a_node_without_output_has_empty_cells() -> None:
-    status = NodeStatus(0, "", {}, 0.0)
-    assert (status.rate, status.delay, status.latency) == ("", "", "")
+    text = table({"fusion": NodeStatus("fusion: stream", 0, "")}, 0.0)
+    assert "Hz" not in text
+    assert " ms" not in text
+
+
+def test_a_figure_that_is_none_is_left_out() -> None:
+    values = {"rate out /a": "fast", "rate out /b": "3.0", "delay median ms": "n/a"}
+    text = table({"other": NodeStatus("other: stream", 0, "", values)}, 0.0)
+    assert "3 Hz" in text
+    assert " ms" not in text
 
 
 def test_what_nodes_say_is_text() -> None:
-    text = table({"<b>x": NodeStatus(2, "<script>alert(1)</script>", {}, 0.0)}, 0.0)
+    text = table({"<b>x": NodeStatus("<b>x: y", 2, "<script>alert(1)</script>")}, 0.0)
     assert "<script>" not in text and "&lt;script&gt;" in text and "<b>x" not in text
