@@ -49,7 +49,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from body_tracking import graph
+from body_tracking import dds, graph
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.parameters import SECTION
@@ -92,6 +92,7 @@ class Ear:
     """Hears a reference sensor, the angles and the diagnostics."""
 
     def __init__(self, sensor: str) -> None:
+        dds.prepare()
         rclpy.init()
         self.node = rclpy.create_node("soak_bench")
         self.executor = SingleThreadedExecutor()

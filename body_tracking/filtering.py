@@ -210,7 +210,6 @@ class FilterStage:
         settings: which one.
         publish: takes a topic, a serialised message and its capture time.
         wanted: whether to make messages of a topic at all; always when None.
-        steady: the clock, nanoseconds, by which frames wait; when None, that of ``now_ns``, which may stand still.
         one_of_several: gets the filtered skeletons instead of ``publish``, of one of several people; frames are of this
             person alone then, and topics below the person's name.
 
@@ -230,7 +229,6 @@ class FilterStage:
         settings: FilterSettings,
         publish: Callable[[str, bytes, int], None],
         wanted: Callable[[str], bool] | None = None,
-        steady: Callable[[], int] | None = None,
         one_of_several: Callable[[Skeleton], None] | None = None,
     ) -> None:
         self._filter = make_filter(settings.filter_name, **settings.parameters)
@@ -242,7 +240,6 @@ class FilterStage:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
             if one_of_several is None:
                 self.people = People(settings.sensors, settings.people, self.alignment.reference)
-        self._steady = steady
         self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
@@ -328,7 +325,7 @@ class FilterStage:
         aligned = self._aligned(sensor, skeletons)
         if aligned is not None:
             self.poll(now_ns)
-            self._take(self._ordering.push(sensor, aligned, self._waiting_ns(now_ns)), now_ns)
+            self._take(self._ordering.push(sensor, aligned, now_ns), now_ns)
 
     def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """The same for one of several frames that are here: the next :meth:`poll` takes them together, in their order.
@@ -340,7 +337,7 @@ class FilterStage:
         """
         aligned = self._aligned(sensor, skeletons)
         if aligned is not None:
-            self._ordering.hold(sensor, aligned, self._waiting_ns(now_ns))
+            self._ordering.hold(sensor, aligned, now_ns)
 
     def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
         """The person in ``world``; None where the sensor is not calibrated, or shows nobody."""
@@ -352,10 +349,6 @@ class FilterStage:
         else:
             return None
         return None if self.alignment is None else self.alignment.push(sensor, subject)
-
-    def _waiting_ns(self, now_ns: int) -> int:
-        """The time in the clock by which frames wait."""
-        return now_ns if self._steady is None else self._steady()
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """The orientation of one segment, in ``world`` and in the reference's clock, as inertial sensors have it.
@@ -377,12 +370,10 @@ class FilterStage:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
         if self._model_filter is None:
             return
-        if self._steady is not None:
-            self._take(self._ordering.poll(self._steady()), now_ns)
-        else:
-            # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
-            while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
-                self._take(self._ordering.poll(deadline_ns), deadline_ns)
+        # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
+        while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
+            self._take(self._ordering.poll(deadline_ns), deadline_ns)
+        self._take(self._ordering.poll(now_ns), now_ns)
         # what waits is of a time that must not be told before
         while self.deadline_ns is None and (stamp_ns := self._prediction.due(now_ns)) is not None:
             predicted = self._model_filter.predict(stamp_ns)
@@ -475,10 +466,9 @@ class PeopleStage:
         settings: FilterSettings,
         publish: Callable[[str, bytes, int], None],
         wanted: Callable[[str], bool] | None = None,
-        steady: Callable[[], int] | None = None,
     ) -> None:
         ids = graph.bodies(settings.people.people)
-        self._stages = [FilterStage(replace(settings, body=body), publish, wanted, steady, self._told) for body in ids]
+        self._stages = [FilterStage(replace(settings, body=body), publish, wanted, self._told) for body in ids]
         first = self._stages[0]
         self.by_sensor, self.models = first.by_sensor, first.models
         self._ids = ids
@@ -612,8 +602,7 @@ def make_stage(
     settings: FilterSettings,
     publish: Callable[[str, bytes, int], None],
     wanted: Callable[[str], bool] | None = None,
-    steady: Callable[[], int] | None = None,
 ) -> FilterStage | PeopleStage:
     """The stage that the settings ask for; arguments and errors as of :class:`FilterStage`."""
     stage = PeopleStage if settings.people.subject == ALL else FilterStage
-    return stage(settings, publish, wanted, steady)
+    return stage(settings, publish, wanted)

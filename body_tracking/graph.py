@@ -494,6 +494,18 @@ EXECUTABLES: tuple[str, ...] = (
     "viewer",
 )
 
+FLOW: tuple[str, ...] = (
+    "bag_player",
+    "kinect_skeleton",
+    "skeleton_adapter",
+    "calibration",
+    "fusion",
+    "imu_skeleton",
+    "skeleton_filter",
+    "joint_angles",
+)
+"""Executables from source to angles: none needs what a later one says."""
+
 
 def parameters_of(executable: str) -> tuple[Parameter, ...]:
     """The parameters of an executable, from its own module, which needs ROS to import."""

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from body_tracking import graph
+from body_tracking import dds, graph
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
 from body_tracking.graph import GraphOptions, NodeSpec
@@ -67,46 +67,14 @@ START_DELAY = 5.0
 STOP_TIMEOUT = 8.0
 """Seconds for a node to end after it was asked to."""
 
-DRAIN_QUIET, DRAIN_TIMEOUT = 0.7, 5.0
-"""After the end of a bag: wait until no angles have come for so long, but no longer than that, seconds."""
+FINISH_TIMEOUT = 60.0
+"""After the end of a bag: seconds for a node to finish what it has been sent."""
 
 LINE_PERIOD = 5.0
 """Seconds between status lines where stdout is no terminal."""
 
 _ROS_LOG = re.compile(r"^(?:\x1b\[[0-9;]*m)?\[(DEBUG|INFO|WARN|ERROR|FATAL)\]")
 _FAST_DDS = re.compile(r"RTPS_|\[[A-Z_]+ (?:Error|Warning)\]")
-
-
-_LOOPBACK = """\
-<?xml version="1.0" encoding="UTF-8" ?>
-<dds xmlns="http://www.eprosima.com">
-  <profiles>
-    <transport_descriptors>
-      <transport_descriptor>
-        <transport_id>loopback</transport_id>
-        <type>UDPv4</type>
-        <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
-        <maxInitialPeersRange>64</maxInitialPeersRange>
-      </transport_descriptor>
-    </transport_descriptors>
-    <participant profile_name="body_tracking" is_default_profile="true">
-      <rtps>
-        <userTransports><transport_id>loopback</transport_id></userTransports>
-        <useBuiltinTransports>false</useBuiltinTransports>
-        <builtin>
-          <discovery_config>
-            <leaseDuration><sec>1</sec><nanosec>500000000</nanosec></leaseDuration>
-            <leaseAnnouncement><nanosec>300000000</nanosec></leaseAnnouncement>
-          </discovery_config>
-          <metatrafficUnicastLocatorList><locator/></metatrafficUnicastLocatorList>
-          <initialPeersList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></initialPeersList>
-        </builtin>
-      </rtps>
-    </participant>
-  </profiles>
-</dds>
-"""
-"""Fast DDS on this machine alone, as ``LOCALHOST`` has it, but without shared memory and with a short lease."""
 
 
 class UpError(BodyTrackingError):
@@ -335,7 +303,7 @@ class Supervisor:
                 self._look_after(monitor)
                 self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
                 if any(child.done for child in self.children):
-                    self._drain(monitor)
+                    self._finish()
                     break
         finally:
             self._stop_all()
@@ -440,14 +408,23 @@ class Supervisor:
 
     # --- ending
 
-    def _drain(self, monitor: GraphMonitor) -> None:
-        """The bag has ended: let the last messages through."""
-        end = time.monotonic() + DRAIN_TIMEOUT
-        begin = time.monotonic()
-        while time.monotonic() < end and not self.stopping.is_set():
-            if time.monotonic() - max(begin, monitor.last_angles) > DRAIN_QUIET:
-                return
-            time.sleep(0.05)
+    def _finish(self) -> None:
+        """The recording is played: end the nodes from source to angles, each of which finishes what it was sent.
+
+        However far one lags behind, what was played comes out.
+        """
+        for executable in graph.FLOW:
+            running = [child for child in self.children if child.spec.executable == executable and child.process]
+            for child in running:
+                assert child.process is not None
+                child.process.send_signal(signal.SIGINT)
+            end = time.monotonic() + FINISH_TIMEOUT
+            while any(child.process is not None and child.process.poll() is None for child in running):
+                if self.stopping.wait(0.02):
+                    return
+                if time.monotonic() > end:
+                    self.console.line(f"{executable} did not finish in {FINISH_TIMEOUT:g} s", error=True)
+                    break
 
     def _stop_all(self) -> None:
         self.stopping.set()
@@ -534,28 +511,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-def _stay_on_this_machine(folder: Path) -> None:
-    """Let this process and the nodes talk over the loopback interface, unless the user chose something else.
-
-    A node that was killed leaves shared memory behind that the others go on writing to, and stays known to them for 20
-    seconds; until they notice, up to 3 s, whoever takes its place hears nothing. So no shared memory here, and a short
-    lease. With the range ``LOCALHOST`` rmw_fastrtps insists on shared memory; the profile does the same without it.
-    """
-    chosen = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
-    if chosen is None and "ROS_LOCALHOST_ONLY" not in os.environ:
-        chosen = os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    profiles = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-    others = (*profiles, "FASTDDS_BUILTIN_TRANSPORTS", "ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
-    fast_dds = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") == "rmw_fastrtps_cpp"
-    if chosen != "LOCALHOST" or not fast_dds or any(name in os.environ for name in others):
-        return
-    file = folder / "loopback.xml"
-    file.write_text(_LOOPBACK, encoding="utf-8")
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SUBNET"  # of the loopback interface
-    for name in profiles:
-        os.environ[name] = str(file)
-
-
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
     options = options_for(args)
@@ -567,7 +522,8 @@ def run(args: argparse.Namespace) -> int:
     absent = graph.all_nodes_for(options)
     parameters_for(specs, args.params_file, absent=absent)  # what is wrong is said before a folder is made
     folder = _log_folder(args.log_dir)
-    _stay_on_this_machine(folder)
+    dds.stay_on_this_machine()
+    dds.prepare()
     defaults: dict[str, dict[str, Value]] = {
         # A calibration node that is started again goes on from here.
         "calibration": {"calibration_file": str(folder / "calibration.yaml")}

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from body_tracking import dds
+
 ROOT = Path(__file__).resolve().parent.parent
+dds.prepare()  # what tests send is sent again as soon as what nodes send
 PROCESSES = ("nodes", "test_cli.py", "test_docs.py", "test_package.py", "test_up.py")
 
 

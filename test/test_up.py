@@ -26,7 +26,6 @@ from body_tracking import cli, graph  # noqa: E402
 from body_tracking.calibration.result import CalibrationResult, SensorQuality  # noqa: E402
 from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.cdr import decode_skeletons  # noqa: E402
-from body_tracking.fusion.fusion import FusionParameters  # noqa: E402
 from body_tracking.fusion.people import PeopleParameters  # noqa: E402
 from body_tracking.fusion.subject import ALL  # noqa: E402
 from body_tracking.graph import GraphOptions  # noqa: E402
@@ -135,25 +134,12 @@ def angles_in(path: Path, topic: str) -> dict[int, Any]:
 def test_a_shipped_recording_becomes_joint_angles_the_same_live_and_offline(
     up: Callable[..., Up], tmp_path: Path, filter_name: str
 ) -> None:
-    # How long to wait for a late frame, and for any before one is predicted, are the decisions by the wall clock; wait
-    # for as long as it takes.
-    file = tmp_path / "parameters.yaml"
-    file.write_text(
-        "fusion: {ros__parameters: {max_wait: 1.0}}\n"
-        f"skeleton_filter: {{ros__parameters: {{filter: {filter_name}, predict_after: 1000.0, order_wait: 1.0}}}}\n"
-    )
-    graph_up = up("--bag", BAG, "--rate", "2", "--record", tmp_path / "live", "--reliable", "--params-file", file)
-    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
+    arguments = ("--filter", filter_name, "--rate", "2", "--record", tmp_path / "live", "--reliable")
+    graph_up = up("--bag", BAG, *arguments)
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=120.0), graph_up.text()
     assert graph_up.process.returncode == 0, graph_up.text()
     assert "frames of joint angles" in graph_up.text()
-    settings = ReplaySettings(
-        ("kinect1", "kinect2"),
-        filter_name=filter_name,
-        predict_after=1000.0,
-        order_wait=1.0,
-        fusion=FusionParameters(max_wait=1.0),
-    )
-    replay(BAG, tmp_path / "offline", settings)
+    replay(BAG, tmp_path / "offline", ReplaySettings(("kinect1", "kinect2"), filter_name=filter_name))
     for topic in (ANGLES, STDDEVS):
         live, offline = angles_in(tmp_path / "live", topic), angles_in(tmp_path / "offline", topic)
         assert len(live) > 0.75 * reference_frames()
@@ -197,16 +183,13 @@ def two_people(folder: Path) -> tuple[Path, Path]:
 
 def test_two_people_have_angles_of_their_own_the_same_live_and_offline(up: Callable[..., Up], tmp_path: Path) -> None:
     bag, calibration = two_people(tmp_path)
-    file = tmp_path / "parameters.yaml"
-    file.write_text("fusion: {ros__parameters: {max_wait: 1.0}}\n")
     shutil.copy(calibration, tmp_path / "live.yaml")  # the node writes what it finds out
     arguments = ("--bag", bag, "--record", tmp_path / "live", "--reliable", "--calibration", tmp_path / "live.yaml")
-    graph_up = up(*arguments, "--params-file", file, "--subject", "all", "--people", "3")
+    graph_up = up(*arguments, "--subject", "all", "--people", "3")
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=120.0), graph_up.text()
     assert graph_up.process.returncode == 0, graph_up.text()
     settings = ReplaySettings(
         ("kinect1", "kinect2"),
-        fusion=FusionParameters(max_wait=1.0),
         calibration_file=calibration,
         people=PeopleParameters(ALL, 3),
     )

@@ -76,7 +76,6 @@ class BagRecorder(GraphNode):
     def start(self) -> None:
         """Open the bag and look for topics."""
         given: dict[str, Any] = dict(self.values)
-        self.simulated_time = bool(self.get_parameter("use_sim_time").value)
         self.writer: BagWriter | None = None
         self.inputs: dict[str, tuple[Qos, Any]] = {}
         self.refused: dict[str, str] = {}
@@ -199,7 +198,7 @@ class BagRecorder(GraphNode):
 
     def receive(self, topic: str, cdr: bytes, info: dict[str, int]) -> None:
         """Write a message, with the time of its receipt."""
-        if not self.simulated_time:
+        if not self.simulated:
             received_ns = info["received_timestamp"] or time.time_ns()
             self.write(topic, cdr, received_ns, info["source_timestamp"] or received_ns)
         elif self.now_ns() == 0:

@@ -104,7 +104,7 @@ class CalibrationNode(GraphNode):
         subject = self.subjects[sensor].pick(skeletons)
         if subject is None:
             return
-        for update in self.calibration.push(sensor, subject, self.now_ns()):
+        for update in self.calibration.push(sensor, subject, self.arrived_ns):
             self.publish(update)
             self.unsaved = True
         events = self.calibration.events

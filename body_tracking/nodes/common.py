@@ -26,6 +26,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -36,13 +37,14 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
 
-from body_tracking import graph
+from body_tracking import dds, graph
 from body_tracking.backlog import Backlog, Sequences
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics
+from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics, to_nanoseconds
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.executor import LeanExecutor
 from body_tracking.parameters import (
@@ -58,6 +60,7 @@ from body_tracking.parameters import (
     unknown_parameter,
 )
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 RCLError: type[Exception] = _rclpy.RCLError
@@ -66,8 +69,11 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _FRAMES_KEPT = 16
 """Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
 that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
-_ALARM_NS = NANOSECONDS // 200, NANOSECONDS // 10
-"""For at least so long, as simulated time may stand still, and at most, as it may run fast, a timer is set by it."""
+_TICKS = 1000
+"""Ticks of simulated time that may wait while a node is busy: each message is to be handled by the time at which it was
+sent."""
+_ACKNOWLEDGE_S = 2.0
+"""Seconds for those who listen to take a node's last messages."""
 
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
@@ -186,23 +192,24 @@ class Monitor:
 
 
 class Alarm:
-    """Calls once when a time has come.
+    """Calls once when a time has come, by :meth:`GraphNode.waiting_ns`.
 
     To set a timer wakes the node up and costs more than to let it go off in vain: one that goes off earlier than it is
-    needed is left as it is, and set anew then.
+    needed is left as it is, and set anew then. Simulated time needs no timer: it goes on with its ticks.
 
     Args:
         node: whose.
         ring: what is called.
-        now: nanoseconds, in the clock of the times that are given; None for ``time.monotonic_ns``.
+        simulated: whether time is simulated.
     """
 
-    def __init__(self, node: Node, ring: Callable[[], None], now: Callable[[], int] | None = None) -> None:
-        self._ring, self._now, self._steady = ring, now or time.monotonic_ns, now is None
+    def __init__(self, node: GraphNode, ring: Callable[[], None], *, simulated: bool) -> None:
+        self._ring, self._now = ring, node.waiting_ns
         self._wanted_ns: int | None = None
         self._set_ns: int | None = None
-        self._timer = node.create_timer(1.0, self._on_timer, clock=STEADY)
-        self._timer.cancel()
+        self._timer = None if simulated else node.create_timer(1.0, self._on_timer, clock=STEADY)
+        if self._timer is not None:
+            self._timer.cancel()
 
     def at(self, time_ns: int | None) -> None:
         """Call at this time instead of any that was given before; None for not at all."""
@@ -210,18 +217,8 @@ class Alarm:
         if time_ns is not None and (self._set_ns is None or time_ns < self._set_ns):
             self._set(time_ns)
 
-    def _set(self, time_ns: int) -> None:
-        self._set_ns = time_ns
-        remaining_ns = max(1, time_ns - self._now())
-        if not self._steady:
-            least, most = _ALARM_NS
-            remaining_ns = min(max(least, remaining_ns), most)
-        self._timer.timer_period_ns = remaining_ns
-        self._timer.reset()
-
-    def _on_timer(self) -> None:
-        self._timer.cancel()
-        self._set_ns = None
+    def look(self) -> None:
+        """Whether it is time."""
         wanted_ns = self._wanted_ns
         if wanted_ns is None:
             return
@@ -230,6 +227,18 @@ class Alarm:
             return
         self._wanted_ns = None
         self._ring()
+
+    def _set(self, time_ns: int) -> None:
+        if self._timer is not None:
+            self._set_ns = time_ns
+            self._timer.timer_period_ns = max(1, time_ns - self._now())
+            self._timer.reset()
+
+    def _on_timer(self) -> None:
+        assert self._timer is not None
+        self._timer.cancel()
+        self._set_ns = None
+        self.look()
 
 
 class GraphNode(Node):
@@ -250,6 +259,16 @@ class GraphNode(Node):
         self._droppable: dict[Subscription, str] = {}
         self._told_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
+        self.simulated = bool(self.get_parameter("use_sim_time").value)
+        self._simulated_ns = 0
+        self._alarms: list[Alarm] = []
+        self.arrived_ns = 0
+        """ROS time at which the message in hand came; nanoseconds."""
+        self.arrived_waiting_ns = 0
+        """The same by :meth:`waiting_ns`."""
+        if self.simulated:
+            qos = to_profile(Qos(SENSOR_DATA.reliability, SENSOR_DATA.durability, _TICKS))
+            self.create_subscription(ClockMessage, graph.CLOCK_TOPIC, self._on_clock, qos)
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         self.configure(self.values)
         self.add_on_set_parameters_callback(self._on_set)
@@ -281,8 +300,11 @@ class GraphNode(Node):
         """Level, line and values that the node adds to its diagnostics."""
         return 0, "", {}
 
+    def finish(self) -> None:
+        """Publish what still waits for something that does not come, at the end."""
+
     def close(self) -> None:
-        """Finish what the node has in hand, at its end."""
+        """Finish what the node has in hand, at its end; also where there is no time for :meth:`finish`."""
 
     # --- parameters
 
@@ -318,6 +340,48 @@ class GraphNode(Node):
         self.values = MappingProxyType(values)
         return SetParametersResult(successful=True)
 
+    def hand_over(self) -> None:
+        """At the end: the last messages, and until those who listen reliably have them, or do not answer."""
+        self.finish()
+        end = time.monotonic() + _ACKNOWLEDGE_S
+        for publisher in self.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
+
+    # --- time
+
+    def now_ns(self) -> int:
+        """ROS time: the wall clock, or ``/clock`` with ``use_sim_time``: by its last tick that was sent before the
+        message in hand, however late that is handled.
+        """
+        return self._simulated_ns if self.simulated else int(self.get_clock().now().nanoseconds)
+
+    def waiting_ns(self) -> int:
+        """The clock by which a node waits: one that nobody sets, or ``/clock`` with ``use_sim_time``.
+
+        What a node makes of a recording then does not depend on how busy the machine is.
+        """
+        return self._simulated_ns if self.simulated else time.monotonic_ns()
+
+    def _arrived(self, info: Mapping[str, int]) -> None:
+        """Note when the message in hand came, which may be well before it is handled."""
+        if self.simulated:
+            self.arrived_ns = self.arrived_waiting_ns = self._simulated_ns
+            return
+        now_ns = time.time_ns()
+        self.arrived_ns = info["received_timestamp"] or now_ns  # not every RMW tells
+        self.arrived_waiting_ns = time.monotonic_ns() - max(0, now_ns - self.arrived_ns)
+
+    def _on_clock(self, clock: ClockMessage) -> None:
+        self._simulated_ns = to_nanoseconds(clock.clock)
+        for alarm in self._alarms:
+            alarm.look()
+
+    def make_alarm(self, ring: Callable[[], None]) -> Alarm:
+        """Something that rings by :meth:`waiting_ns`."""
+        alarm = Alarm(self, ring, simulated=self.simulated)
+        self._alarms.append(alarm)
+        return alarm
+
     # --- messages
 
     def skeleton_qos(self) -> QoSProfile:
@@ -344,6 +408,7 @@ class GraphNode(Node):
         def callback(message: Any, info: dict[str, int]) -> None:
             self.sequences.note(topic, info["publication_sequence_number"])
             self.monitor.arrived(topic)
+            self._arrived(info)
             try:
                 handle(message, info["source_timestamp"])
             except MessageError as error:
@@ -421,10 +486,6 @@ class GraphNode(Node):
         if now - self._logged.get(key, -period_s) >= period_s:
             self._logged[key] = now
             self.get_logger().warning(text)
-
-    def now_ns(self) -> int:
-        """ROS time: the wall clock, or ``/clock`` with ``use_sim_time``."""
-        return int(self.get_clock().now().nanoseconds)
 
     # --- diagnostics
 
@@ -527,7 +588,10 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 class _Ending:
-    """Waits for SIGINT and SIGTERM in a thread of its own, and then stops the executor.
+    """Waits for SIGINT and SIGTERM in a thread of its own, and then ends the executor.
+
+    SIGINT (Ctrl-C, the end of a recording in ``body_tracking up``) lets a node finish what it has been sent; SIGTERM,
+    or a second SIGINT, does not.
 
     rclpy's own handler shuts the context down at once, from another thread; the main thread may then be destroying the
     node, and the process crashes now and then. Here everything ends in its order, and a second Ctrl-C waits until a
@@ -536,7 +600,7 @@ class _Ending:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._asked = False
+        self._asked = 0
         self._executor: LeanExecutor | None = None
         # Python runs its handlers only between two steps of the main thread, which mostly waits below Python; the byte
         # that it writes for each signal comes through at once.
@@ -548,20 +612,29 @@ class _Ending:
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
-        while self._reader.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
-            pass
-        with self._lock:
-            self._asked = True
-            if self._executor is not None:
-                self._executor.stop()
+        while True:
+            number = self._reader.recv(1)[0]
+            if number not in (signal.SIGINT, signal.SIGTERM):
+                continue
+            with self._lock:
+                self._asked += 2 if number == signal.SIGTERM else 1
+                self._end()
 
     def watch(self, executor: LeanExecutor) -> LeanExecutor:
-        """Stop this executor; at once, if a signal has come already."""
+        """End this executor; at once, if a signal has come already."""
         with self._lock:
             self._executor = executor
-            if self._asked:
-                executor.stop()
+            self._end()
         return executor
+
+    @property
+    def in_order(self) -> bool:
+        """Whether there is time to finish."""
+        return self._asked < 2
+
+    def _end(self) -> None:
+        if self._executor is not None and self._asked:
+            (self._executor.finish if self.in_order else self._executor.stop)()
 
 
 def run(node_class: type[GraphNode]) -> None:
@@ -572,12 +645,15 @@ def run(node_class: type[GraphNode]) -> None:
     try:
         for file in _parameter_files():
             read_file(file)  # rcl's own complaint takes several lines
+        dds.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
         # What is there now stays: the collector need not look at it again while frames wait.
         gc.collect()
         gc.freeze()
         ending.watch(LeanExecutor(node)).spin()
+        if ending.in_order:
+            node.hand_over()
     except ExternalShutdownException:
         pass
     except BodyTrackingError as error:

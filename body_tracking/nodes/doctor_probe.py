@@ -28,7 +28,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Float64
 
-from body_tracking import graph
+from body_tracking import dds, graph
 from body_tracking.cdr import decode_skeletons
 from body_tracking.doctor.live import Observation, Stream
 from body_tracking.errors import BodyTrackingError
@@ -46,6 +46,7 @@ def topic_of(token: str) -> str:
 
 def speak(token: str, seconds: float) -> None:
     """Publish the wall time at which this node was there."""
+    dds.prepare()
     rclpy.init()
     node = rclpy.create_node(f"doctor_speaks_{token}")
     publisher = node.create_publisher(Float64, topic_of(token), QoSProfile(depth=1))
@@ -124,6 +125,7 @@ def listen(token: str, seconds: float, patience: float, wanted: Sequence[str]) -
         patience: seconds to wait longer for what is wanted, which may just have been started.
         wanted: topics.
     """
+    dds.prepare()
     rclpy.init()
     node = Listener(token)
     # deadlines of our own: the clock of a bag does not matter here

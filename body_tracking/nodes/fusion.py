@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -20,7 +19,7 @@ from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people_fusion import PeopleFusion
 from body_tracking.messages import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, Alarm, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.recording.qos import LATCHED, Qos
 from body_tracking.sensors import check_sensor_name
@@ -64,7 +63,7 @@ class FusionNode(GraphNode):
         self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose)
         for sensor in self.sensors:
             self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
-        self.alarm = Alarm(self, self.on_deadline)
+        self.due = self.make_alarm(self.on_deadline)
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""
@@ -78,17 +77,22 @@ class FusionNode(GraphNode):
         """Feed one frame and publish what follows from it."""
         if any(skeleton.valid.any() for skeleton in skeletons):
             self.last_sent_ns = sent_ns
-            self.publish(self.fusion.push(sensor, skeletons, time.monotonic_ns()))
+            self.publish(self.fusion.push(sensor, skeletons, self.arrived_waiting_ns))
 
     def on_deadline(self) -> None:
         """Nothing more to wait for."""
-        self.publish(self.fusion.poll(time.monotonic_ns()))
+        self.publish(self.fusion.poll(self.waiting_ns()))
 
     def publish(self, fused: list[tuple[Skeleton, ...]]) -> None:
         """Send the skeletons and set the timer for the next that cannot wait longer."""
         for skeletons in fused:
             self.send(self.output, encode_skeletons(skeletons), skeletons[0].stamp_ns, self.last_sent_ns)
-        self.alarm.at(self.fusion.deadline_ns)
+        self.due.at(self.fusion.deadline_ns)
+
+    def finish(self) -> None:
+        """What waits for a frame that does not come."""
+        while (deadline_ns := self.fusion.deadline_ns) is not None:
+            self.publish(self.fusion.poll(deadline_ns))
 
     def time_jumped_back(self, topic: str) -> None:
         """Start anew; poses and clocks stay."""

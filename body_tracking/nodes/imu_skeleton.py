@@ -73,7 +73,7 @@ class ImuSkeletonNode(GraphNode):
 
     def on_imu(self, topic: str, message: Any, sent_ns: int) -> None:
         """Feed one reading and publish what follows from it."""
-        told = self.stage.on_imu(topic, message, self.now_ns())
+        told = self.stage.on_imu(topic, message, self.arrived_ns)
         if told.orientation is not None:
             publisher = self.orientations[told.orientation.segment]
             self.send(publisher, orientation_to_message(told.orientation, ROS), told.orientation.stamp_ns, sent_ns)
@@ -88,11 +88,11 @@ class ImuSkeletonNode(GraphNode):
         """Note what cameras see of the one who wears the sensors: of several, who is nearest to the first camera."""
         wearer = self.wearer.pick(skeletons)
         if wearer is not None:
-            self.stage.on_skeleton(wearer, self.now_ns())
+            self.stage.on_skeleton(wearer, self.arrived_ns)
 
     def on_frame(self, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """Note when the reference sensor's frames come."""
-        self.stage.on_frame(skeletons[0].stamp_ns, self.now_ns())
+        self.stage.on_frame(skeletons[0].stamp_ns, self.arrived_ns)
 
     def on_align(self, request: Any, response: Any) -> Any:
         """``imu_skeleton/align``."""

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -53,7 +52,6 @@ from body_tracking.nodes.common import (
     ROS,
     SENSORS,
     WORLD_FRAME,
-    Alarm,
     GraphNode,
     run,
 )
@@ -114,7 +112,7 @@ class SkeletonFilterNode(GraphNode):
             given["order_wait"],
             people_from(values),
         )
-        before, stage = self.stage, make_stage(settings, self.publish, self.wanted, time.monotonic_ns)
+        before, stage = self.stage, make_stage(settings, self.publish, self.wanted)
         if before is not None:
             stage.inherit(before)
         self.stage = stage
@@ -130,8 +128,7 @@ class SkeletonFilterNode(GraphNode):
         self.tracked: tuple[str, ...] = ()
         self.advertise()
         self.connect(self.values)
-        self.waiting = Alarm(self, self.on_alarm)
-        self.silence = Alarm(self, self.on_alarm, self.now_ns)
+        self.due = self.make_alarm(self.on_alarm)
 
     def advertise(self) -> None:
         """Make the publishers that the filter needs, and that are not there yet."""
@@ -179,20 +176,21 @@ class SkeletonFilterNode(GraphNode):
         """Filter and publish."""
         assert self.stage is not None
         self.sent_ns = sent_ns
-        self.stage.on_fused(skeletons, self.now_ns())
+        self.stage.on_fused(skeletons, self.arrived_waiting_ns)
         self.set_alarms()
 
     def on_sensor(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
-        """Note, for when all that have come are there."""
+        """Note, for when all that have come are there; in a recording, each in its own time, as offline."""
         assert self.stage is not None
         self.sent_ns = sent_ns
-        self.stage.hold(sensor, skeletons, self.now_ns())
+        take = self.stage.on_sensor if self.simulated else self.stage.hold
+        take(sensor, skeletons, self.arrived_waiting_ns)
 
     def on_orientation(self, segment: str, message: Any, sent_ns: int) -> None:
         """How an inertial sensor has a segment; what it changes comes with the next frame."""
         assert self.stage is not None
         self.sent_ns = sent_ns
-        self.stage.on_orientation(message_to_orientation(message, segment), self.now_ns())
+        self.stage.on_orientation(message_to_orientation(message, segment), self.arrived_waiting_ns)
 
     def messages_taken(self) -> None:
         """Filter and publish what sensors have sent."""
@@ -205,7 +203,7 @@ class SkeletonFilterNode(GraphNode):
         """Publish what frames say that need wait no longer, or what is to be expected where none has come for long."""
         assert self.stage is not None
         try:
-            self.stage.poll(self.now_ns())
+            self.stage.poll(self.waiting_ns())
         except BodyTrackingError as error:
             self.malformed("a frame that waited", str(error), "refused")
         finally:
@@ -216,8 +214,8 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         if self.stage.tracked != self.tracked:
             self.tell_tracked()
-        self.waiting.at(self.stage.deadline_ns)
-        self.silence.at(self.stage.due_ns)
+        deadline_ns = self.stage.deadline_ns
+        self.due.at(self.stage.due_ns if deadline_ns is None else deadline_ns)
 
     def tell_tracked(self) -> None:
         """The ids of those who are tracked, for those who follow ROS4HRI (REP-155)."""
@@ -237,6 +235,12 @@ class SkeletonFilterNode(GraphNode):
             self.send(self.outputs[topic], cdr, stamp_ns, self.sent_ns)
         else:
             self.outputs[topic].publish(cdr)
+
+    def finish(self) -> None:
+        """What waits for an older frame that does not come."""
+        assert self.stage is not None
+        while (deadline_ns := self.stage.deadline_ns) is not None:
+            self.stage.poll(deadline_ns)
 
     def time_jumped_back(self, topic: str) -> None:
         """Start anew; of a sensor, the stage finds out by itself."""
