@@ -650,6 +650,8 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     states = {topic: 1 for each in models for topic in (each.state, each.covariance)}
     to_angles = {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else states
     after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
+    if options.record:
+        after |= {joint_states_stddev_topic(body): 1 for body in options.bodies or [DEFAULT_BODY]}
     if options.bag:
         # Calibration, fusion and, maybe, the filter, the robot's commands, the recorder and those who show.
         others = int(role.input == SENSORS_INPUT) + int(bool(options.robot)) + recorders + len(watchers)

@@ -58,7 +58,7 @@ SETTLED = 10.0
 IN_FLIGHT = 0.3
 """Angles that come sooner after the start of a node were on their way when its predecessor died, seconds."""
 
-LISTENERS_TIMEOUT = 10.0
+LISTENERS_TIMEOUT = 30.0
 """A source starts after this time even if somebody who should listen does not, seconds."""
 
 START_DELAY = 5.0
@@ -339,7 +339,10 @@ class Supervisor:
     def _may_start(self, child: Child, now: float, monitor: GraphMonitor) -> bool:
         """Whether everybody listens whom the node is to wait for; one who does not come holds nobody up forever."""
         assert child.due is not None
-        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(child.spec.after)
+        if not child.spec.after:
+            return True
+        others = [other.spec.name for other in self.children if not other.spec.after]
+        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(child.spec.after, others)
 
     def _start(self, child: Child) -> None:
         spec = child.spec

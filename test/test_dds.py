@@ -12,7 +12,7 @@ from body_tracking import dds
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 OTHERS = ("ROS_LOCALHOST_ONLY", "FASTDDS_BUILTIN_TRANSPORTS", "ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
-PERIOD = "{*}profiles/{*}data_writer/{*}times/{*}heartbeat_period/"
+PERIOD = "{*}profiles/{*}data_writer/{*}times/{*}heartbeatPeriod/"
 
 
 @pytest.fixture(autouse=True)

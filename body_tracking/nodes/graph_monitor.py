@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import rclpy
@@ -81,9 +81,22 @@ class GraphMonitor:
     def _on_clock(self, message: Any) -> None:
         self.clock_ns = to_nanoseconds(message.clock)
 
-    def listened_to(self, wanted: Mapping[str, int]) -> bool:
-        """Whether each of these topics has at least so many subscribers."""
-        return all(self._node.count_subscribers(topic) >= number for topic, number in wanted.items())
+    def listened_to(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
+        """Whether who publishes each of these topics says that it has found at least so many subscribers.
+
+        That we have found them does not mean that the publisher has.
+
+        Args:
+            wanted: topics and numbers; a topic that none of the nodes publishes is not waited for.
+            nodes: all that are to have said something.
+        """
+        statuses = [self._statuses.get(name) for name in nodes]
+        for topic, number in wanted.items():
+            key = f"subscribers {topic}"
+            found = [status.number(key) or 0.0 for status in statuses if status is not None and key in status.values]
+            if found and sum(found) < number:
+                return False
+        return None not in statuses
 
     # --- for people
 
