@@ -20,10 +20,8 @@ from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.tracking import TrackingParameters
 from body_tracking.messages import orientation_to_message
-from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of
-from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import Skeleton
 
 PARAMETERS = (
@@ -58,7 +56,8 @@ class ImuSkeletonNode(GraphNode):
             each.segment: self.create_publisher(Imu, graph.orientation_topic(each.segment), self.skeleton_qos())
             for each in self.stage.sensors
         }
-        waiting = to_profile(Qos(SENSOR_DATA.reliability, SENSOR_DATA.durability, _READINGS))
+        waiting = self.skeleton_qos()
+        waiting.depth = max(waiting.depth, _READINGS)
         for topic in self.stage.mag:
             self.listen(topic, MagneticField, waiting, partial(self.on_field, topic))
         for topic in self.stage.imu:
