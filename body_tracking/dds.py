@@ -30,9 +30,10 @@ def prepare() -> None:
 def stay_on_this_machine() -> None:
     """Let this process and those that it starts talk over the loopback interface, unless the user chose otherwise.
 
-    A node that was killed leaves shared memory behind that the others go on writing to, and stays known to them for 20
-    seconds; until they notice, up to 3 s, whoever takes its place hears nothing. So no shared memory here, and a short
-    lease. With the range ``LOCALHOST`` rmw_fastrtps insists on shared memory; the profile does the same without it.
+    A node that was killed leaves shared memory behind that the others go on writing to; until they notice, up to 3 s,
+    whoever takes its place hears nothing. So no shared memory here. With the range ``LOCALHOST`` rmw_fastrtps insists
+    on it; the profile does the same without. (A short lease would let the others forget the dead sooner, and also the
+    living, where the machine is busy: of these they may then never hear again.)
     """
     chosen = os.environ.get(_RANGE)
     if chosen is None and "ROS_LOCALHOST_ONLY" not in os.environ:

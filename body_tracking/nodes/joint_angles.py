@@ -27,8 +27,9 @@ from body_tracking.skeleton import Skeleton
 
 PARAMETERS = (BODY, *(item for item in PEOPLE if item.name in ("subject", "people")), *ANGLES, RELIABLE)
 
-_UNPAIRED = 32
-"""States and covariances that may wait for each other, of each person."""
+_UNPAIRED = 1000
+"""States and covariances that may wait for each other, of each person: as many as reliable topics keep, for what was
+lost and is sent again comes late."""
 
 
 class JointAnglesNode(GraphNode):

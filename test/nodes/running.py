@@ -14,10 +14,13 @@ from typing import Any, Self
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
+from body_tracking.graph import PARENT_VARIABLE
 from body_tracking.messages import statuses
 from domains import domain
 
@@ -31,6 +34,8 @@ def environment() -> dict[str, str]:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(domain()),
         "RCUTILS_COLORIZED_OUTPUT": "0",
+        # whatever happens to the tests, no node stays to be heard by others
+        PARENT_VARIABLE: str(os.getpid()),
     }
 
 
@@ -106,13 +111,33 @@ class Running:
 
         assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)
 
+    def call(self, kind: type[Any], name: str, request: Any, timeout: float = 60.0) -> Any:
+        """What a service answers; it may be asked several times.
+
+        One of a node that was killed is known for a while, and the first request may go to nobody else.
+        """
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(timeout), name
+        end = time.monotonic() + timeout
+        futures = []
+        while time.monotonic() < end:
+            futures.append(client.call_async(request))
+            self.until(lambda: any(future.done() for future in futures), 5.0)
+            for future in futures:
+                if future.done():
+                    self.node.destroy_client(client)
+                    return future.result()
+        raise AssertionError(f"{name} does not answer: {self.diagnostics}")
+
     def resume(self, timeout: float = 60.0) -> None:
         """Let a ``bag_player`` that was started paused go on."""
-        client = self.node.create_client(Trigger, "/bag_player/resume")
-        assert client.wait_for_service(timeout)
-        future = client.call_async(Trigger.Request())
-        assert self.until(future.done, timeout)
-        assert future.result().success
+        assert self.call(Trigger, "/bag_player/resume", Trigger.Request(), timeout).success
+
+    def set_parameter(self, node: str, name: str, value: ParameterValue) -> tuple[bool, str]:
+        """Whether a node takes it, and why not."""
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
+        (result,) = self.call(SetParameters, f"/{node}/set_parameters", request).results
+        return result.successful, result.reason
 
     def log(self, executable: str) -> str:
         """What a node printed so far."""

@@ -74,18 +74,15 @@ class Wrists(Running):
             on_end="idle",
             start_paused=True,
         )
-        self.wait_for_links(
-            {
-                "bag_player": {graph.CLOCK_TOPIC: 5, "/kinect1/skeleton": 4, "/forearm_left/imu/mag": 1}
-                | dict.fromkeys(raw, 1),
-                "calibration": {graph.CALIBRATION: 2, graph.CALIBRATION_CLOCK: 2},
-                "fusion": {graph.FUSED: 1},
-                "imu_skeleton": {graph.IMU_SKELETON: 1} | {graph.orientation_topic(segment): 2 for segment in FOREARMS},
-                "skeleton_filter": {graph.MODEL_STATE: 1, graph.MODEL_COVARIANCE: 1},
-                "joint_angles": {graph.joint_states_topic("body1"): 1},
-            }
-        )
-        self.resume()
+        self.links = {
+            "bag_player": {graph.CLOCK_TOPIC: 10, "/kinect1/skeleton": 4, "/forearm_left/imu/mag": 1}
+            | dict.fromkeys(raw, 1),
+            "calibration": {graph.CALIBRATION: 2, graph.CALIBRATION_CLOCK: 2},
+            "fusion": {graph.FUSED: 1},
+            "imu_skeleton": {graph.IMU_SKELETON: 1} | {graph.orientation_topic(segment): 2 for segment in FOREARMS},
+            "skeleton_filter": {graph.MODEL_STATE: 1, graph.MODEL_COVARIANCE: 1},
+            "joint_angles": {graph.joint_states_topic("body1"): 1},
+        }
 
     def truth(self) -> tuple[FloatArray, list[dict[str, float]]]:
         """Stamps in seconds, and the model's coordinates by name."""
@@ -101,6 +98,8 @@ class Wrists(Running):
 @pytest.fixture(scope="module")
 def wrists(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wrists]:
     with Wrists(tmp_path_factory.mktemp("wrists")) as running:
+        running.wait_for_links(running.links)
+        running.resume()
         stamps, _ = running.truth()
 
         def ended() -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,14 +40,6 @@ class Graph(Running):
             more = {"folder": folder / "first"} if name == "bag_recorder" else {}
             self.start(name, **parameters, **more)
         self.angles = self.collect(JointState, graph.joint_states_topic("body1"))
-
-    def call(self, kind: type[Any], name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, name)
-        assert client.wait_for_service(30.0), name
-        future = client.call_async(request)
-        assert self.until(future.done), name
-        self.node.destroy_client(client)
-        return future.result()
 
     def set(self, node: str, **values: object) -> list[tuple[bool, str]]:
         """Whether each is set, and why not."""

@@ -13,8 +13,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import TransformStamped  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rclpy.serialization import deserialize_message  # noqa: E402
 from running import RELIABLE, Running  # noqa: E402
@@ -247,7 +246,7 @@ def test_a_filter_that_was_killed_goes_on_with_the_calibration_of_before(trackin
 
     def back() -> bool:
         tracking.play(2)
-        return bool(tracking.angles)
+        return bool(tracking.angles and tracking.states and tracking.covariances)
 
     assert tracking.until(back)
 
@@ -295,32 +294,23 @@ def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tr
     assert tracking.until(lambda: tracking.angles)
 
 
-def set_parameter(tracking: Tracking, node: str, name: str, value: ParameterValue) -> tuple[bool, str]:
-    client = tracking.node.create_client(SetParameters, f"/{node}/set_parameters")
-    assert client.wait_for_service(10.0)
-    future = client.call_async(SetParameters.Request(parameters=[Parameter(name=name, value=value)]))
-    assert tracking.until(future.done)
-    result = future.result().results[0]
-    return result.successful, result.reason
-
-
 def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> None:
-    done, reason = set_parameter(
-        tracking, "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=0.0)
+    done, reason = tracking.set_parameter(
+        "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=0.0)
     )
     assert not done
     assert "ekf.velocity_time" in reason
-    assert set_parameter(tracking, "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=2.0))[0]
-    assert set_parameter(tracking, "joint_angles", "convention", ParameterValue(type=4, string_value="rep155"))[0]
+    assert tracking.set_parameter("skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=2.0))[0]
+    assert tracking.set_parameter("joint_angles", "convention", ParameterValue(type=4, string_value="rep155"))[0]
     tracking.cut_short()
     # With the poses that the filter had before: they do not come again.
     assert tracking.play_until(lambda: tracking.angles and "waist_body1" in tracking.angles[-1].name)
     # A linear filter takes what the fusion makes; nobody makes anything here.
     linear = ParameterValue(type=4, string_value="lkf_constant_velocity")
-    assert set_parameter(tracking, "skeleton_filter", "filter", linear)[0]
+    assert tracking.set_parameter("skeleton_filter", "filter", linear)[0]
     assert tracking.until(lambda: all(p.get_subscription_count() == 0 for p in tracking.publishers.values()))
     extended = ParameterValue(type=4, string_value="ekf")
-    assert set_parameter(tracking, "skeleton_filter", "filter", extended)[0]
+    assert tracking.set_parameter("skeleton_filter", "filter", extended)[0]
     assert tracking.until(tracking.heard)
     tracking.cut_short()
     assert tracking.play_until(lambda: tracking.angles)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import TransformStamped  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from running import RELIABLE, Running, environment, stop  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
@@ -263,15 +263,7 @@ def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Runni
 
 
 def test_the_filter_may_change_while_it_runs_but_not_to_nonsense(nodes: Running) -> None:
-    client = nodes.node.create_client(SetParameters, "/skeleton_filter/set_parameters")
-    assert client.wait_for_service(10.0)
-
-    def set_parameter(name: str, value: ParameterValue) -> tuple[bool, str]:
-        future = client.call_async(SetParameters.Request(parameters=[Parameter(name=name, value=value)]))
-        assert nodes.until(future.done)
-        result = future.result().results[0]
-        return result.successful, result.reason
-
+    set_parameter = partial(nodes.set_parameter, "skeleton_filter")
     assert set_parameter("filter", ParameterValue(type=4, string_value="lkf_zero_velocity"))[0]
     assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"][""].startswith("lkf_zero_velocity"))
     refused, reason = set_parameter("filter", ParameterValue(type=4, string_value="wishful"))
