@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -50,7 +49,6 @@ PARAMETERS = (
 
 _LOOK_NS = 20_000_000  # between two looks for subscribers
 _SETTLE_NS = 250_000_000  # after they are seen, for them to see us too
-_ACKNOWLEDGE_S = 2.0  # at the end, for reliable topics
 
 
 class BagPlayer(GraphNode):
@@ -182,8 +180,7 @@ class BagPlayer(GraphNode):
         self.phase = "at the end"
         self.alarm.cancel()
         self._report()
-        for publisher in self.offers.values():
-            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+        self.hand_over()
         if self.values["on_end"] == "exit":
             self.context.try_shutdown()
 

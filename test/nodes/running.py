@@ -34,8 +34,6 @@ def environment() -> dict[str, str]:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(domain()),
         "RCUTILS_COLORIZED_OUTPUT": "0",
-        # whatever happens to the tests, no node stays to be heard by others
-        PARENT_VARIABLE: str(os.getpid()),
     }
 
 
@@ -88,7 +86,8 @@ class Running:
                 [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=self.environment,
+                # whatever happens to the tests, no node stays to be heard by others
+                env={**self.environment, PARENT_VARIABLE: str(os.getpid())},
             )
         self.processes[executable] = process
         return process

@@ -111,6 +111,7 @@ class Tracking(Running):
 
         def one_more() -> object:
             self.play(1)
+            self.until(lambda: False, 0.03)  # there are no more than a recording has
             return condition()
 
         return self.until(one_more, 30.0)
@@ -313,4 +314,4 @@ def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> 
     assert tracking.set_parameter("skeleton_filter", "filter", extended)[0]
     assert tracking.until(tracking.heard)
     tracking.cut_short()
-    assert tracking.play_until(lambda: tracking.angles)
+    assert tracking.play_until(lambda: tracking.angles), (tracking.at, len(tracking.frames), tracking.diagnostics)
