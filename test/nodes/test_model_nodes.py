@@ -100,7 +100,9 @@ class Tracking(Running):
         return all(publisher.get_subscription_count() == 1 for publisher in self.publishers.values())
 
     def play(self, count: int) -> None:
-        """The next frames of the recording, faster than they were."""
+        """The next frames of the recording, faster than they were; after its end it begins anew."""
+        if self.at >= len(self.frames):
+            self.at = 0
         for topic, cdr, _ in self.frames[self.at : self.at + count]:
             self.publishers[topic].publish(cdr)
             self.executor.spin_once(timeout_sec=0.01)
