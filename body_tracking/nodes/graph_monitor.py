@@ -54,7 +54,8 @@ class GraphMonitor:
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
         for topic in self._angles_topics:
-            self._node.create_subscription(JointState, topic, self._on_angles, to_profile(RELIABLE))
+            # deep, so that all are counted though we are held up
+            self._node.create_subscription(JointState, topic, self._on_angles, to_profile(graph.RELIABLE_SKELETON))
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
         self._executor = SingleThreadedExecutor(context=self._context)
