@@ -190,3 +190,26 @@ def test_a_timer_that_is_set_anew_fires_once_each_time(node: rclpy.node.Node) ->
     assert len(fired) == 5
     rclpy.shutdown()
     spinning.thread.join(10.0)
+
+
+def test_what_was_sent_before_the_end_is_handled_and_what_comes_after_is_not(node: rclpy.node.Node) -> None:
+    handled: list[str] = []
+    publisher = node.create_publisher(String, "text", 100)
+
+    def handle(message: String) -> None:
+        handled.append(message.data)
+        time.sleep(0.02)
+        publisher.publish(String(data="later"))  # whoever keeps sending does not hold up the end
+
+    node.create_subscription(String, "text", handle, 100)
+    assert until(lambda: publisher.get_subscription_count() == 1)
+    executor = LeanExecutor(node)
+    for number in range(20):
+        publisher.publish(String(data=str(number)))
+    time.sleep(0.5)  # on their way
+    executor.finish()
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    thread.join(20.0)
+    assert not thread.is_alive()
+    assert handled == [str(number) for number in range(20)]
