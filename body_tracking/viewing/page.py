@@ -34,6 +34,7 @@ from body_tracking.viewing.colours import (
     sensor_colours,
 )
 from body_tracking.viewing.curves import AngleHistory, first_choice
+from body_tracking.viewing.same_origin import same_origin
 from body_tracking.viewing.shapes import (
     KINECT_VIEW,
     Mesh,
@@ -92,7 +93,7 @@ class Page:
         window: seconds that the plots show.
 
     Raises:
-        PageError: the address is not one of this machine.
+        PageError: the address is not one of this machine, or pages of other sites could not be kept out.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class Page:
         window: float,
     ) -> None:
         _check_address(host)
-        with redirect_stdout(StringIO()):  # it has much to say
+        with same_origin(), redirect_stdout(StringIO()):  # it has much to say
             self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
         self._controls = controls
         self._visible = {name: shown for name, (_, shown) in LAYERS.items()}
