@@ -17,7 +17,7 @@ from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import Posture
 from body_tracking.kinematics.upper_body import PARENTS
 from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu
+from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu, Surroundings
 from body_tracking.simulation.kinect import KinectErrors, Misreading, SimulatedKinect
 from body_tracking.simulation.layouts import Layout, layout
 from body_tracking.simulation.people import MODEL, Course, Person, joints
@@ -86,6 +86,7 @@ class Setup:
         errors: of the cameras.
         dark: no light: a Kinect takes 15 frames a second.
         places: where each stands at first; side by side where there is None.
+        surroundings: what inertial sensors feel of the place.
     """
 
     motion: str
@@ -99,6 +100,7 @@ class Setup:
     errors: KinectErrors = field(default_factory=KinectErrors)
     dark: bool = False
     places: tuple[Place, ...] | None = None
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
     def __post_init__(self) -> None:
         count = self.number if self.people is None else len(self.people)
@@ -244,7 +246,7 @@ def simulate(setup: Setup) -> SimulatedRecording:
         frames += sensor.deliver(times, _numbered(seen), START_NS, RECEIVED_FROM_NS, rng)
     frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
     imus = tuple(
-        (imu, _felt(imu, actors[0], duration, np.random.default_rng([setup.seed, name, 4, number])))
+        (imu, _felt(imu, actors[0], setup.surroundings, duration, np.random.default_rng([setup.seed, name, 4, number])))
         for number, imu in enumerate(setup.imus)
     )
     return SimulatedRecording(setup, duration, sensors, tuple(frames), truths, imus)
@@ -306,7 +308,9 @@ def _sensors(setup: Setup) -> tuple[SimulatedKinect, ...]:
     return tuple(sensors)
 
 
-def _felt(imu: SimulatedImu, actor: _Actor, duration: float, rng: np.random.Generator) -> ImuSamples:
+def _felt(
+    imu: SimulatedImu, actor: _Actor, surroundings: Surroundings, duration: float, rng: np.random.Generator
+) -> ImuSamples:
     """What an inertial sensor on somebody says."""
     segment = MODEL.segment_names.index(imu.segment)
     latest: list[tuple[FloatArray, Posture]] = []
@@ -331,5 +335,6 @@ def _felt(imu: SimulatedImu, actor: _Actor, duration: float, rng: np.random.Gene
         START_NS,
         rng,
         parent=None if parent < 0 else motion_of(parent),
+        surroundings=surroundings,
         received_from_ns=RECEIVED_FROM_NS,
     )
