@@ -142,8 +142,6 @@ _FAR, _CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
-_SUDDEN_TURN = 60.0
-"""rad/s2, the same of a segment."""
 _DRAWING = 3.0
 """Squared Mahalanobis distance that a point is taken for which has been rejected for long."""
 _MOST_GROWN = 100.0
@@ -477,6 +475,7 @@ class ExtendedKalmanFilter:
         self._group_sum[self._group, np.arange(self._nv)] = 1.0
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self._limb_points = self._limb_table()
+        self._quick = self._quick_table()
         self._slow_size = 3 * self._points + len(self._limbs)
         self._thumbs, self._by_thumbs = self._thumb_tables()
         # of the flat covariance the diagonals of its blocks: tangent, velocities, and between these
@@ -797,32 +796,33 @@ class ExtendedKalmanFilter:
         if not heard.all():
             state = self._forgotten(state, heard)
         number = state.sources.find(measurement.source)
+        known = number is not None
         if number is None:
             state = self._with_source(state, measurement)
             number = len(state.sources) - 1
         sources = state.sources
         own = slice(self._size + PER_SOURCE * number, self._size + PER_SOURCE * (number + 1))
-        drift = sources.drifted(number, measurement)
-        if drift > 0.0:
-            covariance = state.covariance.copy()
-            covariance[own.start + 3, own.start + 3] += drift
-            state = state.but(covariance=covariance)
+        restated = sources.restated(number, measurement, p)
+        if restated is not None:
+            sources, left, new = restated
+            errors = slice(own.start, own.start + len(left))
+            covariance, crosses = state.covariance.copy(), state.crosses.copy()
+            covariance[errors] *= left[:, None]
+            covariance[:, errors] *= left
+            covariance[errors, errors] += np.diag(new)
+            crosses[errors] *= left[:, None]
+            state = state.but(covariance=covariance, crosses=crosses, sources=sources)
 
         fade = math.exp(-since / _SLIP_TIME)
         lean, leaning = fade * sources.lean[number], fade * fade * float(sources.leaning[number])
         corrected, white = self._turned_by(state, measurement, number, own)
         distance = float(white @ white)
-        if distance > self._gate:
-            # a segment may set off faster than it is expected to
-            sudden = 0.5 * _SUDDEN_TURN * min(since, _SUDDEN_TIME) ** 2
-            _, eased = self._turned_by(state, measurement, number, own, sudden, once=True)
-            near = float(eased @ eased) < self._gate
-        else:
-            near = True
+        near = distance < self._gate
         lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
         leaning += 1.0
         fits = near and float(lean @ lean) < _SLIPPED * leaning
-        unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + min(since, p.slip_after)
+        passed = min(since, p.slip_after) if known else 0.0  # of a new one nothing has passed
+        unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + passed
         if unfit_for > p.slip_after:
             self.counters["slips"] += 1
             state = state.but(covariance=orientation.slipped(state.covariance, own, p))
@@ -849,9 +849,6 @@ class ExtendedKalmanFilter:
         measurement: SegmentOrientation,
         number: int,
         own: slice,
-        sudden: float = 0.0,
-        *,
-        once: bool = False,
     ) -> tuple[_State, FloatArray]:
         """The Kalman update by an orientation, linearised anew until it is close; and (3,) the normalised innovation.
 
@@ -860,8 +857,6 @@ class ExtendedKalmanFilter:
             measurement: the orientation.
             number: of its source.
             own: the rows of what is known of that.
-            sudden: radians that the segment may be ahead of what is expected.
-            once: only the innovation counts.
         """
         t, v = self._tangent, self._velocities
         ahead = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
@@ -887,12 +882,10 @@ class ExtendedKalmanFilter:
             if ahead > 0.0:
                 cross += by_tangent @ (ahead * state.covariance[v])
             s = (cross[:, t] + ahead * cross[:, v]) @ by_tangent.T + cross[:, own] @ by_source.T
-            s.reshape(-1)[::4] += self.parameters.orientation_noise**2 + sudden**2
+            s.reshape(-1)[::4] += self.parameters.orientation_noise**2
             whitening = _whitening(s)
             white = whitening @ innovation
             first = white if first is None else first
-            if once:
-                break
             gain = whitening @ cross
             before, correction = correction, white @ gain
             turned = float(np.abs(correction[3 : self._nv]).max())
@@ -901,8 +894,6 @@ class ExtendedKalmanFilter:
             step = correction[t] + ahead * (state.velocity + correction[v])
             q = self.model.integrate(state.q, step)
         assert first is not None
-        if once:
-            return state, first
         covariance = state.covariance - gain.T @ gain
         kalman = gain.T @ whitening
         if state.settled:
@@ -934,6 +925,11 @@ class ExtendedKalmanFilter:
         # what thumbs have said so far was said with too much confidence
         doubtful = self._by_thumbs[sources.segments[-1]]
         covariance[doubtful, doubtful] += self.ranges.stddev[doubtful - 6] ** 2
+        # so was all, as if a camera took joints to be elsewhere at other times, which from now on it is not taken to
+        if not state.sources.names and any(sensor.stated for sensor in state.sensors.values()):
+            known = slice(0, self._observed)
+            lines = self.model.linearise(state.q, state.lengths)
+            covariance[known, known] += self._displacement(state.but(sources=sources), lines, self._prior_information)
         # what was unobserved may be so no longer
         null = np.empty((0, self._nv))
         return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
@@ -1108,7 +1104,7 @@ class ExtendedKalmanFilter:
         turns = so3.quat_to_matrix(so3.exp(-step[self.model.ball_v]))
         t, v = self._tangent, self._velocities
         p = state.covariance.copy()
-        crosses = math.exp(-dt / self.parameters.slow_time) * state.crosses
+        crosses = math.exp(-dt / self._slow_time(state)) * state.crosses
         for part in (p, p.T, crosses):  # F P, then (F P) F^T, as rows and columns; and F C
             self._turned_back(part, turns)
             part[t] += reach * part[v]
@@ -1138,6 +1134,11 @@ class ExtendedKalmanFilter:
             fresh=False,
             sources=sources,
         )
+
+    def _slow_time(self, state: _State) -> float:
+        """Seconds for which slow errors of cameras persist."""
+        p = self.parameters
+        return p.slow_time_beside_orientations if state.sources.names else p.slow_time
 
     def _diagonals_of(self, size: int) -> IntArray:
         """(4, 32) where a flat covariance of this size has the diagonals of its blocks."""
@@ -1504,6 +1505,11 @@ class ExtendedKalmanFilter:
         ratio = np.minimum(moved * moved / (variance + 1e-30), _RATIO_BOUND) - 1.0
         lean = self._group_sum @ (share * ratio) / (self._group_sum @ share + 0.3)
         least, greatest = self._log_density_bounds
+        if state.sources.names:
+            least = least.copy()
+            quick = np.concatenate([self._quick[segment] for segment in state.sources.segments.tolist()])
+            least[self._group[quick]] = math.log(self.parameters.density_beside_orientations)
+            greatest = np.maximum(greatest, least)
         result: FloatArray = np.minimum(np.maximum(state.log_density + rate * lean, least), greatest)
         return result
 
@@ -1807,6 +1813,16 @@ class ExtendedKalmanFilter:
             groups[number] = keys.index(key)
         return groups, np.log(densities)
 
+    def _quick_table(self) -> list[IntArray]:
+        """(12,) of each segment the coordinates that turn it quickly: those of its limb, of the trunk all."""
+        found = []
+        for segment in self.model.segment_names:
+            side = segment.rsplit("_", 1)[-1]
+            turning = self.model.turned_by(segment)
+            own = [k for k in turning.tolist() if self.model.coordinate_names[k].endswith(f"_{side}")]
+            found.append(np.array(own or turning, dtype=np.intp))
+        return found
+
     def _limb_table(self) -> tuple[IntArray, IntArray, FloatArray]:
         """(4,) points at the start and (4,) at the end of each limb, and (19, 4) which points it carries."""
         point = {Joint(joint): number for number, joint in enumerate(self.model.joints)}
@@ -2071,23 +2087,27 @@ class ExtendedKalmanFilter:
         """
         period = state.stamp_ns // _SLOW_PERIOD_NS
         if self._last_displaced is None or self._last_displaced[0] != period:  # it changes slowly, as the pose does
-            weights = sum(
-                (1.0 / (sensor.white + sensor.slow[0] * self._base_variance) for sensor in state.sensors.values()),
-                np.zeros(self._points),
-            )
             information = self._prior_information
             if state.sources.names:
-                weights = np.where(self._thumbs[state.sources.segments].any(axis=0), 0.0, weights)
                 information = information + self._held(state, lines)
-            observation = self._observation(lines)
-            weighted = observation.T * weights.repeat(_DIMENSIONS)
-            gain = np.linalg.solve(weighted @ observation + information, weighted)
-            offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
-            if state.sources.names:
-                offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
-            displacement = gain * offsets.repeat(_DIMENSIONS)
-            self._last_displaced = period, displacement @ displacement.T
+            self._last_displaced = period, self._displacement(state, lines, information)
         return self._last_displaced[1]
+
+    def _displacement(self, state: _State, lines: Linearisation, information: FloatArray) -> FloatArray:
+        """The same, where (53, 53) information is what is known without any point."""
+        weights = sum(
+            (1.0 / (sensor.white + sensor.slow[0] * self._base_variance) for sensor in state.sensors.values()),
+            np.zeros(self._points),
+        )
+        offsets = self.parameters.offset_scale * np.sqrt(self._base_variance)
+        if state.sources.names:
+            weights = np.where(self._thumbs[state.sources.segments].any(axis=0), 0.0, weights)
+            offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
+        observation = self._observation(lines)
+        weighted = observation.T * weights.repeat(_DIMENSIONS)
+        gain = np.linalg.solve(weighted @ observation + information, weighted)
+        displacement = gain * offsets.repeat(_DIMENSIONS)
+        return displacement @ displacement.T
 
     def _held(self, state: _State, lines: Linearisation) -> FloatArray:
         """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""

@@ -5,8 +5,10 @@ A source says of its segment's rotation R to world
     R_m = Exp(n) Exp(h z) Exp(g) R M,    M = Exp(m) M_0                                                   (1)
 
 with white noise n, an error h of its heading, an error g that persists for some seconds (of the filter in the source,
-of tissue), and a misalignment m with the segment. Heading and misalignment walk at random, g is a Gauss-Markov process
-whose variance is what the source states and what tissue adds. All seven numbers are estimated with the body; what they
+of tissue), and a misalignment m with the segment. What a source states to err by is mostly what it does not know of how
+it is put on and of its heading, and so is the deviation of h and m at first; they walk at random, and are known as much
+better or worse as the source states to know its orientation later. g is a Gauss-Markov process of the few degrees that
+tissue and a source's own filter make. All seven numbers are estimated with the body; what they
 share with the pose (a forearm's misalignment about itself with its pronation) keeps its deviation, as nothing tells
 them apart. That holds as long as the linearisation has one direction for both whatever is found: the error m of the
 misalignment is told in the segment's frame, not in the sensor's, which turns with what is found (Huang, Mourikis and
@@ -35,6 +37,10 @@ PER_SOURCE: Final = 7
 _MISALIGNMENT, _HEADING, _SLOW = slice(0, 3), 3, slice(4, 7)
 _EYE3 = np.eye(3)
 _Z = np.array([0.0, 0.0, 1.0])
+_PARTS = np.array([0, 0, 0, 1])
+"""Of misalignment (3) and heading which of the two variances that are stated."""
+_SAME = 0.02
+"""Share by which a stated variance changes at least."""
 _SMALL = 1e-4
 """Radians below which the first terms of a series are exact."""
 
@@ -57,7 +63,12 @@ class OrientationParameters:
     """How segment orientations are taken; each field's metadata says what it is, its unit and its range."""
 
     misalignment_stddev: float = number_field(
-        0.06, "orientations: misalignment of a source with its segment per axis, before it is learnt", "rad", 1e-4, 3.0
+        0.06,
+        "orientations: misalignment of a source with its segment per axis beside what the source states, before it is "
+        "learnt",
+        "rad",
+        1e-4,
+        3.0,
     )
     misalignment_density: float = number_field(
         3e-5, "orientations: spectral density of the random walk of the misalignment", "rad2/s", 0.0, 1.0
@@ -77,11 +88,13 @@ class OrientationParameters:
         1.0,
     )
     tissue_stddev: float = number_field(
-        0.05, "orientations: what moving tissue adds to the stated errors, per axis", "rad", 0.0, 1.0
+        0.05,
+        "orientations: what moving tissue, and at most as much again a source's own filter, err by, per axis",
+        "rad",
+        0.0,
+        1.0,
     )
-    tissue_time: float = number_field(
-        2.0, "orientations: time for which stated errors and those of tissue persist", "s", 0.01, 1000.0
-    )
+    tissue_time: float = number_field(2.0, "orientations: time for which errors of tissue persist", "s", 0.01, 1000.0)
     orientation_noise: float = number_field(
         0.01, "orientations: white noise of each that is used, per axis", "rad", 1e-5, 1.0
     )
@@ -98,13 +111,30 @@ class OrientationParameters:
         30.0, "orientations: a source that is silent for longer is forgotten", "s", 0.1, 1e5
     )
     slow_beside_orientations: float = number_field(
-        1.0,
+        3.0,
         "orientations: beside them the variance of the slow errors of cameras is at least this share of what these "
         "state: what a camera is always wrong by alike passes for a body of other proportions as long as nothing but "
         "cameras sees it",
         "1",
         0.0,
         9.0,
+    )
+    slow_time_beside_orientations: float = number_field(
+        30.0,
+        "orientations: time for which the slow errors of cameras persist beside them: where a camera takes a joint to "
+        "be never changes, and over a shorter time it would be learnt as a pose, against what orientations say",
+        "s",
+        0.05,
+        1000.0,
+    )
+    density_beside_orientations: float = number_field(
+        50.0,
+        "orientations: spectral density of the angular acceleration, at least, of the joints that turn a segment whose "
+        "orientation is measured: orientations are quick and need no smoothing, and what a pose is too slow to follow "
+        "would be taken for errors of their sources",
+        "rad2/s3",
+        1e-4,
+        1e4,
     )
     start_after: float = number_field(
         1.0, "orientations: without a skeleton for so long the body is started by orientations alone", "s", 0.0, 60.0
@@ -122,8 +152,7 @@ class Sources:
         heading: (n,) radians h.
         slow: (n, 3) radians g.
         slow_variance: (n, 3, 3) rad2, stationary, of g.
-        stated: (n,) rad2, the variance of the heading as it was stated last.
-        level: (n,) rad2, the least that it was stated.
+        stated: (n, 2) rad2, of misalignment and heading, as it was stated last.
         stamps: (n,) nanoseconds, of the last orientation that was looked at.
         unfit_for: (n,) seconds for which the orientations have not fit without a break.
         lean: (n, 3) faded sum of the normalised innovations, whose covariance is the unit matrix times
@@ -137,7 +166,6 @@ class Sources:
     slow: FloatArray
     slow_variance: FloatArray
     stated: FloatArray
-    level: FloatArray
     stamps: NDArray[np.int64]
     unfit_for: FloatArray
     lean: FloatArray
@@ -148,7 +176,8 @@ class Sources:
         """Nobody."""
         zero, whole = np.zeros(0), np.zeros(0, dtype=np.intp)
         cube = np.zeros((0, 3, 3))
-        return cls((), whole, cube, zero, np.zeros((0, 3)), cube, zero, zero, whole, zero, np.zeros((0, 3)), zero)
+        pairs, triples = np.zeros((0, 2)), np.zeros((0, 3))
+        return cls((), whole, cube, zero, triples, cube, pairs, whole, zero, triples, zero)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -181,11 +210,11 @@ class Sources:
 
     def with_new(self, measurement: SegmentOrientation, parameters: OrientationParameters) -> tuple[Self, FloatArray]:
         """With one more, the last, and (7, 7) the covariance of what is known of it."""
-        slow_variance = _slow_variance(measurement.covariance, float(measurement.covariance[2, 2]), parameters)
-        stated = float(measurement.covariance[2, 2])
+        slow_variance = _slow_variance(measurement.covariance, parameters)
+        stated = _stated(measurement.covariance, parameters)
         covariance = np.zeros((PER_SOURCE, PER_SOURCE))
-        covariance[_MISALIGNMENT, _MISALIGNMENT] = parameters.misalignment_stddev**2 * _EYE3
-        covariance[_HEADING, _HEADING] = max(parameters.heading_stddev**2, stated)
+        covariance[_MISALIGNMENT, _MISALIGNMENT] = stated[0] * _EYE3
+        covariance[_HEADING, _HEADING] = stated[1]
         covariance[_SLOW, _SLOW] = slow_variance
         never = measurement.stamp_ns - 3600 * NANOSECONDS
         new = {
@@ -195,7 +224,6 @@ class Sources:
             "slow": np.zeros(3),
             "slow_variance": slow_variance,
             "stated": stated,
-            "level": stated,
             "stamps": never,
             "unfit_for": 0.0,
             "lean": np.zeros(3),
@@ -214,12 +242,8 @@ class Sources:
         leaning: float,
     ) -> Self:
         """After one more orientation by one of them."""
-        stated = float(measurement.covariance[2, 2])
-        level = min(stated, float(self.level[number]))
         new = {
-            "slow_variance": _slow_variance(measurement.covariance, level, parameters),
-            "stated": stated,
-            "level": level,
+            "slow_variance": _slow_variance(measurement.covariance, parameters),
             "stamps": measurement.stamp_ns,
             "unfit_for": unfit_for,
             "lean": lean,
@@ -230,22 +254,46 @@ class Sources:
             changed[name][number] = value
         return self._but(**changed)
 
-    def drifted(self, number: int, measurement: SegmentOrientation) -> float:
-        """rad2 by which the heading has become less sure since the last orientation, as the source has it."""
-        return max(0.0, float(measurement.covariance[2, 2]) - float(self.stated[number]))
+    def restated(
+        self, number: int, measurement: SegmentOrientation, parameters: OrientationParameters
+    ) -> tuple[Self, FloatArray, FloatArray] | None:
+        """After a source has come to state another variance of itself.
+
+        Where it states a greater one, b instead of a, what it errs by has walked on: b - a is added. Where it states a
+        smaller one it has corrected itself, and of an error e of variance a there is left (b / a) e, and what is new
+        with variance b (1 - b / a): the regression of an optimal estimate's error on the one before.
+
+        Returns:
+            What is known, (4,) what is left of the errors of misalignment and heading, and (4,) rad2 that are new; None
+            where it states hardly another variance.
+        """
+        before, after = self.stated[number], _stated(measurement.covariance, parameters)
+        if (np.abs(after - before) < _SAME * before).all():
+            return None
+        left = np.minimum(1.0, after / before)
+        new = np.maximum(after - before, 0.0) + after * (1.0 - left)
+        turn = so3.log(so3.matrix_to_quat(self.misalignment[number]))
+        misalignment, heading, stated = self.misalignment.copy(), self.heading.copy(), self.stated.copy()
+        misalignment[number] = so3.quat_to_matrix(so3.exp(left[0] * turn))
+        heading[number] *= left[1]
+        stated[number] = after
+        known = self._but(misalignment=misalignment, heading=heading, stated=stated)
+        return known, left[_PARTS], new[_PARTS]
 
 
-def _slow_variance(covariance: FloatArray, level: float, parameters: OrientationParameters) -> FloatArray:
-    """(3, 3) rad2 of what persists for some seconds.
+def _stated(covariance: FloatArray, parameters: OrientationParameters) -> FloatArray:
+    """(2,) rad2, of misalignment per axis and of heading, by the covariance about the axes of world that is stated."""
+    level = 0.5 * float(covariance[0, 0] + covariance[1, 1])
+    return np.array(
+        [parameters.misalignment_stddev**2 + level, max(parameters.heading_stddev**2, float(covariance[2, 2]))]
+    )
 
-    A heading without magnetometer is stated to grow less sure for ever. That is the heading's drift, which has a state
-    of its own; what the variance was at its least (``level``) is what comes and goes.
-    """
-    slow = covariance + parameters.tissue_stddev**2 * _EYE3
-    shrink = math.sqrt((level + parameters.tissue_stddev**2) / float(slow[2, 2]))
-    slow[2] *= shrink
-    slow[:, 2] *= shrink
-    return slow
+
+def _slow_variance(covariance: FloatArray, parameters: OrientationParameters) -> FloatArray:
+    """(3, 3) rad2 of what persists for some seconds: of tissue, and of the source's own filter hardly more."""
+    tissue = parameters.tissue_stddev**2
+    variance: FloatArray = tissue * _EYE3 + np.diag(np.minimum(covariance.diagonal(), tissue))
+    return variance
 
 
 def advance(

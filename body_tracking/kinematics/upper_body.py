@@ -399,6 +399,10 @@ class UpperBody:
         np.multiply(_directions(frames, self._axis_columns), self._turns[segment], out=turning[..., 3:])
         return frames[..., segment, :, :], turning
 
+    def turned_by(self, segment: str) -> IntArray:
+        """The coordinates of the tangent that turn a segment, ascending."""
+        return np.asarray(3 + np.flatnonzero(self._turns[self.segment_names.index(segment)]), dtype=np.intp)
+
     def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
         """Where the points are on average, beside where they are at the mean of the configuration.
 

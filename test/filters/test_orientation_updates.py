@@ -236,19 +236,29 @@ def test_time_passes_over_the_covariance_of_sources_as_by_its_equation() -> None
     assert_allclose(after, transition @ before @ transition.T + noise, rtol=1e-12, atol=1e-12)
 
 
-def test_a_heading_that_is_stated_to_drift_drifts() -> None:
-    """Its growth goes to the heading's own walk; what comes and goes is as large as it was at its least."""
-    steady = np.diag([1e-3, 1e-3, 4e-3])
-    first = SegmentOrientation(0, "a", "head", np.eye(3), steady)
-    later = replace(first, stamp_ns=NANOSECONDS, covariance=np.diag([1e-3, 1e-3, 0.1]))
-    p = EkfParameters(tissue_stddev=0.0)
+def test_what_a_source_states_of_itself_is_what_is_known_of_it_at_first_and_later() -> None:
+    first = SegmentOrientation(0, "a", "head", np.eye(3), np.diag([1e-3, 3e-3, 0.03]))
+    p = EkfParameters()
     sources, covariance = Sources.none().with_new(first, p)
-    assert covariance[3, 3] == p.heading_stddev**2
-    assert_allclose(sources.slow_variance[0], steady)
-    assert sources.drifted(0, later) == pytest.approx(0.096)
-    sources = sources.looked_at(0, later, p, 0.0, np.zeros(3), 0.0)
-    assert_allclose(sources.slow_variance[0], steady)
-    assert sources.drifted(0, later) == 0.0
+    aligned = p.misalignment_stddev**2 + 2e-3
+    assert_allclose(covariance.diagonal()[:4], [aligned, aligned, aligned, 0.03])
+    # only a few degrees of it come and go
+    assert (np.diag(sources.slow_variance[0]) <= 2.0 * p.tissue_stddev**2 + 1e-12).all()
+    assert sources.restated(0, replace(first, stamp_ns=1), p) is None
+    # a heading that drifts
+    drifted = sources.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.1])), p)
+    assert drifted is not None
+    known, left, new = drifted
+    assert_allclose(left, 1.0)
+    assert_allclose(new, [0.0, 0.0, 0.0, 0.07])
+    assert known.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.1])), p) is None
+    # one that was corrected: of what nothing else is known of, the variance is what is stated
+    known = known.moved(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]))
+    corrected = known.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.02])), p)
+    assert corrected is not None
+    known, left, new = corrected
+    assert_allclose(left[3] ** 2 * 0.1 + new[3], 0.02)
+    assert known.heading[0] == pytest.approx(0.2 * 0.02 / 0.1)
 
 
 # --- in the filter
@@ -352,6 +362,63 @@ def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turn
             SegmentOrientation(stamp_ns + 5_000_000, "imu", "forearm_right", forearm, 0.03**2 * np.eye(3))
         )
     assert taught[2] < 0.2 * np.hypot(*taught[:2])
+
+
+def arm_bent_to_the_wrong_side(seconds: float) -> list[Skeleton]:
+    """What a camera shows of a straight right arm, held out to the side."""
+    seen = out_to_the_side(elbow=25.0, twist=125.0)
+    positions = np.full((25, 3), np.nan)
+    positions[MODEL.joints] = MODEL.forward(seen, MODEL.default_lengths()).positions
+    rng, tracked = np.random.default_rng(14), np.full(25, 2, np.uint8)
+    told = np.tile(0.04**2 * np.eye(3), (25, 1, 1))  # as one that states how much it errs
+    return [
+        Skeleton(
+            START_NS + k * NANOSECONDS // 30, "world", positions + 0.003 * rng.normal(size=(25, 3)), tracked, 0, told
+        )
+        for k in range(round(30 * seconds))
+    ]
+
+
+def out_to_the_side(elbow: float, twist: float) -> FloatArray:
+    """(35,) a right arm that is straight but for so many degrees, and turned about itself by so many."""
+    q = MODEL.neutral()
+    turns = so3.exp(np.radians([[-85.0, 0.0, 0.0], [0.0, 0.0, twist]]))
+    q[MODEL.quaternion_of("upper_arm_right")] = so3.quat_multiply(turns[0], turns[1])
+    q[MODEL.scalar_q[[NAMES[v] == "elbow_flexion_right" for v in MODEL.scalar_v]]] = np.radians(elbow)
+    return q
+
+
+@pytest.mark.parametrize("after", [0.1, 3.0], ids=["from the start", "after seconds of the camera alone"])
+def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera_sees_it_bent(after: float) -> None:
+    truth = out_to_the_side(elbow=5.0, twist=0.0)
+    rotation = MODEL.forward(truth, MODEL.default_lengths()).rotations[SEGMENT_NUMBER["upper_arm_right"]]
+    frames = arm_bent_to_the_wrong_side(after + 3.0)
+    begin = START_NS + round(after * NANOSECONDS)
+    said = [
+        SegmentOrientation(stamp, "imu", "upper_arm_right", rotation, np.radians(8.0) ** 2 * np.eye(3))
+        for stamp in range(begin, frames[-1].stamp_ns, NANOSECONDS // 50)
+    ]
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, in_order(frames, said))
+    assert estimator.counters["slips"] == 0
+    assert estimator.estimate is not None
+    found = MODEL.forward(estimator.estimate.q, estimator.estimate.lengths).rotations[SEGMENT_NUMBER["upper_arm_right"]]
+    off = so3.log(so3.matrix_to_quat(rotation.T @ found))
+    stddev = np.sqrt(estimator.estimate.covariance[MODEL.ball_v[-1, 2], MODEL.ball_v[-1, 2]])
+    assert abs(off[2]) < max(np.radians(15.0), 2.0 * stddev)
+
+
+def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
+    person = somebody(15, 1.0, 0.01)
+    far = Source("forearm_left", misalignment=(1.2, 0.0, 0.0)).measure(person)
+    estimator = ExtendedKalmanFilter()
+    soon = START_NS + round(0.8 * EkfParameters().slip_after * NANOSECONDS)
+    events = in_order(person.skeletons, far)
+    feed(estimator, [each for each in events if each.stamp_ns < soon])
+    assert estimator.counters["orientations_rejected"] > 5
+    assert estimator.counters["slips"] == 0
+    feed(estimator, [each for each in events if each.stamp_ns >= soon])
+    assert estimator.counters["slips"] == 1
 
 
 def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
