@@ -152,8 +152,8 @@ def measure(run: Run) -> Figures:
     recording = run.recording()
     worn = {imu.segment: (imu, said) for imu, said in recording.imus}
     events = sorted(each for imu, said in recording.imus for each in readings(imu, said))
-    # ten orientations a second of each are what is judged; the skeleton of the node is not looked at
-    tracker = InertialTracker(SEGMENTS, TrackingParameters(camera=False, rate=1.0, orientation_rate=1.0 / _EVERY_S))
+    # the skeleton of the node is not looked at
+    tracker = InertialTracker(SEGMENTS, TrackingParameters(camera=False, rate=1.0))
     estimator = ExtendedKalmanFilter()
     times, configurations, stddevs = [], [], []
     named: dict[str, None] = {}
@@ -174,12 +174,12 @@ def measure(run: Run) -> Figures:
             continue
         times.append((estimate.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS)
         configurations.append(estimate.q)
-        stddevs.append(np.sqrt(_variances(estimate.q, estimate.covariance)))
+        stddevs.append(np.sqrt(angle_variances(estimate.q, estimate.covariance)))
     seconds = time.process_time() - begin
     at, q = np.array(times), np.array(configurations)
     return Figures(
         at,
-        _errors(q, _true(recording, at)),
+        angle_errors(q, true_configurations(recording, at)),
         np.array(stddevs),
         tuple(named),
         dict(tracker.counters) | dict(estimator.counters),
@@ -187,7 +187,7 @@ def measure(run: Run) -> Figures:
     )
 
 
-def _variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
+def angle_variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
     """(10,) rad2 of ``ANGLES``, by the covariance of the tangent and more."""
     lines = MODEL.linearise(q, MODEL.default_lengths())
     turning = lines.rotation_jacobian
@@ -204,7 +204,7 @@ def _variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
     return result
 
 
-def _true(recording: SimulatedRecording, times: FloatArray) -> FloatArray:
+def true_configurations(recording: SimulatedRecording, times: FloatArray) -> FloatArray:
     """(n, 35) between the instants at which the truth is known."""
     truth = recording.truths[0]
     stamps = (truth.stamps_ns - START_NS) / NANOSECONDS
@@ -213,7 +213,7 @@ def _true(recording: SimulatedRecording, times: FloatArray) -> FloatArray:
     return MODEL.integrate(truth.q[after - 1], share[:, None] * MODEL.difference(truth.q[after - 1], truth.q[after]))
 
 
-def _errors(q: FloatArray, true: FloatArray) -> FloatArray:
+def angle_errors(q: FloatArray, true: FloatArray) -> FloatArray:
     """(n, 10) radians, of ``ANGLES``."""
     found, right = (MODEL.forward(each, MODEL.default_lengths()).rotations for each in (q, true))
     scalars = MODEL.difference(true, q)
