@@ -89,6 +89,7 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	run benchmarks/imu_and_camera.py --seeds 1; \
 	run benchmarks/imu_live.py; \
 	run benchmarks/imu_only.py --motions reaching,punching; \
+	run benchmarks/imu_faults.py --seeds 1; \
 	run benchmarks/accuracy.py --seeds 2 --layout-seeds 1 --sensitivity-seeds 1; \
 	with kinect_vs_vicon benchmarks/kinect_vs_vicon.py; \
 	if $(BIN)/python -c 'import biorbd, opensim' 2>/dev/null; then run benchmarks/estimators.py; \
