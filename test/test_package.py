@@ -35,7 +35,7 @@ LIBRARIES = {
     "zstandard": ("zstandard", None),
     "rosbags": ("rosbags", None),
 }
-EXTRAS = {"viser": "viewer"}
+EXTRAS = {"viser": "viewer", "websockets": "viewer"}
 """Import name -> extra; who imports these says what to install where they are absent."""
 
 

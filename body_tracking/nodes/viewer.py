@@ -74,6 +74,8 @@ _WAITING = 64
 """Messages of joint angles that may wait for the next drawing; while nobody looks, older ones go."""
 _SHARE = 0.25
 """Share of the time for which the page may be drawn, whatever the rate."""
+_FAILURES = 10
+"""Drawings that fail one after the other, after which the node ends."""
 _NICE = 10
 
 
@@ -154,31 +156,46 @@ class ViewerNode(GraphNode):
     # --- drawing, in a thread of its own
 
     def keep_drawing(self) -> None:
-        """Draw while somebody looks; an error that nobody expected ends the node, which then is started again."""
-        try:
-            period = 1.0 / float(str(self.values["rate"]))
-            rest, plotted, told = period, 0.0, 0.0
-            while not self.ended.wait(rest):
-                if not self.page.watched:
-                    continue
-                begin = time.monotonic()
-                self.page.draw(self.snapshot())
-                if begin - plotted >= 1.0 / float(str(self.values["plot_rate"])):
-                    plotted = begin
-                    self.collect_angles()
-                    self.page.draw_curves(self.history)
-                if begin - told >= 1.0:
-                    told = begin
-                    self.page.draw_status(self.statuses, begin)
-                    self.page.draw_bodies(self.bodies(), self.body)
-                spent = time.monotonic() - begin
-                self.drawn += 1
-                self.drawing_s += spent
-                rest = max(period - spent, spent * (1.0 / _SHARE - 1.0))
-        except Exception:
-            if not self.ended.is_set():
-                self.get_logger().fatal(f"drawing failed: {traceback.format_exc()}")
-                self.context.try_shutdown()
+        """Draw while somebody looks; errors that nobody expected, time and again, end the node, which is started anew.
+
+        One alone does not: what is drawn wakes up viser's server in another thread, which now and then goes wrong
+        ("deque mutated during iteration"), and the next drawing shows what that one would have.
+        """
+        rest, failed = 1.0 / float(str(self.values["rate"])), 0
+        self.plotted = self.told = 0.0
+        while not self.ended.wait(rest):
+            if not self.page.watched:
+                continue
+            begin = time.monotonic()
+            try:
+                self.draw(begin)
+                failed = 0
+            except Exception:
+                failed += 1
+                self.monitor.totals["drawings failed"] += 1
+                if self.ended.is_set():
+                    return
+                if failed == _FAILURES:
+                    self.get_logger().fatal(f"drawing failed {failed} times: {traceback.format_exc()}")
+                    self.context.try_shutdown()
+                    return
+                self.log_seldom("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
+            spent = time.monotonic() - begin
+            self.drawn += 1
+            self.drawing_s += spent
+            rest = max(1.0 / float(str(self.values["rate"])) - spent, spent * (1.0 / _SHARE - 1.0))
+
+    def draw(self, now: float) -> None:
+        """What is due at a steady time."""
+        self.page.draw(self.snapshot())
+        if now - self.plotted >= 1.0 / float(str(self.values["plot_rate"])):
+            self.plotted = now
+            self.collect_angles()
+            self.page.draw_curves(self.history)
+        if now - self.told >= 1.0:
+            self.told = now
+            self.page.draw_status(self.statuses, now)
+            self.page.draw_bodies(self.bodies(), self.body)
 
     def snapshot(self) -> Snapshot:
         """What is there now."""
