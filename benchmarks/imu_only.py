@@ -176,6 +176,8 @@ def measure(run: Run) -> Figures:
         configurations.append(estimate.q)
         stddevs.append(np.sqrt(angle_variances(estimate.q, estimate.covariance)))
     seconds = time.process_time() - begin
+    if not times:
+        raise RuntimeError(f"{run.motion} {run.seed}: no pose has aligned the sensors in {run.seconds:g} s")
     at, q = np.array(times), np.array(configurations)
     return Figures(
         at,
