@@ -65,7 +65,7 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (an hour and three quarters)
+bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (two hours)
 	@data=$${BODY_TRACKING_DATA:-../shared/data}; missed=; \
 	run() { echo; echo "== $$*"; $(BIN)/python "$$@" || missed="$$missed $$1"; }; \
 	with() { folder=$$1; shift; if [ -d "$$data/$$folder" ]; then run "$$@"; \

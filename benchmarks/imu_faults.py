@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from imu_only import ANGLES, angle_errors, angle_variances, rms, true_configurations
+from imu_only import ANGLES, Angles, angle_errors, angle_variances, rms, true_configurations
 from tqdm import tqdm
 
 from body_tracking import graph
@@ -121,27 +121,21 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figures:
+class Figures(Angles):
     """Of one run.
 
     Attributes:
-        times: (n,) seconds from the beginning.
-        error: (n, 10) radians, of ``ANGLES``.
-        stddev: (n, 10) radians, stated.
         named: when each line of the diagnostics was there first, seconds.
         oriented: seconds of the last orientation of the faulty sensor's segment.
     """
 
-    times: FloatArray
-    error: FloatArray
-    stddev: FloatArray
     named: dict[str, float]
     oriented: float
 
-    def right(self, since: float) -> float:
-        """Share of the angles that are right by what is enough, or by what is stated."""
+    def right(self, since: float) -> FloatArray:
+        """(10,) share of the frames in which each angle is right by what is enough, or by what is stated."""
         error, stddev = (np.abs(each[self.times >= since]) for each in (self.error, self.stddev))
-        return float(((error < ENOUGH) | (error < _NORMAL * stddev)).mean())
+        return np.asarray(((error < ENOUGH) | (error < _NORMAL * stddev)).mean(axis=0), dtype=float)
 
     def arm(self, since: float, until: float = np.inf) -> float:
         """Degrees RMS of the right arm's angles."""
@@ -275,11 +269,10 @@ def main() -> int:
             since = SETTLED if run.fault in ("none", "exchanged") else BEGIN
             print(
                 f"{run.fault} {run.motion} {run.seed}: {each.arm(SETTLED, BEGIN):.1f} deg before, "
-                f"{each.arm(since):.1f} after, {100 * each.right(since):.1f} % right"
+                f"{each.arm(since):.1f} after, {100 * each.right(since).mean():.1f} % right"
             )
-            inside = (np.abs(each.error) < ENOUGH) | (np.abs(each.error) < _NORMAL * each.stddev)
-            inside = inside[each.times >= since].mean(axis=0)
-            print("  " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in zip(ANGLES, inside, strict=True)))
+            right = zip(ANGLES, each.right(since), strict=True)
+            print("  " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in right))
             for line, when in each.named.items():
                 print(f"  {when:5.1f} s: {line}")
     for fault in faults[1:]:

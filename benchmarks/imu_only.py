@@ -109,21 +109,30 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figures:
-    """Of one run.
+class Angles:
+    """What became of the angles in one run.
 
     Attributes:
         times: (n,) seconds from the beginning.
         error: (n, 10) radians, of ``ANGLES``.
         stddev: (n, 10) radians, stated.
-            problems: what the tracker named, once each.
-        counters: of tracker and filter.
-        seconds: of computing.
     """
 
     times: FloatArray
     error: FloatArray
     stddev: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Figures(Angles):
+    """Of one run.
+
+    Attributes:
+        problems: what the tracker named, once each.
+        counters: of tracker and filter.
+        seconds: of computing.
+    """
+
     problems: tuple[str, ...]
     counters: dict[str, int]
     seconds: float

@@ -169,6 +169,7 @@ class ViewerNode(GraphNode):
             begin = time.monotonic()
             try:
                 self.draw(begin)
+                self.drawn += 1
                 failed = 0
             except Exception:
                 failed += 1
@@ -181,7 +182,6 @@ class ViewerNode(GraphNode):
                     return
                 self.log_seldom("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
             spent = time.monotonic() - begin
-            self.drawn += 1
             self.drawing_s += spent
             rest = max(1.0 / float(str(self.values["rate"])) - spent, spent * (1.0 / _SHARE - 1.0))
 

@@ -40,8 +40,8 @@ def is_own(origin: str | None, host: str | None) -> bool:
 
 def _is_mine(name: str) -> bool:
     """Whether a name cannot be somebody else's: an address, or what this machine calls itself."""
-    own = socket.gethostname().lower()
-    if name in ("localhost", own, f"{own}.local", socket.getfqdn().lower()):
+    own = socket.gethostname().lower()  # no longer name: to look that up would hold the server up
+    if name in ("localhost", own, f"{own}.local"):
         return True
     try:
         ipaddress.ip_address(name)

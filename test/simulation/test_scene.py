@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from body_tracking.simulation.imus import SimulatedImu, usual_mounting
+from body_tracking.simulation.imus import Iron, SimulatedImu, Surroundings, usual_mounting
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.layouts import NUMBERS, around, layout
 from body_tracking.simulation.people import MODEL
@@ -143,6 +143,18 @@ def test_frames_come_in_the_order_of_receipt_and_after_their_capture() -> None:
     for frame in recording.frames:
         captured = clocks[frame.sensor].to_reference(frame.skeletons[0].stamp_ns) - START_NS
         assert frame.received_ns - RECEIVED_FROM_NS > captured
+
+
+def test_iron_in_the_surroundings_turns_the_field_that_an_inertial_sensor_feels_and_nothing_else() -> None:
+    imu = SimulatedImu("imu", "forearm_left", usual_mounting("forearm_left"))
+    clean = Setup("standing_still", imus=(imu,), seconds=SHORT)
+    magnet = Iron(clean.layout.position + [0.0, 0.5, 0.8], np.array([0.0, 30.0, 0.0]))
+    (_, felt), (_, disturbed) = (
+        simulate(each).imus[0] for each in (clean, replace(clean, surroundings=Surroundings(iron=(magnet,))))
+    )
+    assert felt.magnetic_field is not None and disturbed.magnetic_field is not None
+    assert np.linalg.norm(disturbed.magnetic_field - felt.magnetic_field, axis=1).min() > 1e-6
+    assert_array_equal(disturbed.linear_acceleration, felt.linear_acceleration)
 
 
 def test_an_inertial_sensor_turns_as_its_segment_does() -> None:
