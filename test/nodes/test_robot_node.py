@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import yaml
 
@@ -125,12 +126,10 @@ class Arm:
 
 
 class Robots(Running):
-    """Two arms in this process, a node each that commands them, and a player in place of the graph."""
+    """Two arms in this process that follow what they are told."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.bag = folder / "angles"
-        write_angles(self.bag)
         names = {name: angle_names(name) for name in ALL_CONVENTIONS}
         self.arms: dict[str, Arm] = {}
         self.states: dict[str, Any] = {}
@@ -143,10 +142,6 @@ class Robots(Running):
             self.states[robot] = self.node.create_publisher(JointState, mapping.output.state_topic, RELIABLE)
         self.advanced = time.monotonic()
         self.node.create_timer(0.02, self._advance)
-        self.start("calibration", sensors="[kinect1]", use_sim_time=True)
-        # One goes by the wall clock and stamps its commands by it; the other by /clock, which ends with the player.
-        self.command("two_joint_arm")
-        self.command("iiwa7", use_sim_time=True)
 
     def _listener(self, arm: Arm) -> Any:
         def on_trajectory(message: JointTrajectory) -> None:
@@ -176,7 +171,7 @@ class Robots(Running):
 
     def command(self, robot: str, **parameters: object) -> None:
         """Start a robot's ``robot_commands`` under the robot's name."""
-        given = {"mapping": mapping_file(robot), "body": BODIES[robot], "sensors": "[kinect1]", **parameters}
+        given = {"mapping": mapping_file(robot), "sensors": "[kinect1]", **parameters}
         words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
         with (self.folder / f"{robot}.log").open("wb") as log:
             self.processes[robot] = subprocess.Popen(
@@ -186,6 +181,19 @@ class Robots(Running):
                 stderr=subprocess.STDOUT,
                 env=self.environment,
             )
+
+
+class PlayedRobots(Robots):
+    """Besides, a node each that commands them, and a player in place of the graph."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.bag = folder / "angles"
+        write_angles(self.bag)
+        self.start("calibration", sensors="[kinect1]", use_sim_time=True)
+        # One goes by the wall clock and stamps its commands by it; the other by /clock, which ends with the player.
+        self.command("two_joint_arm", body=BODIES["two_joint_arm"])
+        self.command("iiwa7", body=BODIES["iiwa7"], use_sim_time=True)
 
     def play(self) -> None:
         """Start the sensor."""
@@ -225,7 +233,7 @@ class Run:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    with Robots(tmp_path_factory.mktemp("robots")) as robots:
+    with PlayedRobots(tmp_path_factory.mktemp("robots")) as robots:
         killed, quiet = [], []
         reasons: dict[str, list[str]] = {robot: [] for robot in BODIES}
         for _ in range(2):
@@ -339,3 +347,71 @@ def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
     rows = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.startswith("joint_a")}
     assert len(rows) == 7
     assert all(float(row[3]) < 5.0 for row in rows.values())
+
+
+# --- the whole of it
+
+
+def true_joints(mapping: RobotMapping, stamps: FloatArray) -> FloatArray:
+    """(n, joints) where a mapping would have a robot stand by the true pose of the person in the recording.
+
+    Args:
+        mapping: the robot's.
+        stamps: (n,) seconds of the recording's clock.
+    """
+    model = UpperBody()
+    covariance = 1e-6 * np.eye(2 * model.nv)
+    times, joints = [], []
+    with BagReader(BAG) as reader:
+        for raw in reader.messages([graph.TRUE_MODEL_STATE]):
+            state = joint_state_to_model(deserialize("sensor_msgs/msg/JointState", raw.cdr), model)
+            angles = angles_of(state_estimate(model, *state, covariance), model, "isb")
+            person = np.array([angles.position[angles.names.index(name)] for name in mapping.angles])
+            times.append(raw.log_time_ns / NANOSECONDS)
+            joints.append(mapping.matrix @ person + mapping.offset)
+    whole = np.unwrap(np.array(joints), axis=0)
+    whole += 2.0 * np.pi * np.round((mapping.home - whole[0]) / (2.0 * np.pi))
+    return np.stack([np.interp(stamps, times, column) for column in whole.T], axis=1)
+
+
+@pytest.mark.alone
+def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_die(tmp_path: Path) -> None:
+    with Robots(tmp_path) as robots:
+        arm = robots.arms["two_joint_arm"]
+        words = ["--bag", BAG, "--filter", "ekf", "--robot", mapping_file("two_joint_arm"), "--log-dir", tmp_path]
+        with (tmp_path / "up.log").open("wb") as log:
+            up = robots.processes["up"] = subprocess.Popen(
+                [sys.executable, "-m", "body_tracking.cli", "up", *words],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=robots.environment,
+            )
+
+        def state() -> str | None:
+            return robots.diagnostics.get("robot_commands", {}).get("state")
+
+        assert robots.until(lambda: state() == State.FOLLOWING, 60.0), (robots.log("up"), robots.diagnostics)
+        begun = len(arm.told)
+        robots.until(lambda: False, timeout=3.5)
+        assert robots.until(arm.moving), robots.log("up")
+        (player,) = [each for each in psutil.Process(up.pid).children() if "bag_player" in each.cmdline()]
+        killed = time.time()
+        player.kill()
+        assert robots.until(lambda: state() == State.HOLDING), robots.log("up")
+        followed = [each for each in arm.told[begun:] if each[0] < killed]
+        after = [each for each in arm.told if each[0] >= killed]
+        assert robots.until(lambda: state() == State.FOLLOWING), robots.log("up")
+        assert robots.until(lambda: up.poll() is not None, 60.0), robots.log("up")
+        assert up.returncode == 0, robots.log("up")
+    told, stamps = np.array([each[2] for each in followed]), np.array([each[1] for each in followed])
+    true = true_joints(arm.mapping, stamps)
+    off = np.degrees(np.sqrt(np.mean(np.square(told - true), axis=0)))
+    assert len(told) > 250 and np.ptp(told[:, 1]) > np.radians(50.0)
+    # two Kinects know where a shoulder is raised to; an elbow that is nearly straight they see bent
+    assert off[0] < 5.0 and off[1] < 20.0, off
+    assert np.corrcoef(told[:, 1], true[:, 1])[0, 1] > 0.9
+    # up to when diagnostics said that it held, its commands changed for a tenth of a second
+    last = max((k for k in range(1, len(after)) if (after[k][2] != after[k - 1][2]).any()), default=0)
+    assert len(after) > last + 1
+    held_up = stall([killed, *[came for came, _, _ in after[: last + 2]]])
+    assert after[last][0] - killed <= 0.1 + held_up
