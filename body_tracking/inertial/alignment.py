@@ -48,8 +48,9 @@ MOUNTING_STDDEV: Final = float(np.radians(10.0))
 CLAVICLE_IN_T: Final = float(np.radians(20.0))
 """Radians of a clavicle's elevation with the arm at 90 degrees: a third of what is beyond 30 (Inman et al. 1944)."""
 
-STILL_RATE: Final = 0.15
-"""rad/s, root mean square: who holds a pose sways by less, and no gyroscope's bias is as much."""
+STILL_RATE: Final = 0.25
+"""rad/s, root mean square of a tenth of a second: who holds a pose sways by less, and no gyroscope's bias is as much.
+What turns slowly all the while turns further than :data:`STILL_TURN`."""
 STILL_TIME: Final = 1.0
 """Seconds that a pose must be held."""
 STILL_TURN: Final = float(np.radians(10.0))

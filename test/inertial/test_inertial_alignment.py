@@ -137,6 +137,17 @@ def test_still_poses_are_found_and_told_apart() -> None:
     assert still_periods([arm.between(4.2, 5.8)]) == ()
 
 
+@pytest.mark.parametrize(("sway", "still"), [(2.0, True), (4.0, False)])
+def test_who_holds_a_pose_may_sway(sway: float, still: bool) -> None:
+    """Degrees to each side, once a second: two make 0.22 rad/s at the fastest."""
+    times = np.arange(0.0, 3.0, 0.02)
+    angles = np.radians(sway) * np.sin(2.0 * np.pi * times)
+    rates = np.zeros((len(times), 3))
+    rates[:, 0] = np.gradient(angles, times)
+    arm = stream("forearm_left", times, so3.quat_to_matrix(so3.exp(angles[:, None] * [1.0, 0.0, 0.0])), rates)
+    assert bool(still_periods([arm])) is still
+
+
 def elbow(seed: int, seconds: float = 20.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times, and orientations of an upper arm and of its forearm, which bends and turns."""
     rng = np.random.default_rng(seed)
