@@ -109,6 +109,9 @@ _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
+_POSTURE_TIME = 10.0
+"""Seconds for which people hold a trunk alike: to sources of orientations the middle of its ranges is news once in
+twice that time, however often it is told."""
 _VAGUE = 0.5
 """Share of the range's deviation from which an angle is drawn to the middle of its range."""
 _SPURIOUS = 0.7
@@ -171,6 +174,8 @@ _TOGETHER_NS = NANOSECONDS // 125
 the motion model adds in the meantime (1 mrad) comes with the next one."""
 _HELD_STDDEV = 0.02
 """Radians by which what moves a pose without any measurement may turn a segment whose orientation is measured."""
+_HELD_FOR_NS = NANOSECONDS // 4
+"""A source that is silent for longer does not hold its segment any more."""
 _CONTRADICTION = 0.8
 """Radians by which no other pose that points suggest may turn such a segment at once."""
 _LONGEST_WAIT_NS = NANOSECONDS // 10
@@ -1857,6 +1862,8 @@ class ExtendedKalmanFilter:
             self.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
         )
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
+        trunk = np.array([name.startswith(("lumbar", "thoracic", "clavicle")) for name in names])
+        self._posture = np.append(trunk, True)
         self._rest_information = np.full(self._nv, 1e-4)
         self._rest_information[6:] = 1.0 / self.ranges.stddev**2
         self._velocity_variance = np.full(self._nv, _FIRST_TURN_RATE**2)
@@ -1876,9 +1883,10 @@ class ExtendedKalmanFilter:
         gradients[-1, 6:] = self.ranges.twist @ soft.gradients
         values = np.append(soft.values - self.ranges.centre, self.ranges.twist @ soft.values)
         stddev = np.append(self.ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
-        tangent = state.covariance[self._tangent, self._tangent]
+        tangent = self._free(state)[0][self._tangent, self._tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
-        # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that.
+        # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that:
+        # as far as no orientation holds it, for what is told again and again is wrong by the same each time.
         limit = stddev**2
         unknown = variance > limit
         noise = variance * limit / np.maximum(variance - limit, 1e-12)
@@ -1890,7 +1898,11 @@ class ExtendedKalmanFilter:
             return self._turned(state, *branch)
         state = self._unsure(state)
         if unknown.any():
-            state = self._told(state, gradients[unknown], -values[unknown], noise[unknown])
+            state = self._told(state, gradients[unknown], -values[unknown], noise[unknown], self._free(state))
+        if state.sources.names:
+            rows, repeated = self._posture, 2.0 * _POSTURE_TIME / _PRIOR_PERIOD
+            whole = state.covariance, state.crosses
+            state = self._told(state, gradients[rows], -values[rows], repeated * limit[rows], whole)
         vague = variance > (_VAGUE * stddev) ** 2
         if vague.any() and not state.sources.names:
             state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
@@ -1944,7 +1956,7 @@ class ExtendedKalmanFilter:
         it is done to what is handed out only (:meth:`_middled`): what cameras pull back again and again, as the
         covariance stays, would end up in the headings and misalignments of the sources.
         """
-        cross_covariance = self._free(state)[:, self._tangent] @ observation.T
+        cross_covariance = self._free(state)[0][:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(stddev**2)
         correction = -cross_covariance @ np.linalg.solve(s, values)
         correction[self._velocities] = 0.0
@@ -1977,9 +1989,25 @@ class ExtendedKalmanFilter:
             state = state.but(velocity=velocity)
         return state.but(q=self.ranges.clipped(state.q, _FAR_BEYOND))
 
-    def _told(self, state: _State, observation: FloatArray, error: FloatArray, noise: FloatArray) -> _State:
-        """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,)."""
-        cross_covariance = state.covariance[:, self._tangent] @ observation.T
+    def _told(
+        self,
+        state: _State,
+        observation: FloatArray,
+        error: FloatArray,
+        noise: FloatArray,
+        part: tuple[FloatArray, FloatArray],
+    ) -> _State:
+        """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,).
+
+        Args:
+            state: to be corrected.
+            observation: rows.
+            error: of what is observed.
+            noise: variances.
+            part: the covariance, and with the slow errors of cameras: all of it, or what may be corrected.
+        """
+        free, free_crosses = part
+        cross_covariance = free[:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent] + np.diag(noise)
         factor = _cholesky(s)
         gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
@@ -1987,7 +2015,7 @@ class ExtendedKalmanFilter:
         covariance = state.covariance - gain.T @ gain
         if state.settled:
             covariance[self._lengths, self._lengths] = state.covariance[self._lengths, self._lengths]
-        half, _ = dtrtrs(factor, observation @ state.crosses[self._tangent], lower=1)
+        half, _ = dtrtrs(factor, observation @ free_crosses[self._tangent], lower=1)
         crosses = state.crosses - gain.T @ half
         if state.settled:
             crosses[self._lengths] = state.crosses[self._lengths]
@@ -2000,28 +2028,30 @@ class ExtendedKalmanFilter:
 
         The covariance stays: that an angle is within its limits does not tell where.
         """
-        cross_covariance = self._free(state)[:, self._tangent] @ observation.T
+        cross_covariance = self._free(state)[0][:, self._tangent] @ observation.T
         s = observation @ cross_covariance[self._tangent]
         s[np.arange(len(s)), np.arange(len(s))] += np.radians(stddev) ** 2
         correction = -cross_covariance @ np.linalg.solve(s, excess)
         correction[self._size :] = 0.0  # as the covariance stays, sources would learn this again and again
         return self._moved(state, correction)
 
-    def _free(self, state: _State) -> FloatArray:
-        """The covariance of all as far as orientations leave a pose free.
+    def _free(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free.
 
         A pose that is moved without any measurement must not turn what a source says the turn of: the source would be
         corrected instead, each time a little.
         """
-        if not state.sources.names:
-            return state.covariance
-        turning = self.model.linearise(state.q, state.lengths).rotation_jacobian[state.sources.segments]
+        speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
+        if not speaking.any():
+            return state.covariance, state.crosses
+        turning = self.model.linearise(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
         rows = turning.reshape(-1, self._nv)
         cross = state.covariance[:, self._tangent] @ rows.T
         s = rows @ cross[self._tangent]
         s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
-        free: FloatArray = state.covariance - cross @ np.linalg.solve(s, cross.T)
-        return free
+        held = np.linalg.solve(s, np.concatenate([cross.T, rows @ state.crosses[self._tangent]], axis=1))
+        size = len(state.covariance)
+        return state.covariance - cross @ held[:, :size], state.crosses - cross @ held[:, size:]
 
     def _moved(self, state: _State, correction: FloatArray) -> _State:
         """The state moved by a correction (85,)."""

@@ -322,6 +322,53 @@ def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None
     assert turned[0] < 0.5 * hold / (hold + limit) < 0.5 * turned[1]
 
 
+ALL_BUT_HANDS = ("pelvis", "upper_trunk", "head", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+
+
+def still(posture: dict[str, float], seconds: float, until: dict[str, float] | None = None) -> list[SegmentOrientation]:
+    """What seven sources that do not err, and do not know it, say of somebody who does not move; until when each."""
+    step = np.zeros(MODEL.nv)
+    step[[NAMES.index(name) for name in posture]] = np.radians(list(posture.values()))
+    rotations = MODEL.forward(MODEL.integrate(MODEL.neutral(), step), MODEL.default_lengths()).rotations
+    return [
+        SegmentOrientation(
+            START_NS + round((time + 0.003 * number) * NANOSECONDS),
+            f"imu_{segment}",
+            segment,
+            rotations[SEGMENT_NUMBER[segment]],
+            0.2**2 * np.eye(3),
+        )
+        for time in np.arange(0.0, seconds, 0.05)
+        for number, segment in enumerate(ALL_BUT_HANDS)
+        if time < (until or {}).get(segment, np.inf)
+    ]
+
+
+def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
+    """The middle of a range is told again and again, wrong by the same each time: as if seldom (before: 13 degrees)."""
+    posture = {"lumbar_flexion": 30.0, "thoracic_flexion": 15.0, "lumbar_axial": 12.0, "clavicle_elevation_left": 20.0}
+    estimator = ExtendedKalmanFilter()
+    events = still(posture, 12.0)
+    feed(estimator, events)
+    estimate = estimator.estimate
+    assert estimate is not None
+    found = MODEL.forward(estimate.q, MODEL.default_lengths()).rotations
+    said = {each.segment: each.rotation for each in events}
+    for segment, rotation in said.items():
+        off = so3.log(so3.matrix_to_quat(rotation.T @ found[SEGMENT_NUMBER[segment]]))
+        assert np.linalg.norm(off) < np.radians(6.0), segment
+
+
+def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, still({"elbow_flexion_right": 60.0}, 9.0, {"forearm_right": 4.0}))
+    estimate = estimator.estimate
+    assert estimate is not None
+    elbow = NAMES.index("elbow_flexion_right")
+    deviation = np.sqrt(estimate.covariance[elbow, elbow])
+    assert np.radians(20.0) < deviation < 1.5 * Ranges(MODEL).stddev[elbow - 6]
+
+
 @pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, 0.35)])
 def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, float]) -> None:
     person = somebody(4, 7.0, 0.01)
