@@ -1,7 +1,9 @@
 """Which sensor is where it should not be: exchanged with another one, or slipped.
 
 **Exchanged.** How well each of k streams goes with each of k segments is a table of log likelihoods; the assignment
-with the highest sum (Kuhn and Munkres) beside the stated one tells how sure an exchange is. From a skeleton: of the
+with the highest sum (Kuhn and Munkres) tells of an exchange, where being where they are said to be is worth something
+of its own to each sensor: forearm and upper arm of one side turn so much alike that either fits the other. From a
+skeleton: of the
 rate at which a bone turns, the correlation rho with that of the sensor's over n' independent samples is worth
 
     - n' / 2 log(1 - rho^2),  0 for rho < 0                                                                         (13)
@@ -31,12 +33,12 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, Turning, independent_samples, sampled
-from body_tracking.skeleton import FloatArray, IntArray
+from body_tracking.skeleton import FloatArray
 
 SEGMENT_STDDEV: Final = float(np.radians(8.0))
 """Radians per axis by which a person's segment is off a pose."""
 SURE: Final = 5.0
-"""Logarithm of the likelihood ratio from which an exchange is named."""
+"""Logarithm of the likelihood ratio from which a sensor is somewhere else than is said."""
 SLIP_TURN: Final = float(np.radians(10.0))
 """Radians from which a slip is one: below, the flesh gives as much."""
 SLIP_TIME: Final = 6.0
@@ -76,29 +78,10 @@ def assign(stated: Sequence[str], likelihood: FloatArray) -> Assignment:
     k = len(stated)
     if likelihood.shape != (k, k) or not np.isfinite(likelihood).all():
         raise AlignmentError(f"assignment of {k} sensors: table of shape {likelihood.shape}, expected finite numbers")
-    rows, columns = linear_sum_assignment(likelihood, maximize=True)
-    advantage = float(likelihood[rows, columns].sum() - likelihood.diagonal().sum())
-    # an exchange that as well may not be is not named: each cycle must be sure on its own
-    found = _sure_cycles(stated, columns, likelihood)
+    _, columns = linear_sum_assignment(likelihood + SURE * np.eye(k), maximize=True)
+    found = tuple(stated[column] for column in columns.tolist())
     exchanged = tuple((said, is_) for said, is_ in zip(stated, found, strict=True) if said != is_)
-    return Assignment(found, exchanged, advantage)
-
-
-def _sure_cycles(stated: Sequence[str], columns: IntArray, likelihood: FloatArray) -> tuple[str, ...]:
-    """The assignment with those of its cycles that are sure, the others as stated."""
-    result, done = list(stated), set()
-    for start in range(len(stated)):
-        if start in done:
-            continue
-        cycle = [start]
-        while int(columns[cycle[-1]]) != start:
-            cycle.append(int(columns[cycle[-1]]))
-        done.update(cycle)
-        gain = sum(float(likelihood[i, columns[i]] - likelihood[i, i]) for i in cycle)
-        if len(cycle) > 1 and gain > SURE:
-            for i in cycle:
-                result[i] = stated[int(columns[i])]
-    return tuple(result)
+    return Assignment(found, exchanged, float(likelihood[np.arange(k), columns].sum() - likelihood.trace()))
 
 
 def likelihood_by_motion(sensors: Sequence[Turning], bones: Sequence[Turning | None]) -> FloatArray:

@@ -88,6 +88,8 @@ _SLIP_WINDOWS = 6.0, 18.0
 """Seconds: large slips are seen soon, those hardly larger than a camera's errors late."""
 _NAMED_S = 60.0
 """Seconds for which a slip is told."""
+_POSE_TELLS = 20.0
+"""Logarithm of a likelihood ratio at most, that a pose tells of where a sensor is: later it may be put elsewhere."""
 _FAR_HEADING = 0.5
 """Radians of a heading's deviation from which it counts as unknown."""
 _MAGNETIC_WALK = 0.1 * HEADING_WALK
@@ -271,6 +273,7 @@ class InertialTracker:
         self._posture: FloatArray | None = None
         self._slips: dict[str, tuple[float, str]] = {}
         self._exchanged: dict[str, str] = {}
+        self._by_pose: dict[str, dict[str, float]] = {}
         self._detectors = {name: self._new_detectors(name) for name in self.segments}
         self._turn = 0
 
@@ -628,9 +631,20 @@ class InertialTracker:
         kept = [number for number, each in enumerate(felt) if each is not None]
         segments = [listening[number][1].segment for number in kept]
         table = likelihood_by_motion([each for each in felt if each is not None], self._bones(segments))
+        for row, number in enumerate(kept):
+            said = self._by_pose.get(self._stated(listening[number][1]), {})
+            table[row] += [said.get(segment, 0.0) for segment in segments]
         found = assign(segments, table)
         if found.exchanged:
             self._exchange([listening[number][1] for number in kept], found.segments)
+
+    def _note_pose(self, sensors: Sequence[WornSensor], table: FloatArray) -> None:
+        """Keep what a pose tells of where each sensor is, beside what motion will."""
+        for sensor, row in zip(sensors, table, strict=True):
+            worth = np.maximum(row - row.max(), -_POSE_TELLS)
+            self._by_pose[self._stated(sensor)] = dict(
+                zip((each.segment for each in sensors), worth.tolist(), strict=True)
+            )
 
     def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> None:
         """Sensors are on other segments than was thought."""
@@ -638,6 +652,7 @@ class InertialTracker:
         moved = [(sensor, segment) for sensor, segment in moved if sensor.segment != segment]
         for sensor, segment in moved:
             stated = self._stated(sensor)
+            self._slips.pop(segment, None)  # it looked like one
             self.counters["exchanged sensors"] += 1
             if segment == stated:
                 self._exchanged.pop(stated, None)
@@ -745,10 +760,10 @@ class InertialTracker:
         measured = np.array([mean_rotation(stream.rotations) for stream in held])
         posed = self._poses[name][[self._model.segment_names.index(each) for each in segments]]
         meant = self._meant[numbers]
-        if faced is None and len(segments) > 1:
-            table = likelihood_by_pose(
-                segments, measured, posed, meant, common_heading=bool(self._magnetic[numbers].all())
-            )
+        magnetic = bool(self._magnetic[numbers].all())
+        if len(segments) > 1 and (faced is None or magnetic):
+            table = likelihood_by_pose(segments, measured, posed, meant, common_heading=magnetic)
+            self._note_pose([sensor for _, sensor in listening], table)
             found = assign(segments, table)
             if found.exchanged:
                 self._exchange([sensor for _, sensor in listening], found.segments)

@@ -11,6 +11,7 @@ from body_tracking.inertial.alignment import AlignmentError, pose_covariance, po
 from body_tracking.inertial.clock import Turning
 from body_tracking.inertial.detection import (
     SLIP_TIME,
+    SURE,
     SlipDetector,
     assign,
     likelihood_by_motion,
@@ -88,14 +89,40 @@ def test_a_pose_of_sensors_with_headings_of_their_own_tells_the_trunk_from_an_ar
 
 def test_what_is_not_sure_is_not_named_and_no_table_is_refused() -> None:
     table = np.zeros((5, 5))
-    table[1, 3] = table[3, 1] = 2.0
+    table[1, 3] = table[3, 1] = SURE - 0.1
     assert assign(WORN, table).exchanged == ()
-    table[1, 3] = table[3, 1] = 4.0
+    table[1, 3] = table[3, 1] = SURE + 0.1
     table[2, 4] = 0.5
     found = assign(WORN, table)
     assert found.exchanged == (("upper_arm_left", "upper_arm_right"), ("upper_arm_right", "upper_arm_left"))
     with pytest.raises(AlignmentError, match="finite"):
         assign(WORN, np.full((5, 5), np.nan))
+
+
+def test_that_both_bones_of_an_arm_turn_alike_makes_no_exchange() -> None:
+    """Tables of a simulated person who reaches before a Kinect: first with exchanged forearms, then without."""
+    names = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+    forearms = np.array(
+        [
+            [16.5, 0.2, 0.0, 1.5, 2.9],
+            [0.2, 19.7, 20.7, 1.7, 0.8],
+            [3.0, 1.0, 0.6, 12.7, 13.9],
+            [3.8, 1.4, 0.8, 13.2, 15.1],
+            [2.3, 11.3, 8.0, 2.1, 1.7],
+        ]
+    )
+    found = assign(names, forearms)
+    assert found.exchanged == (("forearm_left", "forearm_right"), ("forearm_right", "forearm_left"))
+    right = np.array(
+        [
+            [17.6, 0.5, 0.1, 1.7, 3.2],
+            [0.1, 20.6, 32.8, 0.0, 0.0],
+            [0.3, 26.4, 31.8, 0.0, 0.0],
+            [3.0, 0.0, 0.0, 21.1, 17.7],
+            [3.6, 0.0, 0.0, 23.2, 19.4],
+        ]
+    )
+    assert assign(names, right).exchanged == ()
 
 
 def test_a_slip_is_found_within_seconds_and_noise_and_outliers_are_none() -> None:

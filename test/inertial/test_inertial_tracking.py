@@ -121,6 +121,19 @@ def test_two_exchanged_sensors_are_named_and_taken_for_what_they_are(wrists: Fed
         assert covered(fed, segment, 20.0).mean() > 0.9
 
 
+def test_arms_that_move_alike_are_told_apart_by_the_pose_where_the_field_tells_headings() -> None:
+    crossed = (
+        sensor("forearm_left", "forearm_right", magnetometer=True),
+        sensor("forearm_right", "forearm_left", magnetometer=True),
+    )
+    fed = feed(recorded("arm_raises", crossed, seed=4))
+    assert "forearm_left: its sensor is on forearm_right" in lines(fed, 4.0)
+    assert "forearm_right: its sensor is on forearm_left" in lines(fed, 4.0)
+    assert not any("slipped" in line for line in lines(fed, 0.0))
+    for segment in FOREARMS:
+        assert covered(fed, segment, 20.0).mean() > 0.9
+
+
 @pytest.mark.parametrize("oriented", [False, True], ids=["raw", "oriented"])
 def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
     imus = (sensor("forearm_left", magnetometer=True, oriented=oriented),)
