@@ -104,6 +104,10 @@ _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
+_OF_SPEED = 16.0
+"""1/s: beside orientations the density of a joint's acceleration besides, per square of its speed. Who swings a limb
+twice a second accelerates it by 4 pi times its speed for about a tenth of a second; what a pose is too slow to follow
+is taken for errors of the sources."""
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
@@ -481,6 +485,9 @@ class ExtendedKalmanFilter:
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self._limb_points = self._limb_table()
         self._quick = self._quick_table()
+        self._swift = np.zeros((len(self._quick), self._nv), dtype=np.bool_)
+        for segment, turning in enumerate(self._quick):
+            self._swift[segment, turning[turning >= 6]] = True
         self._slow_size = 3 * self._points + len(self._limbs)
         self._thumbs, self._by_thumbs = self._thumb_tables()
         # of the flat covariance the diagonals of its blocks: tangent, velocities, and between these
@@ -1103,6 +1110,9 @@ class ExtendedKalmanFilter:
         fade = math.exp(-dt / tau)
         reach = tau * (1.0 - fade)
         density = np.exp(state.log_density)[self._group]
+        if state.sources.names:
+            speeds = (self._group_sum @ (state.velocity * state.velocity))[self._group]
+            density += _OF_SPEED * self._swift[state.sources.segments].any(axis=0) * speeds
         step = reach * state.velocity
         q = self.model.integrate(state.q, step)
 
