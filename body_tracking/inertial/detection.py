@@ -1,10 +1,10 @@
 """Which sensor is where it should not be: exchanged with another one, or slipped.
 
 **Exchanged.** How well each of k streams goes with each of k segments is a table of log likelihoods; the assignment
-with the highest sum (Kuhn and Munkres) tells of an exchange, where being where they are said to be is worth something
-of its own to each sensor: forearm and upper arm of one side turn so much alike that either fits the other. From a
-skeleton: of the
-rate at which a bone turns, the correlation rho with that of the sensor's over n' independent samples is worth
+with the highest sum (Kuhn and Munkres) tells of an exchange, where being where it is said to be is worth something of
+its own to each sensor: forearm and upper arm of one side turn so much alike that either fits the other. From a
+skeleton: of the rate at which a bone turns, the correlation rho with that of the sensor's over n' independent samples
+is worth
 
     - n' / 2 log(1 - rho^2),  0 for rho < 0                                                                         (13)
 
