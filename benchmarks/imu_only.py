@@ -34,7 +34,8 @@ import numpy as np
 
 from body_tracking.filters.ekf import ExtendedKalmanFilter
 from body_tracking.inertial.alignment import rotation_vectors
-from body_tracking.inertial.tracking import InertialTracker, TrackingParameters
+from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.tracking import InertialTracker
 from body_tracking.sensors.imu import ImuSample
 from body_tracking.simulation.bags import draw_clock
 from body_tracking.simulation.imus import IDEAL, ImuSamples, SimulatedImu, usual_mounting

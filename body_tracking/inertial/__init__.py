@@ -3,7 +3,8 @@
 ``clock`` finds a clock's offset from motion, ``alignment`` how a sensor is turned against its segment, ``heading``
 keeps that and the heading of every sensor over time, ``detection`` finds exchanged and slipped sensors, ``posture``
 makes a configuration of the body model of segments' orientations. ``worn`` takes the readings of one sensor,
-``mounting`` says how it is meant to be put on, and ``tracking`` makes a source of all of it. Arrays in, small
+``timing`` brings their clocks together, ``mounting`` says how they are meant to be put on, ``held_pose`` when a pose is
+held, ``body`` makes a skeleton, and ``tracking`` with its ``parameters`` a source of all of it. Arrays in, small
 dataclasses out; it knows ``skeleton``, ``orientation``, ``kinematics``, the inertial readings of ``sensors`` and the
 clock fit of ``calibration``, neither files nor ROS. The node ``imu_skeleton`` and the filters may import it.
 

@@ -171,6 +171,20 @@ class Alignment:
         result: FloatArray = yaw(self.headings[number]) @ rotations @ self.rotations[number]
         return result
 
+    def replaced(self, part: Alignment) -> Alignment:
+        """With other knowledge of some of its sensors, that has nothing in common with what is known of the others.
+
+        Raises:
+            AlignmentError: one of a segment that carries no sensor here.
+        """
+        numbers = numbers_of(self, *part.segments)
+        rotations, headings, covariance = self.rotations.copy(), self.headings.copy(), self.covariance.copy()
+        rotations[numbers], headings[numbers] = part.rotations, wrapped(part.headings)
+        rows = (4 * numbers[:, None] + np.arange(4)).reshape(-1)
+        covariance[rows], covariance[:, rows] = 0.0, 0.0
+        covariance[np.ix_(rows, rows)] = part.covariance
+        return Alignment(self.segments, rotations, headings, covariance)
+
     def moved(self, error: FloatArray, covariance: FloatArray) -> Alignment:
         """Corrected by (4 k,) as of the covariance's coordinates."""
         parts = error.reshape(-1, 4)

@@ -1,13 +1,8 @@
 """Inertial sensors as a source: readings in, orientations of segments and a skeleton in ``world`` out.
 
 Puts together what the other modules of this package find: each sensor's orientation in an earth of its own (``worn``),
-its alignment and heading by a pose, by elbows and by what a camera sees (``alignment``, ``heading``), its clock
-(``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``posture``).
-
-Clocks: everything comes out in the clock of the camera's skeletons, or in that of receipt where there is no camera. The
-times of receipt of both tell the offset to within what their transports differ by; motion tells that difference. Of the
-camera those of its own frames count, where these are heard: skeletons in ``world`` come later by what fusion takes,
-which is another time in every run.
+its alignment and heading by a pose, by elbows and by what a camera sees (``held_pose``, ``alignment``, ``heading``),
+its clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
 
 Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
 all headings drifts, and says so.
@@ -16,9 +11,9 @@ all headings drifts, and says so.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -26,48 +21,32 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
-    Pose,
-    StillPeriod,
     Stream,
     align_in_pose,
     mean_rotation,
-    pose_covariance,
-    pose_of,
-    pose_rotations,
-    still_periods,
-    wrapped,
     yaw,
 )
+from body_tracking.inertial.body import WornBody, joint_variances
 from body_tracking.inertial.clock import Turning, clock_offset
 from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by_motion, likelihood_by_pose
 from body_tracking.inertial.heading import HEADING_WALK, JOINTS, HeadingTracker, bone_of
+from body_tracking.inertial.held_pose import HeldPose, PoseFinder
 from body_tracking.inertial.mounting import mountings as meant_mountings
-from body_tracking.inertial.posture import OrientationKinematics
-from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, ReceiptClock, WornSensor
+from body_tracking.inertial.parameters import ARMS_DOWN, AUTO, REFERENCE, T_POSE, TrackingParameters
+from body_tracking.inertial.timing import JUMP_NS, SensorClocks
+from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, WornSensor
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.lengths import SkeletonLengths
-from body_tracking.kinematics.upper_body import PARENTS, UpperBody
-from body_tracking.measurement import BASE_STDDEV, body_heading
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.orientation import SegmentOrientation
-from body_tracking.parameters import number_field
 from body_tracking.sensors.imu import ImuSample
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
-AUTO, T_POSE, ARMS_DOWN = "auto", "t_pose", "arms_down"
-OWN, SHARED, REFERENCE = "own", "shared", "reference"
-_POSES: Final[Mapping[str, Pose]] = {T_POSE: "t", ARMS_DOWN: "n"}
-
-_JUMP_NS = NANOSECONDS
 _STEP_NS = NANOSECONDS // 10
 """How often what changes slowly is looked at."""
 _POSE_S, _POSE_EVERY_S = 1.6, 0.25
 """Seconds of readings in which a pose is looked for, and how often."""
 _ASKED_S = 15.0
 """Seconds within which a pose that was asked for must be held."""
-_FACING = float(np.radians(8.0))
-"""Radians by which a skeleton's shoulders tell wrongly where a person faces."""
-_CAMERA_CONE = float(np.radians(40.0))
-"""Radians within which a camera sees the arms as a pose has them."""
 _CAMERA_LASTS = 12.0
 """Times as long as ``heading`` has it that a camera misreads a bone alike, by where it takes people's joints to be."""
 _CAMERA_SLIPS = 3.0
@@ -82,8 +61,6 @@ _DRIFT_S, _LOST = 1.0, 0.05
 """Seconds between two looks at drift, and rad2 at once by which a heading is lost rather than drifts."""
 _CLOCK_EVERY_S, _CHECK_EVERY_S, _LOOK_BACK_S = 3.0, 5.0, 30.0
 _CLOCK_WINDOW = 0.5
-_TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
-"""Seconds by which transports differ, per root second by which that changes, and that motion tells at best."""
 _SLIP_WINDOWS = 6.0, 18.0
 """Seconds: large slips are seen soon, those hardly larger than a camera's errors late."""
 _NAMED_S = 60.0
@@ -95,80 +72,11 @@ _FAR_HEADING = 0.5
 _MAGNETIC_WALK = 0.1 * HEADING_WALK
 _RATE_STDDEV, _RATE_SHARE = 0.05, 0.1
 """rad/s, and share of itself, that a segment's rate is off, mostly by the flesh."""
-_BASE_STDDEV, _BASE_UNKNOWN = 0.05, 1.0
-"""Metres: of the base where a camera sees it, and where nobody knows."""
-_BASE_WALK = 0.3
-"""Metres per root second that the base is known less well when the camera does not see it."""
-_STANDING: Final = np.array([0.0, 0.0, 1.0])
 _EYE3 = np.eye(3)
-_SMALL: Final = 1e-4 * np.eye(3)
-_CARRIERS: Final = {
-    "SPINE_BASE": "pelvis",
-    "HIP": "pelvis",
-    "SPINE_MID": "lower_trunk",
-    "SPINE_SHOULDER": "upper_trunk",
-    "NECK": "upper_trunk",
-    "HEAD": "head",
-    "SHOULDER": "clavicle",
-    "ELBOW": "upper_arm",
-    "WRIST": "forearm",
-    "HAND": "hand",
-    "HAND_TIP": "hand",
-    "THUMB": "hand",
-}
-"""Of each kind of joint the segment that it is a point of."""
-_LITTLE_MOVED: Final = ("lower_trunk", "clavicle_left", "clavicle_right")
-_TRUNK: Final = ("pelvis", "upper_trunk")
 
 
 class InertialTrackingError(BodyTrackingError):
     """Sensors that cannot be tracked as was asked for."""
-
-
-def _choice(default: str, doc: str, *choices: str) -> Any:
-    return field(default=default, metadata={"doc": doc, "choices": choices})
-
-
-@dataclass(frozen=True, slots=True)
-class TrackingParameters:
-    """What inertial sensors are taken for; each field's metadata says what it is, its unit and its range."""
-
-    pose: str = _choice(
-        AUTO,
-        "in which pose the sensors are aligned with the body: T-pose with palms down, or arms hanging with thumbs "
-        "forward; auto: the first of the two that is held for a second",
-        AUTO,
-        T_POSE,
-        ARMS_DOWN,
-    )
-    camera: bool = field(
-        default=True,
-        metadata={"doc": "take headings, slips and clocks from a camera's skeletons; false: inertial sensors alone"},
-    )
-    clock: str = _choice(
-        OWN,
-        "own: each sensor has a clock of its own; shared: all have the same; reference: they have that of world",
-        OWN,
-        SHARED,
-        REFERENCE,
-    )
-    magnetometer: bool = field(
-        default=True, metadata={"doc": "use magnetic fields, where there are any and while they are undisturbed"}
-    )
-    swap_exchanged: bool = field(
-        default=True,
-        metadata={"doc": "take sensors that are found on each other's segments for what they are; false: only tell"},
-    )
-    rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
-    orientation_rate: float = number_field(50.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
-    largest_stddev: float = number_field(
-        0.6, "tell no orientation that is known less well than this about any axis", "rad", 0.01, 2.0
-    )
-    mounting_stddev: float = number_field(
-        0.17, "by how much sensors are put on otherwise than meant, per axis", "rad", 0.001, 2.0
-    )
-    silent_after: float = number_field(0.5, "a sensor that says nothing for longer is silent", "s", 0.05, 60.0)
-    stature: float = number_field(1.75, "of the person, until a camera has measured the segments", "m", 0.5, 2.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,24 +93,6 @@ class Told:
 
 
 _NOTHING: Final = Told()
-
-
-@dataclass(slots=True)
-class _Transports:
-    """Seconds by which a sensor's stamps come later than by the times of receipt, and how sure that is."""
-
-    offset: float = 0.0
-    variance: float = _TRANSPORTS**2
-    stamp: float = 0.0
-    found: int = 0
-
-    def correct(self, stamp: float, offset: float, stddev: float) -> None:
-        """By what motion tells (a scalar Kalman filter)."""
-        self.variance += _TRANSPORTS_WALK**2 * max(0.0, stamp - self.stamp)
-        gain = self.variance / (self.variance + stddev**2 + _OFFSET_FLOOR**2)
-        self.offset += gain * (offset - self.offset)
-        self.variance *= 1.0 - gain
-        self.stamp, self.found = stamp, self.found + 1
 
 
 class InertialTracker:
@@ -240,42 +130,39 @@ class InertialTracker:
         self._meant = meant_mountings(self.segments, mountings)
         self._world = world
         self.counters: Counter[str] = Counter()
-        self._kinematics: dict[tuple[str, ...], tuple[OrientationKinematics, BoolArray]] = {}
-        self._poses = {name: pose_rotations(self._model, pose) for name, pose in _POSES.items()}
+        self._poses = PoseFinder(self._model)
         self._sensors = {name: WornSensor(name, magnetometer=self.parameters.magnetometer) for name in self.segments}
         self._begin()
 
     def _begin(self) -> None:
         """Know nothing of the person and of time."""
-        k = len(self.segments)
-        prior = np.tile([self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING], k)
-        self._tracker = HeadingTracker(Alignment(self.segments, self._meant, np.zeros(k), np.diag(prior)))
+        self._magnetic = np.zeros(len(self.segments), dtype=np.bool_)
+        self._tracker = self._new_tracker(self._unaligned(self.segments))
         self._last = 0.0
         self._epoch_ns: int | None = None
         self.aligned = False
         self._asked_until: float | None = None
-        self._asked_pose = AUTO
-        self._magnetic = np.zeros(k, dtype=np.bool_)
-        self._all_clocks = ReceiptClock()
-        self._camera_clock = ReceiptClock()
-        self._frame_ns: int | None = None
-        self._transports = {name: _Transports() for name in self.segments}
+        self._clocks = SensorClocks(self.parameters.clock, self.segments)
         self._pending: deque[Skeleton] = deque()
         self._seen: deque[Skeleton] = deque()
-        self._base: tuple[int, FloatArray] | None = None
-        self._lengths = SkeletonLengths()
+        self._body = WornBody(self._model, self.parameters.stature, self._world)
         self._first_ns: int | None = None
         self._received_ns: int | None = None
         self._newest_ns: int | None = None
         self._due: dict[str, float] = {}
         self._told_ns: dict[str, int] = {}
         self._skeleton_ns: int | None = None
-        self._posture: FloatArray | None = None
         self._slips: dict[str, tuple[float, str]] = {}
         self._exchanged: dict[str, str] = {}
         self._by_pose: dict[str, dict[str, float]] = {}
         self._detectors = {name: self._new_detectors(name) for name in self.segments}
         self._turn = 0
+
+    def _unaligned(self, segments: Sequence[str]) -> Alignment:
+        """Sensors put on as they were meant to, of any heading."""
+        prior = np.tile([self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING], len(segments))
+        meant = self._meant[[self.segments.index(name) for name in segments]]
+        return Alignment(tuple(segments), meant, np.zeros(len(segments)), np.diag(prior))
 
     @staticmethod
     def _new_detectors(segment: str) -> tuple[SlipDetector, ...]:
@@ -290,7 +177,7 @@ class InertialTracker:
 
     def align(self) -> str:
         """Align anew in the next pose that is held; what is said to who asked."""
-        self._asked_until, self._asked_pose = self._last + _ASKED_S, self.parameters.pose
+        self._asked_until = self._last + _ASKED_S
         what = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
         return f"hold {what}, for a second and within the next {_ASKED_S:.0f} s"
 
@@ -331,8 +218,7 @@ class InertialTracker:
         for number, name in enumerate(self.segments):
             values[f"{name} alignment deg"] = round(float(np.sqrt((stddev[number, :3] ** 2).mean())), 1)
             values[f"{name} heading deg"] = round(float(stddev[number, 3]), 1)
-            if self._transports[name].found:
-                values[f"{name} clock ms"] = round(1e3 * self._transports[name].offset, 1)
+        values |= {f"{name} clock ms": round(1e3 * offset, 1) for name, offset in self._clocks.found.items()}
         return values
 
     # --- readings
@@ -354,8 +240,7 @@ class InertialTracker:
         self._receive(received_ns)
         sensor = self._sensors[segment]
         felt = sensor.take(sample, received_ns)
-        if self.parameters.clock == SHARED:
-            self._all_clocks.add(sample.stamp_ns, received_ns)
+        self._clocks.take(sample.stamp_ns, received_ns)
         if felt is None or sensor.problems:
             return _NOTHING
         stamp_ns = self._to_reference(sensor, felt.stamp_ns)
@@ -366,7 +251,7 @@ class InertialTracker:
         if now >= self._due.get("step", -np.inf):
             self._due["step"] = now + _STEP_NS / NANOSECONDS
             self._step(now, stamp_ns)
-        return Told(self._orientation(sensor, felt, stamp_ns), self._body(stamp_ns))
+        return Told(self._orientation(sensor, felt, stamp_ns), self._skeleton(stamp_ns))
 
     def hear(self, stamp_ns: int, received_ns: int) -> None:
         """Note when a frame of the camera whose clock is that of ``world`` was received.
@@ -378,11 +263,7 @@ class InertialTracker:
         if not self.parameters.camera:
             return
         self._receive(received_ns)
-        before, self._frame_ns = self._frame_ns, stamp_ns
-        if before is None or stamp_ns <= before - _JUMP_NS:
-            self._camera_clock.reset()
-        known = self._camera_clock.delay_ns is not None
-        if not self._camera_clock.add(stamp_ns, received_ns) or not known:
+        if self._clocks.hear(stamp_ns, received_ns):
             self._rebase()
 
     def see(self, skeleton: Skeleton, received_ns: int) -> None:
@@ -395,15 +276,11 @@ class InertialTracker:
         if not self.parameters.camera:
             return
         self._receive(received_ns)
-        newest, heard = self._newest_ns, self._frame_ns is not None
-        first = not heard and self._camera_clock.delay_ns is None
-        if newest is not None and newest - _JUMP_NS < skeleton.stamp_ns <= newest:
+        newest, first = self._newest_ns, not self._clocks.camera_known
+        if newest is not None and newest - JUMP_NS < skeleton.stamp_ns <= newest:
             self.counters["camera's late frames"] += 1
             return
-        jumped = newest is not None and skeleton.stamp_ns <= newest
-        if jumped and not heard:
-            self._camera_clock.reset()
-        jumped |= not heard and not self._camera_clock.add(skeleton.stamp_ns, received_ns)
+        jumped = self._clocks.see(skeleton.stamp_ns, received_ns, newest is not None and skeleton.stamp_ns <= newest)
         if jumped:
             self.counters["camera's time jumped"] += 1
             self._pending.clear()
@@ -415,15 +292,10 @@ class InertialTracker:
         self._seen.append(skeleton)
         while skeleton.stamp_ns - self._seen[0].stamp_ns > _LOOK_BACK_S * NANOSECONDS:
             self._seen.popleft()
-        if skeleton.valid[Joint.SPINE_BASE]:
-            self._base = skeleton.stamp_ns, skeleton.positions[Joint.SPINE_BASE]
-        known = skeleton.valid[self._model.joints]
-        points = np.where(known[:, None], skeleton.positions[self._model.joints], np.nan)
-        variance = np.where(known, _variance(skeleton)[self._model.joints], np.inf)
-        self._lengths.update(skeleton.stamp_ns, points, variance)
+        self._body.see(skeleton)
 
     def _receive(self, received_ns: int) -> None:
-        if self._received_ns is not None and received_ns < self._received_ns - _JUMP_NS:
+        if self._received_ns is not None and received_ns < self._received_ns - JUMP_NS:
             self.counters["time jumps"] += 1
             self.reset()
         self._received_ns = received_ns
@@ -444,15 +316,7 @@ class InertialTracker:
         return stamp_ns + self._offset_ns(sensor)
 
     def _offset_ns(self, sensor: WornSensor) -> int:
-        if self.parameters.clock == REFERENCE:
-            return 0
-        own = (self._all_clocks if self.parameters.clock == SHARED else sensor.clock).delay_ns
-        camera = self._camera_clock.delay_ns
-        assert own is not None  # it has said something
-        return own - (0 if camera is None else camera) - round(self._transport(sensor).offset * NANOSECONDS)
-
-    def _transport(self, sensor: WornSensor) -> _Transports:
-        return self._transports[self.segments[0] if self.parameters.clock == SHARED else self._stated(sensor)]
+        return self._clocks.offset_ns(self._stated(sensor), sensor.clock)
 
     def _stated(self, sensor: WornSensor) -> str:
         return next(name for name, each in self._sensors.items() if each is sensor)
@@ -556,7 +420,7 @@ class InertialTracker:
         """Headings, alignments and slips by the bones of a skeleton."""
         if not self._is_due("bones", now, 0.9 * _STEP_NS / NANOSECONDS):
             return
-        variance, valid = _variance(skeleton), skeleton.valid
+        variance, valid = joint_variances(skeleton), skeleton.valid
         for _, sensor in self._listening(skeleton.stamp_ns):
             segment = sensor.segment
             bone, rotation = bone_of(segment), sensor.at(skeleton.stamp_ns - self._offset_ns(sensor))
@@ -618,8 +482,7 @@ class InertialTracker:
             return
         found = clock_offset(seen, felt, window=_CLOCK_WINDOW)
         if found is not None and sensor.segment not in self._exchanged.values():
-            transport = self._transport(sensor)
-            transport.correct(now, transport.offset + found.offset, found.offset_stddev)
+            self._clocks.correct(self._stated(sensor), now, found.offset, found.offset_stddev)
             self.counters["clocks by motion"] += 1
 
     def _look_for_exchange(self, now: float, stamp_ns: int) -> None:
@@ -660,19 +523,11 @@ class InertialTracker:
                 self._exchanged[stated] = segment
         if not self.parameters.swap_exchanged:
             return
-        a = self.alignment
-        rotations, headings, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
         for sensor, segment in moved:
             sensor.segment = segment
-            number = self.segments.index(segment)
-            rows = slice(4 * number, 4 * number + 4)
-            covariance[rows], covariance[:, rows] = 0.0, 0.0
-            own = [self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING]
-            covariance[rows, rows] = np.diag(own)
-            rotations[number], headings[number] = self._meant[number], 0.0
-            self._magnetic[number] = sensor.has_field
+            self._magnetic[self.segments.index(segment)] = sensor.has_field
             self._detectors[segment] = self._new_detectors(segment)
-        self._tracker = self._new_tracker(Alignment(a.segments, rotations, headings, covariance))
+        self._tracker = self._new_tracker(self.alignment.replaced(self._unaligned([each for _, each in moved])))
 
     # --- a pose
 
@@ -691,116 +546,58 @@ class InertialTracker:
         streams = [self._stream(sensor, self._recent(sensor, stamp_ns, _POSE_S)) for _, sensor in listening]
         if any(len(stream.stamps) < 2 for stream in streams):
             return
-        periods = still_periods(streams)
-        if not periods or periods[-1].end < now - 0.5:
-            return
-        period = periods[-1]
-        numbers = [number for number, _ in listening]
         seen = self._seen[-1] if self._seen and abs(self._seen[-1].stamp_ns - stamp_ns) < _FRESH_NS else None
         if self._seen and seen is None:
             return  # the camera knows where the person faces, but not now
-        name = self.parameters.pose
-        if name == AUTO:
-            pose = pose_of(streams, self._meant[numbers], period)
-            if pose is None:
-                return
-            name = next(each for each, letter in _POSES.items() if letter == pose)
-        arms = any(stream.segment.startswith("upper_arm") for stream in streams)
-        if seen is not None and not self._looks_like(seen, name):
-            return
-        if seen is None and not asked and not arms:
-            return  # forearms alone do not tell a pose from hands on a table
-        held = [stream.between(period.begin, period.end) for stream in streams]
-        facing = 0.0 if seen is None else self._faced(period)
-        if facing is not None:
-            self._align(name, listening, held, facing if seen is not None else None)
-        self._asked_until = None
-
-    def _faced(self, period: StillPeriod) -> float | None:
-        """Radians from world's x, which way the person faced in a pose, as the camera saw it."""
         assert self._epoch_ns is not None
-        begin, end = (self._epoch_ns + round(each * NANOSECONDS) for each in (period.begin, period.end))
-        found = [_facing(each) for each in self._seen if begin <= each.stamp_ns <= end]
-        turns = np.exp(1j * np.array([each for each in found if each is not None]))
-        return float(np.angle(turns.mean())) if len(turns) else None
+        lately = [
+            ((each.stamp_ns - self._epoch_ns) / NANOSECONDS, each)
+            for each in self._seen
+            if stamp_ns - each.stamp_ns < 2.0 * _POSE_S * NANOSECONDS
+        ]
+        meant = self._meant[[number for number, _ in listening]]
+        held = self._poses.find(streams, meant, self.parameters.pose, now, lately, asked=asked)
+        if held is not None:
+            self._align(held, listening)
+            self._asked_until = None
 
-    def _looks_like(self, skeleton: Skeleton, name: str) -> bool:
-        """Whether a camera sees the arms in a pose, as far as it sees them."""
-        facing = _facing(skeleton)
-        if facing is None:
-            return False
-        valid = skeleton.valid
-        for side in ("left", "right"):
-            for part in ("upper_arm", "forearm"):
-                bone = bone_of(f"{part}_{side}")
-                assert bone is not None
-                if not (valid[bone.start] and valid[bone.end]):
-                    continue
-                way = skeleton.positions[bone.end] - skeleton.positions[bone.start]
-                expected = (
-                    yaw(facing) @ self._poses[name][self._model.segment_names.index(f"{part}_{side}")] @ bone.axis
-                )
-                if float(way @ expected) < np.cos(_CAMERA_CONE) * float(np.linalg.norm(way)):
-                    return False
-        return True
-
-    def _align(
-        self, name: str, listening: Sequence[tuple[int, WornSensor]], held: Sequence[Stream], faced: float | None
-    ) -> None:
-        """The sensors that were there are aligned by a pose; of others nothing changes.
-
-        Args:
-            name: of the pose.
-            listening: the sensors.
-            held: what they felt meanwhile.
-            faced: which way a camera saw the person face, radians; None without one.
-        """
+    def _align(self, held: HeldPose, listening: Sequence[tuple[int, WornSensor]]) -> None:
+        """The sensors that were there are aligned by a pose; of others nothing changes."""
         numbers = [number for number, _ in listening]
         segments = [self.segments[number] for number in numbers]
-        measured = np.array([mean_rotation(stream.rotations) for stream in held])
-        posed = self._poses[name][[self._model.segment_names.index(each) for each in segments]]
-        meant = self._meant[numbers]
+        measured = np.array([mean_rotation(stream.rotations) for stream in held.streams])
+        posed = self._poses.rotations(held.name, segments)
         magnetic = bool(self._magnetic[numbers].all())
-        if len(segments) > 1 and (faced is None or magnetic):
-            table = likelihood_by_pose(segments, measured, posed, meant, common_heading=magnetic)
+        if len(segments) > 1 and (held.facing is None or magnetic):
+            table = likelihood_by_pose(segments, measured, posed, self._meant[numbers], common_heading=magnetic)
             self._note_pose([sensor for _, sensor in listening], table)
             found = assign(segments, table)
             if found.exchanged:
                 self._exchange([sensor for _, sensor in listening], found.segments)
                 if self.parameters.swap_exchanged:
                     return  # aligned as what they are the next time
-        facing = 0.0 if faced is None else faced
-        spread = pose_covariance(self._model, _POSES[name], segments)
-        if faced is not None:
-            up = (yaw(facing) @ posed)[:, 2].reshape(-1)
-            spread = spread + _FACING**2 * np.outer(up, up)
         a = self.alignment
         places = [4 * number + 3 for number in numbers]
         own = a.covariance[np.ix_(places, places)]
         headings: FloatArray | None = None
-        if faced is not None and float(own.diagonal().max()) < _FAR_HEADING**2:
+        if held.facing is not None and float(own.diagonal().max()) < _FAR_HEADING**2:
             headings = a.headings[numbers]
         elif all(sensor.has_field and not sensor.disturbed for _, sensor in listening):
             # all face the same way, whichever that is
             variances = [felt.covariance[2, 2] for _, sensor in listening if (felt := sensor.latest) is not None]
             headings, own = np.zeros(len(numbers)), UNKNOWN_HEADING + np.diag(variances)
-        found_alignment = align_in_pose(
+        part = align_in_pose(
             segments,
             measured,
             posed,
-            spread,
-            mountings=meant,
+            self._poses.covariance(held, segments),
+            mountings=self._meant[numbers],
             mounting_stddev=self.parameters.mounting_stddev,
             headings=headings,
             heading_covariance=None if headings is None else own,
-            facing=facing,
+            facing=0.0 if held.facing is None else held.facing,
         )
-        rotations, turns, covariance = a.rotations.copy(), a.headings.copy(), a.covariance.copy()
-        rows = np.concatenate([np.arange(4 * number, 4 * number + 4) for number in numbers])
-        rotations[numbers], turns[numbers] = found_alignment.rotations, found_alignment.headings
-        covariance[rows], covariance[:, rows] = 0.0, 0.0
-        covariance[np.ix_(rows, rows)] = found_alignment.covariance
-        self._tracker = self._new_tracker(Alignment(a.segments, rotations, wrapped(turns), covariance))
+        self._tracker = self._new_tracker(a.replaced(part))
         self._detectors = {each: self._new_detectors(each) for each in self.segments}
         for each in segments:
             self._slips.pop(each, None)
@@ -844,7 +641,7 @@ class InertialTracker:
 
     def _orientation(self, sensor: WornSensor, felt: Felt, stamp_ns: int) -> SegmentOrientation | None:
         last = self._told_ns.get(sensor.segment)
-        if last is not None and -_JUMP_NS < stamp_ns - last < 0.9 * NANOSECONDS / self.parameters.orientation_rate:
+        if last is not None and -JUMP_NS < stamp_ns - last < 0.9 * NANOSECONDS / self.parameters.orientation_rate:
             return None
         number = self.segments.index(sensor.segment)
         world, covariance = self._placed(number, felt, felt.rotation)
@@ -863,7 +660,7 @@ class InertialTracker:
             self._world,
         )
 
-    def _body(self, stamp_ns: int) -> Skeleton | None:
+    def _skeleton(self, stamp_ns: int) -> Skeleton | None:
         """The body that fits all orientations, when one is due."""
         period = NANOSECONDS / self.parameters.rate
         if self._skeleton_ns is not None and stamp_ns - self._skeleton_ns < 0.98 * period:
@@ -881,49 +678,7 @@ class InertialTracker:
         if not segments:
             return None
         self._skeleton_ns = stamp_ns
-        names = tuple(segments)
-        if names not in self._kinematics:
-            self._kinematics[names] = OrientationKinematics(self._model, names), _placed_by(self._model, names)
-        kinematics, placed = self._kinematics[names]
-        self._posture, covariance = kinematics.solve(np.array(rotations), np.array(covariances), self._posture)
-        return self._skeleton(stamp_ns, placed, self._posture, covariance)
-
-    def _skeleton(self, stamp_ns: int, placed: BoolArray, q: FloatArray, covariance: FloatArray) -> Skeleton:
-        model = self._model
-        base, variance = _STANDING, _BASE_UNKNOWN**2
-        if self._base is not None:
-            base = self._base[1]
-            unseen = abs(stamp_ns - self._base[0]) / NANOSECONDS
-            variance = min(_BASE_STDDEV**2 + _BASE_WALK**2 * unseen, _BASE_UNKNOWN**2)
-        q = q.copy()
-        q[:3] = base
-        lengths = self._lengths.lengths if self._base is not None else model.default_lengths(self.parameters.stature)
-        lines = model.linearise(q, lengths)
-        spread = covariance.copy()
-        spread[:3] = spread[:, :3] = 0.0
-        own = lines.jacobian @ spread @ lines.jacobian.swapaxes(-1, -2) + variance * _EYE3 + _SMALL
-        positions = np.full((N_JOINTS, 3), np.nan)
-        covariances = np.tile(np.diag([np.inf] * 3), (N_JOINTS, 1, 1))
-        states = np.zeros(N_JOINTS, dtype=np.uint8)
-        positions[model.joints], covariances[model.joints] = lines.posture.positions, own
-        states[model.joints] = np.where(placed, TrackingState.TRACKED, TrackingState.INFERRED)
-        return Skeleton(stamp_ns, self._world, positions, states, 0, covariances)
-
-
-def _variance(skeleton: Skeleton) -> FloatArray:
-    """(25,) square metres per axis, of a camera's joints."""
-    if skeleton.covariances is None:
-        return BASE_STDDEV**2
-    traces: FloatArray = np.trace(skeleton.covariances, axis1=1, axis2=2) / 3.0
-    return np.where(np.isfinite(traces), traces, 1.0)
-
-
-def _facing(skeleton: Skeleton) -> float | None:
-    """Radians from world's x, which way a person faces, by shoulders and hips."""
-    left = body_heading(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
-    if not np.isfinite(left).all() or np.linalg.norm(left[:2]) < 0.05:
-        return None
-    return float(np.arctan2(-left[0], left[1]))
+        return self._body.skeleton(stamp_ns, segments, np.array(rotations), np.array(covariances))
 
 
 def _orthonormal(rotation: FloatArray) -> FloatArray:
@@ -941,24 +696,3 @@ def _joints() -> list[tuple[str, str]]:
             above = [parent] * 2 if parent == "upper_trunk" else [f"{parent}_left", f"{parent}_right"]
             found += zip(above, [f"{child}_left", f"{child}_right"], strict=True)
     return found
-
-
-def _placed_by(model: UpperBody, sensed: Sequence[str]) -> BoolArray:
-    """(19,) points whose place against the trunk sensors tell: every segment from there on carries one.
-
-    None is asked for on the spine and on the girdle, which move little, nor on more than one end of the trunk.
-    """
-    trunk = any(name in sensed for name in _TRUNK)
-    sure: dict[str, bool] = {}
-    for number, name in enumerate(model.segment_names):
-        above = PARENTS[number] < 0 or sure[model.segment_names[PARENTS[number]]]
-        sure[name] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
-    carriers = []
-    for joint in model.joints.tolist():
-        kind, _, side = Joint(joint).name.rpartition("_")
-        if side in ("LEFT", "RIGHT"):
-            carrier = _CARRIERS[kind]
-            carriers.append(carrier if carrier == "pelvis" else f"{carrier}_{side.lower()}")
-        else:
-            carriers.append(_CARRIERS[Joint(joint).name])
-    return np.array([sure[carrier] for carrier in carriers])

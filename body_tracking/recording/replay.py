@@ -36,7 +36,7 @@ from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings
-from body_tracking.inertial.tracking import TrackingParameters
+from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file

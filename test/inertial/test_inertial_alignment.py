@@ -198,6 +198,21 @@ def test_an_elbow_that_does_not_move_says_nothing() -> None:
         align_by_elbow(start, "left", *streams)
 
 
+def test_what_is_replaced_has_nothing_in_common_with_what_stays() -> None:
+    rng = np.random.default_rng(0)
+    spread = rng.normal(size=(12, 12))
+    whole = Alignment(WORN[:3], random_rotations(rng, 3), rng.normal(size=3), spread @ spread.T)
+    part = Alignment((WORN[2], WORN[0]), random_rotations(rng, 2), np.array([0.1, 7.0]), 2.0 * np.eye(8))
+    found = whole.replaced(part)
+    np.testing.assert_array_equal(found.rotations, [part.rotations[1], whole.rotations[1], part.rotations[0]])
+    np.testing.assert_allclose(found.headings, [7.0 - 2.0 * np.pi, whole.headings[1], 0.1])
+    expected = np.diag(np.repeat([2.0, 0.0, 2.0], 4))
+    expected[4:8, 4:8] = whole.covariance[4:8, 4:8]
+    np.testing.assert_array_equal(found.covariance, expected)
+    with pytest.raises(AlignmentError, match="no sensor on forearm_left"):
+        whole.replaced(Alignment(("forearm_left",), part.rotations[:1], part.headings[:1], np.eye(4)))
+
+
 def test_the_mean_of_rotations_about_one_is_that_one() -> None:
     rng = np.random.default_rng(0)
     middle = random_rotations(rng, 1)[0]

@@ -12,7 +12,8 @@ from worn_people import FOREARMS, MODEL, Fed, feed, recorded, sensor
 from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import pose_rotations
 from body_tracking.inertial.mounting import mounting, mountings
-from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackingParameters
+from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS

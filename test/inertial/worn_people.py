@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from body_tracking.inertial.alignment import rotation_vectors
-from body_tracking.inertial.tracking import InertialTracker, TrackingParameters
+from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.tracking import InertialTracker
 from body_tracking.kinematics.upper_body import SEGMENTS, UpperBody
 from body_tracking.measurement import joint_stddev
 from body_tracking.orientation import SegmentOrientation
