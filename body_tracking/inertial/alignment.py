@@ -117,6 +117,14 @@ class Stream:
         part = slice(*np.searchsorted(self.stamps, [begin, end]))
         return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
 
+    def thinned(self, rate: float) -> Stream:
+        """At most about so many samples per second."""
+        if len(self.stamps) < 2:
+            return self
+        every = max(1, round(float(len(self.stamps) - 1) / float(np.ptp(self.stamps)) / rate))
+        part = slice(None, None, every)
+        return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
+
     def at(self, times: FloatArray, gap: float = 0.1) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Rotations and rates between samples, and where samples no further apart than a gap surround the time."""
         if len(self.stamps) < 2:
@@ -244,11 +252,13 @@ def _pose(model: UpperBody, pose: Pose) -> FloatArray:
     return q
 
 
-def pose_covariance(model: UpperBody, pose: Pose, segments: Sequence[str]) -> FloatArray:
+def pose_covariance(
+    model: UpperBody, pose: Pose, segments: Sequence[str], joint_stddev: float = POSE_STDDEV
+) -> FloatArray:
     """(3 k, 3 k) radians squared by which people's segments are off a pose, each in its own frame.
 
-    Joints are held to within :data:`POSE_STDDEV`; what is off in a proximal joint moves all that hangs on it. The flesh
-    turns each sensor besides by :data:`TISSUE_STDDEV`.
+    Joints are held to within ``joint_stddev`` radians per axis; what is off in a proximal joint moves all that hangs on
+    it. The flesh turns each sensor besides by :data:`TISSUE_STDDEV`.
 
     Raises:
         AlignmentError: a segment that the model does not have.
@@ -256,7 +266,7 @@ def pose_covariance(model: UpperBody, pose: Pose, segments: Sequence[str]) -> Fl
     unknown = [name for name in segments if name not in model.segment_names]
     if unknown:
         raise AlignmentError(f"no segment {', '.join(unknown)}")
-    stddev = np.full(model.nv, POSE_STDDEV)
+    stddev = np.full(model.nv, joint_stddev)
     stddev[:3] = 0.0
     for number, name in enumerate(model.coordinate_names):
         if name.startswith(("lumbar", "thoracic")):  # of a trunk that is held as a whole

@@ -57,9 +57,15 @@ class PoseFinder:
         """(k, 3, 3) orientations of segments in a pose of somebody who faces x."""
         return self._rotations[name][[self._model.segment_names.index(each) for each in segments]]
 
-    def covariance(self, held: HeldPose, segments: Sequence[str]) -> FloatArray:
-        """(3 k, 3 k) radians squared by which segments are off a pose, and off where the person seems to face."""
-        spread = pose_covariance(self._model, POSES[held.name], segments)
+    def covariance(self, held: HeldPose, segments: Sequence[str], stddev: float) -> FloatArray:
+        """(3 k, 3 k) radians squared by which segments are off a pose, and off where the person seems to face.
+
+        Args:
+            held: the pose.
+            segments: k names.
+            stddev: radians by which joints are off it, per axis.
+        """
+        spread = pose_covariance(self._model, POSES[held.name], segments, stddev)
         if held.facing is None:
             return spread
         up = (yaw(held.facing) @ self.rotations(held.name, segments))[:, 2].reshape(-1)

@@ -57,5 +57,19 @@ class TrackingParameters:
     mounting_stddev: float = number_field(
         0.17, "by how much sensors are put on otherwise than meant, per axis", "rad", 0.001, 2.0
     )
+    pose_stddev: float = number_field(
+        0.105,
+        "by how much the person's joints are off the pose, per axis; more for one who cannot hold it",
+        "rad",
+        0.001,
+        1.0,
+    )
+    movement: bool = field(
+        default=False,
+        metadata={
+            "doc": "half a minute after a pose, learn once from how elbows bend and turn how their sensors sit; "
+            "it tells less than a pose that is held well"
+        },
+    )
     silent_after: float = number_field(0.5, "a sensor that says nothing for longer is silent", "s", 0.05, 60.0)
     stature: float = number_field(1.75, "of the person, until a camera has measured the segments", "m", 0.5, 2.5)

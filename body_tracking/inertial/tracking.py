@@ -22,6 +22,7 @@ from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
     Stream,
+    align_by_elbow,
     align_in_pose,
     mean_rotation,
     yaw,
@@ -57,6 +58,8 @@ _FRESH_NS = NANOSECONDS // 2
 _PENDING_NS = NANOSECONDS // 20
 """A skeleton waits so long for the readings around it."""
 _ELBOW_S = 0.5
+_MOVED_S, _MOVED_RATE, _MOVEMENT_TELLS = 30.0, 10.0, 0.5
+"""Seconds of an elbow's movement that are looked at, readings per second of them, and nats that they must be worth."""
 _DRIFT_S, _LOST = 1.0, 0.05
 """Seconds between two looks at drift, and rad2 at once by which a heading is lost rather than drifts."""
 _CLOCK_EVERY_S, _CHECK_EVERY_S, _LOOK_BACK_S = 3.0, 5.0, 30.0
@@ -157,6 +160,8 @@ class InertialTracker:
         self._by_pose: dict[str, dict[str, float]] = {}
         self._detectors = {name: self._new_detectors(name) for name in self.segments}
         self._turn = 0
+        self._since = 0.0
+        self._elbows: set[str] = set()
 
     def _unaligned(self, segments: Sequence[str]) -> Alignment:
         """Sensors put on as they were meant to, of any heading."""
@@ -324,7 +329,7 @@ class InertialTracker:
     def _rebase(self) -> None:
         """Another clock counts from now on."""
         self._tracker = self._new_tracker(self.alignment)
-        self._epoch_ns, self._last = None, 0.0
+        self._epoch_ns, self._last, self._since = None, 0.0, 0.0
         self._due.clear()
         self._told_ns.clear()
         self._skeleton_ns = None
@@ -378,6 +383,8 @@ class InertialTracker:
             self._look_for_pose(now, stamp_ns)
         if self._is_due("elbow", now, _ELBOW_S):
             self._constrain(now, stamp_ns)
+        if self.parameters.movement and self._is_due("movement", now, _CHECK_EVERY_S):
+            self._look_at_movement(now, stamp_ns)
         if self._is_due("clock", now, _CLOCK_EVERY_S):
             self._look_at_clock(now, stamp_ns)
         if self._is_due("exchange", now, _CHECK_EVERY_S):
@@ -443,6 +450,8 @@ class InertialTracker:
 
     def _slipped(self, segment: str, now: float, turn: float) -> None:
         self.counters["slips"] += 1
+        self._since = now
+        self._elbows.add(segment.rpartition("_")[2])
         self._slips[segment] = now, f"{segment}: its sensor has slipped by {np.degrees(turn):.0f} deg"
         self._tracker.loosen(segment, max(turn, 0.2))
         self._detectors[segment] = self._new_detectors(segment)
@@ -523,6 +532,7 @@ class InertialTracker:
                 self._exchanged[stated] = segment
         if not self.parameters.swap_exchanged:
             return
+        self._since = self._last
         for sensor, segment in moved:
             sensor.segment = segment
             self._magnetic[self.segments.index(segment)] = sensor.has_field
@@ -590,7 +600,7 @@ class InertialTracker:
             segments,
             measured,
             posed,
-            self._poses.covariance(held, segments),
+            self._poses.covariance(held, segments, self.parameters.pose_stddev),
             mountings=self._meant[numbers],
             mounting_stddev=self.parameters.mounting_stddev,
             headings=headings,
@@ -602,6 +612,7 @@ class InertialTracker:
         for each in segments:
             self._slips.pop(each, None)
         self.aligned = True
+        self._since, self._elbows = self._last, {"left", "right"}
         self.counters["alignments by a pose"] += 1
 
     # --- joints
@@ -621,6 +632,28 @@ class InertialTracker:
         for parent, child in _joints():
             if parent in there and child in there:
                 self._tracker.observe_range(now, parent, child, (there[parent], there[child]))
+
+    def _look_at_movement(self, now: float, stamp_ns: int) -> None:
+        """Once after a pose or a slip, what an elbow's movement tells of how its sensors sit (eq. 5 of ``alignment``).
+
+        Once, because what such a fit has wrong, by the flesh and by the person's own axes, it has wrong each time.
+        """
+        if now - self._since < _MOVED_S:
+            return
+        there = {sensor.segment: sensor for _, sensor in self._listening(stamp_ns)}
+        for side in sorted(self._elbows):
+            upper, lower = there.get(f"upper_arm_{side}"), there.get(f"forearm_{side}")
+            if upper is None or lower is None or max(self._stddev(upper), self._stddev(lower)) > _FAR_HEADING:
+                continue
+            streams = [self._stream(each, self._recent(each, stamp_ns, _MOVED_S)) for each in (upper, lower)]
+            fit = align_by_elbow(self.alignment, side, streams[0], streams[1].thinned(_MOVED_RATE))
+            if fit is None or fit.information < _MOVEMENT_TELLS:
+                continue
+            self._tracker.predict(max(now, self._last))
+            self._tracker.alignment = fit.alignment
+            self._elbows.discard(side)
+            self.counters["alignments by an elbow's movement"] += 1
+            return  # the other one the next time: it takes a while
 
     # --- what comes out
 

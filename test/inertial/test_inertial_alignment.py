@@ -213,6 +213,16 @@ def test_what_is_replaced_has_nothing_in_common_with_what_stays() -> None:
         whole.replaced(Alignment(("forearm_left",), part.rotations[:1], part.headings[:1], np.eye(4)))
 
 
+@given(st.integers(2, 400), st.floats(1.0, 60.0))
+def test_a_thinned_stream_has_about_so_many_samples_a_second(count: int, rate: float) -> None:
+    times = np.linspace(0.0, 4.0, count)
+    thin = stream("pelvis", times, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))).thinned(rate)
+    assert set(thin.stamps) <= set(times)
+    # every second one of twice as many, every third of three times as many
+    assert len(thin.stamps) <= max(1.5 * 4.0 * rate, 4.0 * rate + 2.0) + 1.0
+    assert len(thin.stamps) >= min(count, 4.0 * rate / 1.5 - 1.0)
+
+
 def test_the_mean_of_rotations_about_one_is_that_one() -> None:
     rng = np.random.default_rng(0)
     middle = random_rotations(rng, 1)[0]
