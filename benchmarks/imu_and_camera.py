@@ -39,6 +39,7 @@ from accuracy import KNOWN
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.fusion.alignment import SensorAlignment
+from body_tracking.inertial.tracking import rate_variance
 from body_tracking.kinematics import so3
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
@@ -123,10 +124,13 @@ def aligned(
     quats = so3.quat_multiply(so3.quat_multiply(to_world, samples.orientation), so3.quat_inverse(mounting))
     rotations = so3.quat_to_matrix(quats)
     turn = so3.quat_to_matrix(to_world)
+    rates = samples.angular_velocity @ so3.quat_to_matrix(mounting).T
     return [
-        SegmentOrientation(int(stamp_ns), samples.name, imu.segment, rotation, turn @ covariance @ turn.T)
-        for stamp_ns, rotation, covariance in zip(
-            samples.stamps_ns, rotations, samples.orientation_covariance, strict=True
+        SegmentOrientation(
+            int(stamp_ns), samples.name, imu.segment, rotation, turn @ covariance @ turn.T, rate, rate_variance(rate)
+        )
+        for stamp_ns, rotation, covariance, rate in zip(
+            samples.stamps_ns, rotations, samples.orientation_covariance, rates, strict=True
         )
     ]
 

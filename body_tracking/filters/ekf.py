@@ -519,6 +519,7 @@ class ExtendedKalmanFilter:
                 "orientations",
                 "orientations_used",
                 "orientations_rejected",
+                "rates_rejected",
                 "orientations_late",
                 "orientations_refused",
                 "slips",
@@ -841,6 +842,7 @@ class ExtendedKalmanFilter:
             lean, leaning, unfit_for, near = np.zeros(3), 0.0, 0.0, True
             corrected, _ = self._turned_by(state, measurement, number, own)
         if near:
+            corrected = self._spun_by(corrected, measurement, number, own)
             before, after = (m.covariance.diagonal()[self._velocities] for m in (state, corrected))
             moved = state.moved + (corrected.velocity - state.velocity)
             moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
@@ -925,6 +927,45 @@ class ExtendedKalmanFilter:
                 covariance[:, ball] = covariance[:, ball] @ turn.T
                 crosses[ball] = turn @ crosses[ball]
         return self._moved(state.but(covariance=covariance, crosses=crosses), correction), first
+
+    def _spun_by(self, state: _State, measurement: SegmentOrientation, number: int, own: slice) -> _State:
+        """The velocities corrected by the angular velocity that comes with an orientation; nothing else is.
+
+        What it errs by (how the source sits, axes that are the person's own) it errs by alike all the time, and would
+        teach the pose and its sources what is not so: these are considered but not corrected (Schmidt 1966).
+        """
+        rate, p = measurement.angular_velocity, self.parameters
+        if rate is None or not p.rate_factor:
+            return state
+        v = self._velocities
+        rotation, turning = self.model.turning(state.q, int(state.sources.segments[number]))
+        innovation = rotation @ (state.sources.misalignment[number] @ rate) - turning @ state.velocity
+        # about axes that are off by a misalignment that is known only so well
+        misaligned = float(state.covariance.diagonal()[own][:3].mean())
+        cross = turning @ state.covariance[v]
+        s = cross[:, v] @ turning.T
+        s.reshape(-1)[::4] += p.rate_factor**2 * measurement.angular_velocity_variance + misaligned * float(rate @ rate)
+        whitening = _whitening(s)
+        white = whitening @ innovation
+        if float(white @ white) > self._gate:
+            self.counters["rates_rejected"] += 1  # a blow, or the pose is far off
+            return state
+        half = whitening @ cross  # of it the columns of velocities are the gain's
+        gain = half[:, v]
+        taken = gain.T @ half
+        covariance = state.covariance.copy()
+        covariance[v] -= taken
+        covariance[:, v] -= taken.T
+        covariance[v, v] += gain.T @ gain
+        correction = np.zeros(len(covariance))
+        correction[v] = white @ gain
+        if len(state.null):
+            correction[v] -= (state.null @ correction[v]) @ state.null
+        crosses = state.crosses
+        if crosses.shape[1]:
+            crosses = crosses.copy()
+            crosses[v] -= gain.T @ (whitening @ (turning @ crosses[v]))
+        return self._moved(state.but(covariance=covariance, crosses=crosses), correction)
 
     def _with_source(self, state: _State, measurement: SegmentOrientation) -> _State:
         """A state with one more source of orientations."""

@@ -98,8 +98,16 @@ class OrientationParameters:
     orientation_noise: float = number_field(
         0.01, "orientations: white noise of each that is used, per axis", "rad", 1e-5, 1.0
     )
+    rate_factor: float = number_field(
+        3.0,
+        "orientations: angular velocities that come with them err by so many times what is stated, because they do so "
+        "alike all the time; 0 to use none",
+        "1",
+        0.0,
+        100.0,
+    )
     orientation_rate: float = number_field(
-        50.0, "orientations: of a source that is faster no more than so many are used", "Hz", 1.0, 1000.0
+        30.0, "orientations: of a source that is faster no more than so many are used", "Hz", 1.0, 1000.0
     )
     slip_stddev: float = number_field(
         0.35, "orientations: how far a sensor may have slipped whose orientations do not fit any more", "rad", 0.0, 3.2

@@ -50,7 +50,7 @@ class TrackingParameters:
         metadata={"doc": "take sensors that are found on each other's segments for what they are; false: only tell"},
     )
     rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
-    orientation_rate: float = number_field(50.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
+    orientation_rate: float = number_field(30.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
     largest_stddev: float = number_field(
         0.6, "tell no orientation that is known less well than this about any axis", "rad", 0.01, 2.0
     )

@@ -689,7 +689,7 @@ class InertialTracker:
             _orthonormal(world),
             covariance,
             rate,
-            (_RATE_STDDEV + _RATE_SHARE * float(np.linalg.norm(rate))) ** 2,
+            rate_variance(rate),
             self._world,
         )
 
@@ -712,6 +712,11 @@ class InertialTracker:
             return None
         self._skeleton_ns = stamp_ns
         return self._body.skeleton(stamp_ns, segments, np.array(rotations), np.array(covariances))
+
+
+def rate_variance(rate: FloatArray) -> float:
+    """rad2/s2 per axis, by which the rate (3,) of a segment is off that its sensor tells."""
+    return float((_RATE_STDDEV + _RATE_SHARE * np.linalg.norm(rate)) ** 2)
 
 
 def _orthonormal(rotation: FloatArray) -> FloatArray:

@@ -78,7 +78,11 @@ def somebody(
 
 @dataclass(frozen=True)
 class Source:
-    """How a sensor errs: misalignment, heading, deviation and time of what persists; a slip at some time."""
+    """How a sensor errs: misalignment, heading, deviation and time of what persists; a slip at some time.
+
+    Where ``spin`` is given, it tells angular velocities that err by so many rad/s, about the axes that it takes for its
+    segment's.
+    """
 
     segment: str
     misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -88,6 +92,7 @@ class Source:
     slip: tuple[float, tuple[float, float, float]] | None = None
     stated: float = 0.01
     rate: float = 50.0
+    spin: float | None = None
 
     def measure(self, person: Person, seed: int = 0) -> list[SegmentOrientation]:
         """Its orientations, by equation (1)."""
@@ -109,9 +114,20 @@ class Source:
         measured = turned @ so3.quat_to_matrix(so3.exp(self.slow * slow))
         measured = measured @ rotations[:, SEGMENT_NUMBER[self.segment]] @ mounting
         stamps = START_NS + np.round(times * NANOSECONDS).astype(np.int64)
-        return [
+        told = [
             SegmentOrientation(int(stamp), f"imu_{self.segment}", self.segment, each, self.stated**2 * np.eye(3))
             for stamp, each in zip(stamps, measured, strict=True)
+        ]
+        if self.spin is None:
+            return told
+        step = 1e-4
+        after = MODEL.forward(person.motion.configuration(times + step), person.body.lengths).rotations
+        turned = rotations[:, SEGMENT_NUMBER[self.segment]].swapaxes(-1, -2) @ after[:, SEGMENT_NUMBER[self.segment]]
+        rates = so3.log(so3.matrix_to_quat(mounting.swapaxes(-1, -2) @ turned @ mounting)) / step
+        rates += self.spin * rng.normal(size=rates.shape)
+        return [
+            replace(each, angular_velocity=rate, angular_velocity_variance=self.spin**2)
+            for each, rate in zip(told, rates, strict=True)
         ]
 
 
@@ -458,7 +474,7 @@ def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera
 def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
     person = somebody(15, 1.0, 0.01)
     far = Source("forearm_left", misalignment=(1.2, 0.0, 0.0)).measure(person)
-    estimator = ExtendedKalmanFilter()
+    estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=50.0))
     soon = START_NS + round(0.8 * EkfParameters().slip_after * NANOSECONDS)
     events = in_order(person.skeletons, far)
     feed(estimator, [each for each in events if each.stamp_ns < soon])
@@ -468,7 +484,8 @@ def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
     assert estimator.counters["slips"] == 1
 
 
-def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
+@pytest.mark.parametrize("spin", [None, 0.05], ids=["orientations alone", "with rates"])
+def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | None) -> None:
     observed = np.array([k for k, name in enumerate(NAMES) if name not in UNOBSERVED and k >= 6])
     p, normalised = EkfParameters(), []
     for seed in range(3):
@@ -481,6 +498,7 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
                 p.heading_stddev * rng.normal(),
                 float(np.hypot(p.tissue_stddev, 0.01)),
                 p.tissue_time,
+                spin=spin,
             )
             for segment in (*FOREARMS, "upper_trunk")
         ]
@@ -489,6 +507,69 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave() -> None:
         for error, covariance in zip(errors[:, observed], covariances[:, observed][:, :, observed], strict=True):
             normalised.append(error @ np.linalg.solve(covariance, error))
     assert 0.5 < np.mean(normalised) / len(observed) < 1.6, np.mean(normalised) / len(observed)
+
+
+# --- angular velocities
+
+
+def test_angular_velocities_correct_velocities_and_nothing_else() -> None:
+    person = somebody(15, 2.0)
+    orientations = Source("forearm_left", (0.05, 0.0, 0.1), spin=0.05).measure(person)
+    estimator = ExtendedKalmanFilter(EkfParameters(rate_factor=0.0))
+    feed(estimator, in_order(person.skeletons, orientations))
+    without = estimator._state
+    assert without is not None
+    own = slice(BODY, BODY + PER_SOURCE)
+    quicker = replace(orientations[-1], angular_velocity=orientations[-1].angular_velocity + 0.1)
+    with_rates = ExtendedKalmanFilter()
+    found = with_rates._spun_by(without, quicker, 0, own)
+    assert_allclose(found.q, without.q, rtol=0.0, atol=0.0)
+    assert_allclose(found.sources.misalignment, without.sources.misalignment, rtol=0.0, atol=0.0)
+    assert np.abs(found.velocity - without.velocity).max() > 0.01
+    before, after = (np.sqrt(state.covariance.diagonal()) for state in (without, found))
+    velocities = with_rates._velocities
+    moved = [NAMES.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left")]
+    assert (after[velocities][moved] < 0.9 * before[velocities][moved]).all()
+    rest = np.ones(len(before), dtype=np.bool_)
+    rest[velocities] = False
+    assert_allclose(after[rest], before[rest], rtol=1e-9)
+    assert np.linalg.eigvalsh(found.covariance).min() > -1e-12
+
+
+def test_how_quickly_joints_turn_is_known_better_by_rates() -> None:
+    observed = [NAMES.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left")]
+    errors = np.empty((3, 2))
+    for number in range(3):
+        person = somebody(16 + number, 4.0, tempo=3.0)
+        for place, spin in enumerate((None, 0.05)):
+            sources = [Source(segment, spin=spin, rate=30.0) for segment in ("forearm_left", "upper_arm_left")]
+            estimator, off = ExtendedKalmanFilter(), []
+            for each in in_order(person.skeletons, *(source.measure(person) for source in sources)):
+                if give(estimator, each) and isinstance(each, Skeleton):
+                    estimate = estimator.estimate
+                    assert estimate is not None
+                    step = NANOSECONDS // 1000
+                    true = 1e3 * MODEL.difference(person.at(estimate.stamp_ns), person.at(estimate.stamp_ns + step))
+                    off.append((estimate.velocity - true)[observed])
+            errors[number, place] = rms(np.array(off[30:]))
+    without, by_rates = errors.mean(axis=0)
+    assert by_rates < 0.9 * without, errors
+
+
+def test_a_rate_that_cannot_be_is_left_out_and_counted() -> None:
+    person = somebody(17, 2.0)
+    orientations = Source("forearm_left", spin=0.05).measure(person)
+    wild = [
+        replace(each, angular_velocity=np.array([50.0, -40.0, 30.0])) if k % 7 == 5 else each
+        for k, each in enumerate(orientations)
+    ]
+    estimates = []
+    for told in (orientations, wild):
+        estimator = ExtendedKalmanFilter()
+        errors, _ = followed(estimator, in_order(person.skeletons, told), person, 1.0)
+        estimates.append(rms(errors))
+    assert estimator.counters["rates_rejected"] > 5
+    assert estimates[1] < 1.1 * estimates[0]
 
 
 # --- time

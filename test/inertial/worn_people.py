@@ -102,7 +102,9 @@ def feed(
         camera_stddev: metres, of a camera with white noise in the place of the simulated one.
     """
     stated = tuple(imu.name for imu, _ in recording.imus)
-    tracker = InertialTracker(stated, TrackingParameters(rate=2.0) if parameters is None else parameters)
+    tracker = InertialTracker(
+        stated, TrackingParameters(rate=2.0, orientation_rate=50.0) if parameters is None else parameters
+    )
     events: list[tuple[int, str, object]] = [e for imu, said in recording.imus for e in samples_of(imu, said)]
     (camera,) = recording.sensors
     rng = np.random.default_rng(0)
