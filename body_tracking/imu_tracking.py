@@ -81,13 +81,14 @@ class ImuStage:
         self.refused: Counter[str] = Counter()
         self._fields: dict[str, tuple[int, FloatArray]] = {}
 
-    def on_imu(self, topic: str, message: Any, received_ns: int) -> Told:
+    def on_imu(self, topic: str, message: Any, received_ns: int, *, skeleton: bool = True) -> Told:
         """One ``sensor_msgs/Imu``.
 
         Args:
             topic: on which it came.
             message: of a ROS install or of a recording.
             received_ns: when.
+            skeleton: tell the whole body when it is due.
 
         Raises:
             BodyTrackingError: it is of no use; counted.
@@ -95,7 +96,7 @@ class ImuStage:
         segment = self.imu[topic]
         try:
             sample = message_to_sample(message, self._field_at(segment, message))
-            return self.tracker.add(segment, sample, received_ns)
+            return self.tracker.add(segment, sample, received_ns, skeleton=skeleton)
         except BodyTrackingError:
             self.refused[f"refused of {segment}"] += 1
             raise

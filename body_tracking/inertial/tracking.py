@@ -228,13 +228,14 @@ class InertialTracker:
 
     # --- readings
 
-    def add(self, segment: str, sample: ImuSample, received_ns: int) -> Told:
+    def add(self, segment: str, sample: ImuSample, received_ns: int, *, skeleton: bool = True) -> Told:
         """Take one reading.
 
         Args:
             segment: on which the sensor is said to be.
             sample: what it said.
             received_ns: when, in a clock common to all sensors and to the camera.
+            skeleton: tell the whole body when it is due; to fit it costs more than all the rest.
 
         Raises:
             InertialTrackingError: no such segment.
@@ -256,7 +257,7 @@ class InertialTracker:
         if now >= self._due.get("step", -np.inf):
             self._due["step"] = now + _STEP_NS / NANOSECONDS
             self._step(now, stamp_ns)
-        return Told(self._orientation(sensor, felt, stamp_ns), self._skeleton(stamp_ns))
+        return Told(self._orientation(sensor, felt, stamp_ns), self._skeleton(stamp_ns) if skeleton else None)
 
     def hear(self, stamp_ns: int, received_ns: int) -> None:
         """Note when a frame of the camera whose clock is that of ``world`` was received.

@@ -72,7 +72,8 @@ class ImuSkeletonNode(GraphNode):
 
     def on_imu(self, topic: str, message: Any, sent_ns: int) -> None:
         """Feed one reading and publish what follows from it."""
-        told = self.stage.on_imu(topic, message, self.arrived_ns)
+        heard = self.skeletons.get_subscription_count() > 0
+        told = self.stage.on_imu(topic, message, self.arrived_ns, skeleton=heard)
         if told.orientation is not None:
             publisher = self.orientations[told.orientation.segment]
             self.send(publisher, orientation_to_message(told.orientation, ROS), told.orientation.stamp_ns, sent_ns)

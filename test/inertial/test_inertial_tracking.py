@@ -260,6 +260,23 @@ def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_
     assert apart[0, 0] + apart[1, 1] - 2.0 * apart[0, 1] < np.radians(10.0) ** 2
 
 
+def test_no_body_is_fitted_where_nobody_wants_one() -> None:
+    tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
+    held(tracker)
+    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
+    stamps = [110 * NANOSECONDS + k * NANOSECONDS // 5 for k in range(3)]
+    told = [
+        tracker.add(
+            "forearm_left",
+            ImuSample(stamp_ns, "forearm_left", np.array([0.0, 0.0, 0.0, 1.0]), level, np.zeros(3), up, None),
+            stamp_ns + 10_000_000,
+            skeleton=wanted,
+        ).skeleton
+        for stamp_ns, wanted in zip(stamps, (True, False, True), strict=True)
+    ]
+    assert [each is not None for each in told] == [True, False, True]
+
+
 def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_come() -> None:
     parameters = TrackingParameters(clock="own")
     told = [
