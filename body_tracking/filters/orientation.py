@@ -12,7 +12,9 @@ tissue and a source's own filter make. All seven numbers are estimated with the 
 share with the pose (a forearm's misalignment about itself with its pronation) keeps its deviation, as nothing tells
 them apart. That holds as long as the linearisation has one direction for both whatever is found: the error m of the
 misalignment is told in the segment's frame, not in the sensor's, which turns with what is found (Huang, Mourikis and
-Roumeliotis 2010 on such false information). Errors of rotations are rotation vectors (Sola, Deray and Atchuthan 2018).
+Roumeliotis 2010 on such false information). An angular velocity that comes with an orientation corrects the velocities
+alone: what it errs by lasts, and is no state here. Errors of rotations are rotation vectors (Sola, Deray and Atchuthan
+2018).
 """
 
 from __future__ import annotations
