@@ -235,7 +235,7 @@ class InertialTracker:
             segment: on which the sensor is said to be.
             sample: what it said.
             received_ns: when, in a clock common to all sensors and to the camera.
-            skeleton: tell the whole body when it is due; to fit it costs more than all the rest.
+            skeleton: tell the whole body when it is due, which has to be fitted.
 
         Raises:
             InertialTrackingError: no such segment.
@@ -689,7 +689,7 @@ class InertialTracker:
             sensor.segment,
             _orthonormal(world),
             covariance,
-            rate,
+            rate if felt.rate_told else None,
             rate_variance(rate),
             self._world,
         )

@@ -95,12 +95,14 @@ class Felt:
         rotation: (3, 3) sensor to earth (z up, a heading of its own).
         covariance: (3, 3) rad2 about the earth's axes; of the heading what does not grow for ever.
         rate: (3,) rad/s in the sensor's frame.
+        rate_told: the sensor told it; else it is the difference of two orientations, or nothing.
     """
 
     stamp_ns: int
     rotation: FloatArray
     covariance: FloatArray
     rate: FloatArray
+    rate_told: bool = True
 
 
 class WornSensor:
@@ -206,7 +208,7 @@ class WornSensor:
             covariance = covariance * np.outer(scale, scale)
         elif self._turned:
             covariance = covariance + np.diag([0.0, 0.0, self._turned])
-        self.latest = felt = Felt(felt.stamp_ns, felt.rotation, covariance, felt.rate)
+        self.latest = felt = replace(felt, covariance=covariance)
         if not self._kept or felt.stamp_ns - self._kept[-1].stamp_ns >= _SPACING_NS:
             self._kept.append(felt)
             while felt.stamp_ns - self._kept[0].stamp_ns > HISTORY_S * NANOSECONDS:
@@ -272,7 +274,7 @@ class WornSensor:
                 elapsed = (sample.stamp_ns - self.latest.stamp_ns) / NANOSECONDS
                 if elapsed < OUTAGE_S:
                     rate = rotation_vectors(self.latest.rotation.T @ rotation) / elapsed
-        return Felt(sample.stamp_ns, rotation, covariance, rate)
+        return Felt(sample.stamp_ns, rotation, covariance, rate, sample.angular_velocity is not None)
 
     def _estimated(self, sample: ImuSample) -> Felt | None:
         if self._off_field() > _DISTURBED:

@@ -260,6 +260,21 @@ def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_
     assert apart[0, 0] + apart[1, 1] - 2.0 * apart[0, 1] < np.radians(10.0) ** 2
 
 
+def test_no_rate_is_told_that_a_driver_does_not_tell() -> None:
+    """The difference of two orientations is too rough to be taken for a measurement."""
+    for rate in (None, np.array([0.1, 0.0, 0.0])):
+        tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
+        held(tracker)
+        level = np.diag([1e-4, 1e-4, 1e-3])
+        for k in range(2):
+            stamp_ns = 110 * NANOSECONDS + k * NANOSECONDS // 20
+            turned = so3.exp(np.array([0.005 * k, 0.0, 0.0]))
+            sample = ImuSample(stamp_ns, "forearm_left", turned, level, rate, None, None)
+            told = tracker.add("forearm_left", sample, stamp_ns + 10_000_000).orientation
+            assert told is not None
+            assert (told.angular_velocity is None) is (rate is None)
+
+
 def test_no_body_is_fitted_where_nobody_wants_one() -> None:
     tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
     held(tracker)

@@ -97,7 +97,8 @@ def feed(
 
     Args:
         recording: of somebody.
-        parameters: of the tracker; by default with fewer skeletons than usual, which take their time.
+        parameters: of the tracker; by default with fewer skeletons than usual, which take their time, and with all
+            orientations.
         meddle: what becomes of a reading, at seconds from the beginning.
         camera_stddev: metres, of a camera with white noise in the place of the simulated one.
     """
