@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import struct
 import subprocess
 import sys
@@ -25,20 +24,17 @@ from pathlib import Path
 from typing import Any
 
 import latency  # sets up discovery before rclpy is imported
+import node_processes
 import numpy as np
 import rclpy
-import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, JointState, PointCloud2
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
-from body_tracking.calibration.storage import save
-from body_tracking.graph import GraphOptions, nodes_for
+from body_tracking.graph import GraphOptions
 from body_tracking.messages import RosMessages, imu_to_message, skeletons_to_cloud, to_nanoseconds
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.parameters import SECTION, to_ros
 from body_tracking.recording.qos import RELIABLE
 from body_tracking.simulation.imus import SimulatedImu, usual_mounting
 from body_tracking.simulation.layouts import layout
@@ -175,24 +171,9 @@ def _topic(segment: str) -> str:
 def _start(folder: Path, recording: SimulatedRecording) -> list[subprocess.Popen[bytes]]:
     """The graph's nodes from its own table, and the relays."""
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    names = tuple(poses)
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
-    file = folder / "calibration.yaml"
-    save(CalibrationResult(names[0], poses, {name: ClockModel() for name in names}, quality), file)
-    environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
-    commands = []
-    for spec in nodes_for(GraphOptions(names, filter_name="ekf", calibration_file=str(file), imus=SEGMENTS)):
-        if spec.executable == "kinect_skeleton":
-            continue
-        values = {name: to_ros(value) for name, value in {**spec.defaults, **spec.parameters}.items()}
-        parameters = folder / f"{spec.name}.parameters.yaml"
-        parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
-        arguments = ["--ros-args", "--log-level", "WARN", "--params-file", str(parameters)]
-        commands.append(["-m", "body_tracking.nodes", spec.executable, *arguments])
-    commands += [[latency.__file__, "--relay", str(stage)] for stage in range(len(latency.CHAIN))]
-    return [
-        subprocess.Popen([sys.executable, *command], env=environment, start_new_session=True) for command in commands
-    ]
+    calibration = node_processes.calibrated(folder, poses)
+    options = GraphOptions(tuple(poses), filter_name="ekf", calibration_file=calibration, imus=SEGMENTS)
+    return node_processes.start(node_processes.commands(folder, options) + latency.relay_commands())
 
 
 def measure(seconds: float) -> dict[str, Any]:
@@ -210,12 +191,12 @@ def measure(seconds: float) -> dict[str, Any]:
                     raise SystemExit("imu_live: the processes did not come up")
                 time.sleep(0.1)
             time.sleep(1.0)
-            threading.Thread(target=latency._spin, args=(bench.executor,), daemon=True).start()
+            threading.Thread(target=latency.spin, args=(bench.executor,), daemon=True).start()
             print(f"sending for {seconds + _SETTLED_S:.0f} s ...", file=sys.stderr)
             late = bench.publish()
             time.sleep(1.0)
         finally:
-            latency._stop(processes)
+            node_processes.stop(processes)
             rclpy.try_shutdown()
     result: dict[str, Any] = {"seconds": seconds, "sending late ms (99 %)": round(late, 1)}
     for chain in ("graph", "relay"):

@@ -14,7 +14,6 @@ import contextlib
 import json
 import os
 import random
-import signal
 import subprocess
 import sys
 import tempfile
@@ -26,17 +25,16 @@ from typing import Any
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
 
+import node_processes
 import numpy as np
 import rclpy
-import yaml
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState, PointCloud2
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
-from body_tracking.calibration.storage import save
-from body_tracking.graph import GraphOptions, nodes_for
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.graph import GraphOptions
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages import (
     TIME_REFERENCE,
@@ -52,7 +50,6 @@ from body_tracking.messages import (
 )
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.supervised import die_with_parent
-from body_tracking.parameters import SECTION, to_ros
 from body_tracking.recording.qos import RELIABLE
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.skeleton import NANOSECONDS, Skeleton
@@ -182,7 +179,7 @@ class Stream:
         return self._skeletons[int(np.abs(self._times - wanted).argmin())]
 
 
-def _recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
+def recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
     """Skeletons of a shipped recording, and where its sensors really stood."""
     frames: dict[str, list[Skeleton]] = {name: [] for name in SENSORS}
     poses: dict[str, SensorPose] = {}
@@ -199,59 +196,39 @@ def _recorded() -> tuple[dict[str, Stream], dict[str, SensorPose]]:
     return {name: Stream(skeletons, clocks[name]) for name, skeletons in frames.items()}, poses
 
 
-def _start(folder: Path, poses: dict[str, SensorPose], relays: bool = True) -> list[subprocess.Popen[bytes]]:
+def start(folder: Path, poses: dict[str, SensorPose], relays: bool = True) -> list[subprocess.Popen[bytes]]:
     """The graph's nodes from its own table, and the relays."""
-    file = folder / "calibration.yaml"
-    clocks = {name: ClockModel() for name in SENSORS}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in SENSORS}
-    save(CalibrationResult(SENSORS[0], poses, clocks, quality), file)
-    environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
-    commands = []
-    for spec in nodes_for(GraphOptions(SENSORS, calibration_file=str(file))):
-        if spec.executable == "kinect_skeleton":
-            continue  # this process takes their place, to know when it sent what
-        values = {name: to_ros(value) for name, value in spec.parameters.items()}
-        parameters = folder / f"{spec.name}.parameters.yaml"
-        parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
-        arguments = ["--ros-args", "--log-level", "WARN", "--params-file", str(parameters)]
-        commands.append(["-m", "body_tracking.nodes", spec.executable, *arguments])
-    commands += [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))] if relays else []
-    return [
-        subprocess.Popen([sys.executable, *command], env=environment, start_new_session=True) for command in commands
-    ]
+    lines = node_processes.commands(
+        folder, GraphOptions(SENSORS, calibration_file=node_processes.calibrated(folder, poses))
+    )
+    return node_processes.start(lines + (relay_commands() if relays else []))
 
 
-def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
-    for process in processes:
-        process.send_signal(signal.SIGINT)
-    for process in processes:
-        try:
-            process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+def relay_commands() -> list[list[str]]:
+    """Command lines of the relays."""
+    return [[__file__, "--relay", str(stage)] for stage in range(len(CHAIN))]
 
 
 def measure(seconds: float, warm_up: float) -> dict[str, Any]:
     """Run both chains and compare their delays."""
-    frames, poses = _recorded()
+    frames, poses = recorded()
     rclpy.init()
     bench = Bench(frames, seconds, warm_up)
     with tempfile.TemporaryDirectory() as name:
-        processes = _start(Path(name), poses)
+        running = start(Path(name), poses)
         try:
             deadline = time.monotonic() + 30.0
             while not bench.ready():
-                if time.monotonic() > deadline or any(process.poll() is not None for process in processes):
+                if time.monotonic() > deadline or any(process.poll() is not None for process in running):
                     raise SystemExit("latency: the processes did not come up")
                 time.sleep(0.1)
             time.sleep(0.5)
-            listener = threading.Thread(target=_spin, args=(bench.executor,), daemon=True)
+            listener = threading.Thread(target=spin, args=(bench.executor,), daemon=True)
             listener.start()
             bench.publish()
             time.sleep(0.5)
         finally:
-            _stop(processes)
+            node_processes.stop(running)
             rclpy.try_shutdown()
     result: dict[str, Any] = {"seconds": seconds, "sensors": len(SENSORS), "processes": len(CHAIN)}
     for chain in ("graph", "relay"):
@@ -271,7 +248,7 @@ def measure(seconds: float, warm_up: float) -> dict[str, Any]:
     return result
 
 
-def _spin(executor: SingleThreadedExecutor) -> None:
+def spin(executor: SingleThreadedExecutor) -> None:
     with contextlib.suppress(ExternalShutdownException):
         executor.spin()
 

@@ -18,7 +18,6 @@ import argparse
 import json
 import os
 import random
-import signal
 import subprocess
 import sys
 import tempfile
@@ -33,21 +32,19 @@ from typing import Any
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
 
+import node_processes
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from body_tracking import graph
 from body_tracking.calibration.offline import calibrate
 from body_tracking.calibration.online import CalibrationParameters
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
-from body_tracking.calibration.storage import save
+from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import encode_skeletons
 from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL
-from body_tracking.graph import GraphOptions, nodes_for
+from body_tracking.graph import GraphOptions
 from body_tracking.messages import statuses
-from body_tracking.parameters import SECTION, to_ros
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import frames_of, sensor_topics
 from body_tracking.recording.rosbag2 import BagReader
@@ -269,23 +266,11 @@ class Ear:
 
 def start(folder: Path, play: Play, filter_name: str, people: int) -> list[subprocess.Popen[bytes]]:
     """The graph's nodes from its own table; this process takes the place of the sensors."""
-    names = tuple(play.poses)
-    file = folder / "calibration.yaml"
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
-    save(CalibrationResult(names[0], play.poses, {name: ClockModel() for name in names}, quality), file)
-    environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
-    processes = []
-    options = GraphOptions(names, filter_name=filter_name, subject=ALL, people=people, calibration_file=str(file))
-    for spec in nodes_for(options):
-        if spec.executable == "kinect_skeleton":
-            continue
-        values = {name: to_ros(value) for name, value in spec.parameters.items()}
-        parameters = folder / f"{spec.name}.parameters.yaml"
-        parameters.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
-        command = [sys.executable, "-m", "body_tracking.nodes", spec.executable, "--ros-args", "--log-level", "ERROR"]
-        command += ["--params-file", str(parameters)]
-        processes.append(subprocess.Popen(command, env=environment, start_new_session=True))
-    return processes
+    calibration = node_processes.calibrated(folder, play.poses)
+    options = GraphOptions(
+        tuple(play.poses), filter_name=filter_name, subject=ALL, people=people, calibration_file=calibration
+    )
+    return node_processes.start(node_processes.commands(folder, options, level="ERROR"))
 
 
 def live(filter_name: str, play: Play, people: int, seconds: float) -> dict[str, Any]:
@@ -324,14 +309,7 @@ def live(filter_name: str, play: Play, people: int, seconds: float) -> dict[str,
             while time.monotonic() < end:
                 ear.executor.spin_once(timeout_sec=0.05)
         finally:
-            for process in processes:
-                process.send_signal(signal.SIGINT)
-            for process in processes:
-                try:
-                    process.wait(8.0)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            node_processes.stop(processes)
             ear.node.destroy_node()
             rclpy.shutdown()
     return {"filter": filter_name, "people": people, "seconds": seconds, **told(ear, begin_ns, seconds)}

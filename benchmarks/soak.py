@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -51,7 +52,6 @@ from tqdm import tqdm
 
 from body_tracking import dds, graph
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
-from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.parameters import SECTION
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import FloatArray
@@ -60,10 +60,15 @@ GROWTH = 0.05
 """Of private memory, from the second minute to the last tenth."""
 LATER = 1.2
 """The median latency of the last tenth over that of the first."""
+TENTHS = 10
 WARM_UP = 60.0
 """Seconds that do not count."""
 PERIOD, LISTENING = 10.0, 2.0
 """Seconds from sample to sample, and for which this process listens at each: it is not to cost a core itself."""
+LOOK = 0.05
+"""Seconds from look to look while it listens: a wait for each message would cost more than a node of the graph."""
+_KEPT = 200
+"""Messages that wait for a look."""
 BACK_WITHIN = 20.0
 """Seconds after which a node that was killed must be there again."""
 BAG_SECONDS = 60.0
@@ -101,16 +106,16 @@ class Ear:
         self.latencies: list[float] = []
         self.angles_at = 0.0
         self.statuses: dict[str, tuple[float, dict[str, str]]] = {}
-        diagnostics = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.node.create_subscription(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, diagnostics)
-        quick = to_profile(graph.SKELETON)
-        # rclpy passes the message info to callbacks of two arguments
-        on_frame: Any = self._on_frame
-        on_angles: Any = self._on_angles
-        self.node.create_subscription(PointCloud2, graph.skeleton_topic(sensor), on_frame, quick, raw=True)
-        self.node.create_subscription(
-            JointState, graph.joint_states_topic(graph.DEFAULT_BODY), on_angles, quick, raw=True
+        quick = QoSProfile(depth=_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
+        # taken by listen(), and not by an executor; in this order
+        topics: tuple[tuple[Any, str, Any, bool], ...] = (
+            (PointCloud2, graph.skeleton_topic(sensor), self._on_frame, True),
+            (JointState, graph.joint_states_topic(graph.DEFAULT_BODY), self._on_angles, True),
+            (DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, False),
         )
+        self.subscriptions = [
+            self.node.create_subscription(kind, topic, handle, quick, raw=raw) for kind, topic, handle, raw in topics
+        ]
         self.triggers = {name: self.node.create_client(Trigger, f"recorder/{name}") for name in ("start", "stop")}
 
     def _on_frame(self, cdr: bytes, info: Mapping[str, int]) -> None:
@@ -123,7 +128,7 @@ class Ear:
         if sent is not None and 0 <= info["source_timestamp"] - sent < 2_000_000_000:
             self.latencies.append((info["source_timestamp"] - sent) / 1e9)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray, _info: Mapping[str, int]) -> None:
         for status in message.status:
             name = status.name.split(":")[0]
             self.statuses[name] = time.time(), {pair.key: pair.value for pair in status.values}
@@ -132,7 +137,11 @@ class Ear:
         """Take what comes for so long."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.1)
+            time.sleep(LOOK)
+            # the frames first: angles that have come belong to frames that have
+            for subscription in self.subscriptions:
+                while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+                    subscription.callback(*taken)
 
     def call(self, name: str) -> str:
         """A service of the recorder; why it did not do what it was asked, or empty."""
@@ -262,11 +271,22 @@ def _killed(name: str, up: subprocess.Popen[bytes], ear: Ear) -> float | None:
 # --- the result
 
 
-def _tenths(times: FloatArray, total: float) -> tuple[Any, Any]:
-    """Which samples belong to the first tenth after the warm-up, and which to the last tenth."""
-    warm = min(WARM_UP, total / 2)
-    length = max((total - warm) / 10, min(PERIOD, total / 4))
-    return (times >= warm) & (times < warm + length), times >= total - length
+def _edges(total: float) -> FloatArray:
+    """Seconds at which the tenths of the run begin, and at which the last one ends; the warm-up is before them."""
+    return np.linspace(min(WARM_UP, total / 2), total, TENTHS + 1)
+
+
+def _latencies(samples: Samples, total: float) -> list[dict[str, float]]:
+    """Of each tenth."""
+    latency, rows = np.array(samples.latency).reshape(-1, 2), []
+    for begin, end in itertools.pairwise(_edges(total)):
+        # a sample holds what came since the sample before
+        chosen = latency[(latency[:, 0] > begin) & (latency[:, 0] <= end), 1]
+        if len(chosen):
+            median, late = (round(float(value), 2) for value in 1e3 * np.percentile(chosen, [50, 99]))
+            row = {"minute": round(float(begin) / 60.0, 1), "median_ms": median, "p99_ms": late, "frames": len(chosen)}
+            rows.append(row)
+    return rows
 
 
 def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
@@ -277,7 +297,7 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
         table = np.array(values)
         times, megabytes = table[:, 0], table[:, 1:] / 2**20
         warm = min(WARM_UP, total / 2)
-        early, (_, late) = (times >= warm) & (times < 2 * warm), _tenths(times, total)
+        early, late = (times >= warm) & (times < 2 * warm), times >= min(_edges(total)[-2], times[-1])
         if not early.any() or not late.any():
             continue
         first, last = np.median(megabytes[early], axis=0), np.median(megabytes[late], axis=0)
@@ -291,17 +311,6 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
             "kb_per_minute": round(1024.0 * float(slope), 1),
             "cpu_percent": round(100.0 * more["cpu"].get(name, 0.0), 1),
         }
-    latency = np.array(samples.latency).reshape(-1, 2)
-    early, late = _tenths(latency[:, 0], total)
-    latencies = {
-        which: {
-            "frames": int(chosen.sum()),
-            "median_ms": round(1e3 * float(np.median(latency[chosen, 1])), 2),
-            "p99_ms": round(1e3 * float(np.percentile(latency[chosen, 1], 99)), 2),
-        }
-        for which, chosen in (("first", early), ("last", late))
-        if chosen.any()
-    }
     progress = np.array(samples.progress)
     progress = progress[progress[:, 0] >= min(WARM_UP, total / 2)]
     elapsed, played, sent, taken = progress[-1] - progress[0] if len(progress) > 1 else np.full(4, np.nan)
@@ -316,7 +325,7 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
         "load_average": round(float(load[:, 1].mean()), 2),
         "cores": psutil.cpu_count(),
         "processes": rows,
-        "latency": latencies,
+        "latency": _latencies(samples, total),
         "deaths": samples.deaths,
         "back_s": more["back_s"],
     }
@@ -328,8 +337,7 @@ def bars(result: Mapping[str, Any]) -> dict[str, bool]:
     met = {
         "memory_flat": all(row["growth_percent"] <= 100.0 * GROWTH for row in result["processes"].values()),
         "nothing_died": not result["deaths"],
-        "latency_unchanged": len(latency) == 2
-        and latency["last"]["median_ms"] <= LATER * latency["first"]["median_ms"],
+        "latency_unchanged": len(latency) > 1 and latency[-1]["median_ms"] <= LATER * latency[0]["median_ms"],
     }
     if result["back_s"]:
         met["every_node_back_after_a_kill"] = all(seconds is not None for seconds in result["back_s"].values())
@@ -352,10 +360,9 @@ def show(result: Mapping[str, Any]) -> None:
             f"{row['kb_per_minute']:9.1f} kB {pss[0]:6.1f} {pss[1]:6.1f} {rss[0]:6.1f} {rss[1]:6.1f} "
             f"{row['cpu_percent']:7.1f} %"
         )
-    for which, row in result["latency"].items():
-        print(
-            f"  latency, {which} tenth: median {row['median_ms']} ms, 99 % {row['p99_ms']} ms of {row['frames']} frames"
-        )
+    print("  latency, from minute   median ms    99 % ms   frames")
+    for row in result["latency"]:
+        print(f"  {row['minute']:20.1f} {row['median_ms']:11.2f} {row['p99_ms']:10.2f} {row['frames']:8}")
     print(f"  died by itself, or gave no answer: {', '.join(result['deaths']) or 'nothing'}")
     if result["back_s"]:
         texts = [f"{name} {'never' if at is None else f'{at:g} s'}" for name, at in result["back_s"].items()]

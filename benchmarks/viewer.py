@@ -29,6 +29,7 @@ from typing import Any
 
 # first of all: it chooses a ROS domain of its own
 import latency
+import node_processes
 import numpy as np
 import psutil
 import rclpy
@@ -162,7 +163,7 @@ def viewer(page: Any, folder: Path, sharpness: float) -> Iterator[psutil.Process
         yield psutil.Process(process.pid)
         page.goto("about:blank")
     finally:
-        latency._stop([process])
+        node_processes.stop([process])
 
 
 def _seconds(process: psutil.Process) -> float:
@@ -173,7 +174,7 @@ def _seconds(process: psutil.Process) -> float:
 
 def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
     """Alternate, and compare."""
-    frames, poses = latency._recorded()
+    frames, poses = latency.recorded()
     rclpy.init()
     bench = Stretches(frames)
     spans: dict[str, list[tuple[int, int]]] = {"off": [], "on": []}
@@ -181,15 +182,15 @@ def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         stack.callback(rclpy.try_shutdown)
-        graph_processes = latency._start(folder, poses, relays=False)
-        stack.callback(latency._stop, graph_processes)
+        graph_processes = latency.start(folder, poses, relays=False)
+        stack.callback(node_processes.stop, graph_processes)
         page, browser = stack.enter_context(chromium(folder))
         deadline = time.monotonic() + 60.0
         while not bench.ready():
             if time.monotonic() > deadline:
                 raise SystemExit("viewer: the graph did not come up")
             time.sleep(0.1)
-        for run in (bench.publish, lambda: latency._spin(bench.executor)):
+        for run in (bench.publish, lambda: latency.spin(bench.executor)):
             threading.Thread(target=run, daemon=True).start()
         stack.callback(bench.ended.set)
 
