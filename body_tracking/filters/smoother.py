@@ -29,7 +29,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter, _Measurement, _State
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.state import Measurement, State
 from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
@@ -68,7 +69,7 @@ class _Posterior:
         covariance: (85 + m, 85 + m) of the state and the slow errors.
     """
 
-    state: _State
+    state: State
     sensors: tuple[str, ...]
     slow: FloatArray
     covariance: FloatArray
@@ -86,7 +87,7 @@ class _Link:
     """
 
     sensors: tuple[str, ...]
-    predicted: _State
+    predicted: State
     covariance: FloatArray
     gain: FloatArray
 
@@ -96,21 +97,20 @@ class _Backward:
 
     def __init__(self, ekf: ExtendedKalmanFilter) -> None:
         self._ekf = ekf
-        nv, nl = ekf.model.nv, len(ekf.model.length_names)
-        self._tangent, self._lengths = slice(0, nv), slice(nv, nv + nl)
-        self._velocities = slice(nv + nl, nv + nl + nv)
-        self._size = nv + nl + nv
+        space = ekf._space
+        self._tangent, self._lengths, self._velocities = space.tangent, space.lengths, space.velocities
+        self._size = space.size
 
-    def starts(self, state: _State) -> bool:
+    def starts(self, state: State) -> bool:
         """Whether a pose was just started: nothing but passing time ties it to its velocity."""
         return not state.covariance[self._tangent, self._velocities].any()
 
-    def link(self, state: _State, following: _State) -> _Link | None:
+    def link(self, state: State, following: State) -> _Link | None:
         """The tie of two states in a row; None where the second one is a start."""
         if self.starts(following):
             return None
         ekf = self._ekf
-        predicted = ekf._predicted(state, following.stamp_ns)
+        predicted = ekf._motion.predicted(state, following.stamp_ns)
         known = _sensors(state)
         shared = tuple(name for name in known if name in _sensors(following))
         covariance = self._joint(predicted, shared)
@@ -118,13 +118,13 @@ class _Backward:
         columns = self._columns(state, known, shared)
         return _Link(shared, predicted, covariance, _divided(moved[columns].T, covariance))
 
-    def last(self, state: _State) -> _Posterior:
+    def last(self, state: State) -> _Posterior:
         """Where nothing comes after, the filtered state is the smoothed one."""
         known = _sensors(state)
         covariance = self._joint(state, known)
         return _Posterior(state, known, np.zeros(len(covariance) - self._size), covariance)
 
-    def step(self, state: _State, link: _Link, following: _Posterior) -> _Posterior:
+    def step(self, state: State, link: _Link, following: _Posterior) -> _Posterior:
         """Smooth a state by the smoothed next one."""
         model = self._ekf.model
         predicted, after = link.predicted, following.state
@@ -153,10 +153,10 @@ class _Backward:
     def output(self, posterior: _Posterior, skeleton: Skeleton) -> tuple[Skeleton, ModelEstimate]:
         """What is told of a smoothed state; ``skeleton`` is the frame that was measured."""
         state = replace(posterior.state, covariance=posterior.covariance[: self._size, : self._size])
-        estimate = replace(self._ekf._estimate(state), frame_id=skeleton.frame_id, body=skeleton.body)
-        return self._ekf._output(state, skeleton), estimate
+        estimate = self._ekf._output.estimate(state, skeleton.frame_id, skeleton.body)
+        return self._ekf._output.skeleton(state, skeleton), estimate
 
-    def _joint(self, state: _State, sensors: tuple[str, ...]) -> FloatArray:
+    def _joint(self, state: State, sensors: tuple[str, ...]) -> FloatArray:
         """Covariance of a state and the slow errors of these sensors, which are in units of their deviation."""
         crosses = [cross for name in sensors if (cross := state.cross(name)) is not None]
         n = self._size
@@ -167,20 +167,20 @@ class _Backward:
             joint[n:, :n] = joint[:n, n:].T
         return joint
 
-    def _moved(self, state: _State, stamp_ns: int, errors: FloatArray) -> FloatArray:
+    def _moved(self, state: State, stamp_ns: int, errors: FloatArray) -> FloatArray:
         """Errors (85 + m, ...) of a state as they are at a later time: those of the filter's motion model."""
         parameters = self._ekf.parameters
         dt = (stamp_ns - state.stamp_ns) / NANOSECONDS
         fade = np.exp(-dt / parameters.velocity_time)
         reach = parameters.velocity_time * (1.0 - fade)
         moved = errors.copy()
-        moved[self._tangent] = self._ekf._turning_back(reach * state.velocity) @ errors[self._tangent]
+        moved[self._tangent] = self._ekf._motion.turning_back(reach * state.velocity) @ errors[self._tangent]
         moved[self._tangent] += reach * errors[self._velocities]
         moved[self._velocities] *= fade
         moved[self._size :] *= np.exp(-dt / parameters.slow_time)
         return moved
 
-    def _columns(self, state: _State, known: tuple[str, ...], wanted: tuple[str, ...]) -> IntArray:
+    def _columns(self, state: State, known: tuple[str, ...], wanted: tuple[str, ...]) -> IntArray:
         """Where the state and the slow errors of the wanted sensors lie, among those of the known ones."""
         columns = [np.arange(self._size)]
         place = self._size
@@ -193,7 +193,7 @@ class _Backward:
         return np.concatenate(columns).astype(np.intp)
 
 
-def _sensors(state: _State) -> tuple[str, ...]:
+def _sensors(state: State) -> tuple[str, ...]:
     """The sensors whose slow errors a state has to do with."""
     return state.slow_names
 
@@ -255,7 +255,7 @@ def smooth(
     found: list[tuple[Skeleton, ModelEstimate] | None] = [None] * len(order)
     last_of_stretch = np.zeros(len(order), dtype=np.intp)
     following: _Posterior | None = None
-    filtered: _State | None = None
+    filtered: State | None = None
     end = len(order)
     for first, place in reversed(kept):
         forward.go_back(place)
@@ -286,10 +286,10 @@ def smooth(
 
 def _learnt(
     ekf: ExtendedKalmanFilter, frames: Iterable[tuple[str, Skeleton]], tell: Callable[[int], None]
-) -> _State | None:
+) -> State | None:
     """What a run over all frames finds out about the person and the sensors; None where it sees no person."""
-    best: _State | None = None
-    start: _State | None = None
+    best: State | None = None
+    start: State | None = None
     for number, (sensor, skeleton) in enumerate(frames):
         ekf.update(skeleton, sensor)
         state = ekf._state
@@ -319,13 +319,13 @@ def _learnt(
 class _Forward:
     """A filter that can be put back to an earlier place, and that never forgets what was learnt before."""
 
-    def __init__(self, ekf: ExtendedKalmanFilter, learnt: _State | None) -> None:
+    def __init__(self, ekf: ExtendedKalmanFilter, learnt: State | None) -> None:
         self._ekf = ekf
         self._learnt = learnt
         # as if the person had been out of sight for longer than is predicted
         self._absence_ns = round((ekf.parameters.predict_for + 1.0) * NANOSECONDS)
 
-    def take(self, sensor: str, skeleton: Skeleton) -> _State | None:
+    def take(self, sensor: str, skeleton: Skeleton) -> State | None:
         """The state after a frame; None where the frame changed nothing."""
         ekf = self._ekf
         if self._learnt is not None and (ekf._state is None or ekf._frame_id != skeleton.frame_id):
@@ -336,11 +336,11 @@ class _Forward:
         ekf.update(skeleton, sensor)
         return None if ekf._state is before else ekf._state
 
-    def place(self) -> tuple[_State | None, str]:
+    def place(self) -> tuple[State | None, str]:
         """From where to go on."""
         return self._ekf._state, self._ekf._frame_id
 
-    def go_back(self, place: tuple[_State | None, str]) -> None:
+    def go_back(self, place: tuple[State | None, str]) -> None:
         """Go on from an earlier place."""
         self._ekf.reset()
         self._ekf._state, self._ekf._frame_id = place
@@ -359,7 +359,7 @@ class _Frame:
         link: to the next one; None for the newest, and where a stretch ends.
     """
 
-    state: _State
+    state: State
     skeleton: Skeleton
     link: _Link | None = None
 
@@ -454,7 +454,7 @@ class FixedLagSmoother:
             self._told_ns, self._estimate = told[-1][0].stamp_ns, told[-1][1]
         return told
 
-    def _append(self, state: _State, skeleton: Skeleton, follows: bool = True) -> None:
+    def _append(self, state: State, skeleton: Skeleton, follows: bool = True) -> None:
         if self._frames and follows:
             self._frames[-1].link = self._backward.link(self._frames[-1].state, state)
         self._frames.append(_Frame(state, skeleton))
@@ -463,7 +463,7 @@ class FixedLagSmoother:
         """Take over the states that the filter came to when it went back for a late frame."""
         while self._frames and self._frames[-1].state.stamp_ns > late.stamp_ns:
             self._frames.pop()
-        history = [(state, each) for state, each in self.filter._history if isinstance(each, _Measurement)]
+        history = [(state, each) for state, each in self.filter._history if isinstance(each, Measurement)]
         newest = self.filter._state
         assert newest is not None
         # it is not among them where it came late to the start, and was the first one of it

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from body_tracking.filters import orientation
-from body_tracking.filters.ekf import _HELD_STDDEV, _LIMIT_STDDEV, EkfParameters, ExtendedKalmanFilter
-from body_tracking.filters.orientation import PER_SOURCE, Sources
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf import sources as orientation
+from body_tracking.filters.ekf.priors import _HELD_STDDEV, _LIMIT_STDDEV
+from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import SEGMENTS, UNOBSERVED
@@ -329,7 +330,7 @@ def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None
     row = np.eye(MODEL.nv)[PRONATION[:1]]
     turned = []
     for state in (held, loose):
-        pushed = estimator._pushed_back(state, row, np.array([0.5]))
+        pushed = estimator._priors._pushed_back(state, row, np.array([0.5]))
         before, after = (MODEL.turning(each.q, SEGMENT_NUMBER["forearm_left"])[0] for each in (state, pushed))
         turned.append(np.linalg.norm(so3.log(so3.matrix_to_quat(after @ before.T))))
         assert_allclose(pushed.sources.misalignment, state.sources.misalignment, rtol=0.0, atol=1e-12)
@@ -522,12 +523,12 @@ def test_angular_velocities_correct_velocities_and_nothing_else() -> None:
     own = slice(BODY, BODY + PER_SOURCE)
     quicker = replace(orientations[-1], angular_velocity=orientations[-1].angular_velocity + 0.1)
     with_rates = ExtendedKalmanFilter()
-    found = with_rates._spun_by(without, quicker, 0, own)
+    found = with_rates._orientations._spun_by(without, quicker, 0, own)
     assert_allclose(found.q, without.q, rtol=0.0, atol=0.0)
     assert_allclose(found.sources.misalignment, without.sources.misalignment, rtol=0.0, atol=0.0)
     assert np.abs(found.velocity - without.velocity).max() > 0.01
     before, after = (np.sqrt(state.covariance.diagonal()) for state in (without, found))
-    velocities = with_rates._velocities
+    velocities = with_rates._space.velocities
     moved = [NAMES.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left")]
     assert (after[velocities][moved] < 0.9 * before[velocities][moved]).all()
     rest = np.ones(len(before), dtype=np.bool_)

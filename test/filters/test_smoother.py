@@ -10,8 +10,8 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from body_tracking.filters import ekf, smoother
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters import smoother
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter, sensor_errors
 from body_tracking.filters.linear import FilterError
 from body_tracking.filters.smoother import FixedLagSmoother, Smoothed, smooth
 from body_tracking.kinematics.estimate import ModelEstimate
@@ -165,7 +165,7 @@ def test_equals_the_rts_smoother_of_filterpy_where_the_filter_is_linear() -> Non
         transition[size:, size:] *= slow_fade
         noise = (1.0 - slow_fade**2) * np.eye(full)
         noise[:size, :size] = (
-            ekf._predicted(state, after.stamp_ns).covariance
+            ekf._motion.predicted(state, after.stamp_ns).covariance
             - transition[:size, :size] @ state.covariance @ transition[:size, :size].T
         )
         transitions.append(transition)
@@ -198,7 +198,7 @@ def test_moves_errors_as_the_filter_does() -> None:
     later = state.stamp_ns + NANOSECONDS // 10
     backward = smoother._Backward(ekf)
     moved = backward._moved(state, later, backward._moved(state, later, state.covariance).T)
-    added = ekf._predicted(state, later).covariance - moved
+    added = ekf._motion.predicted(state, later).covariance - moved
     blocks = np.zeros_like(added)
     for first in (0, NV + NL):
         for second in (0, NV + NL):
@@ -229,7 +229,7 @@ def gained(before: list[tuple[Skeleton, ModelEstimate]], after: list[tuple[Skele
 
 def test_is_never_less_certain_than_a_filter_that_estimates_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the positive semidefinite sense, of the tangent and the velocities."""
-    monkeypatch.setattr(ekf, "_LEAST_ERROR", 0.0)  # slow errors are not estimated
+    monkeypatch.setattr(sensor_errors, "_LEAST_ERROR", 0.0)  # slow errors are not estimated
     parameters = EkfParameters(slow_scale=0.0, settle_stddev=1e-5, settle_time=1e5)
     frames = rest(np.random.default_rng(2), 60, 1e-3)
     shares = np.linalg.eigvalsh(gained(filtered(frames, parameters), lagged(frames, LONG, parameters)))

@@ -1,0 +1,85 @@
+"""What a pose is off by because sensors take the centres of joints to be elsewhere, which no filter can know."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.sensor_errors import SLOW_PERIOD_NS
+from body_tracking.filters.ekf.sources import PER_SOURCE
+from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.kinematics.model import Linearisation
+from body_tracking.skeleton import FloatArray, Joint
+
+_DIMENSIONS = 3
+_BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
+"""Joints that show which way an arm is bent, and how many times the usual distance their centres are off for that: a
+Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simulated as calibrated with recordings)."""
+
+
+class Displacement:
+    """Says how unsure a pose is by that.
+
+    Args:
+        space: of the states.
+        parameters: of the filter.
+
+    Attributes:
+        prior_information: (53, 53) on tangent and lengths without any measurement.
+    """
+
+    def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
+        self._space, self._parameters = space, parameters
+        self._of_arms = np.isin(
+            space.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
+        )
+        self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
+        self._last_displaced: tuple[int, FloatArray] | None = None
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._last_displaced = None
+
+    def displaced(self, state: State, lines: Linearisation) -> FloatArray:
+        """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
+
+        By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
+        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` is how the filter weighs the points and ``P`` what is known
+        without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
+        offsets, err by more.
+        """
+        period = state.stamp_ns // SLOW_PERIOD_NS
+        if self._last_displaced is None or self._last_displaced[0] != period:  # it changes slowly, as the pose does
+            information = self.prior_information
+            if state.sources.names:
+                information = information + self._held(state, lines)
+            self._last_displaced = period, self.covariance(state, lines, information)
+        return self._last_displaced[1]
+
+    def covariance(self, state: State, lines: Linearisation, information: FloatArray) -> FloatArray:
+        """The same, where (53, 53) information is what is known without any point."""
+        space = self._space
+        weights = sum(
+            (1.0 / (sensor.white + sensor.slow[0] * space.base_variance) for sensor in state.sensors.values()),
+            np.zeros(space.points),
+        )
+        offsets = self._parameters.offset_scale * np.sqrt(space.base_variance)
+        if state.sources.names:
+            weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
+            offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
+        observation = space.observation(lines)
+        weighted = observation.T * weights.repeat(_DIMENSIONS)
+        gain = np.linalg.solve(weighted @ observation + information, weighted)
+        displacement = gain * offsets.repeat(_DIMENSIONS)
+        return displacement @ displacement.T
+
+    def _held(self, state: State, lines: Linearisation) -> FloatArray:
+        """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""
+        space = self._space
+        own = state.covariance.diagonal()[space.size :].reshape(-1, PER_SOURCE)
+        variance = own.sum(axis=1) / _DIMENSIONS  # of misalignment, heading and what persists together, per axis
+        turning = lines.rotation_jacobian[state.sources.segments]
+        information = np.zeros((space.observed, space.observed))
+        information[space.tangent, space.tangent] = np.einsum("nij,nik,n->jk", turning, turning, 1.0 / variance)
+        return information

@@ -1,0 +1,482 @@
+"""The extended filter: frames and orientations in the order of their time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from body_tracking.filters.ekf.displacement import Displacement
+from body_tracking.filters.ekf.motion import Motion
+from body_tracking.filters.ekf.orientations import OrientationUpdate
+from body_tracking.filters.ekf.output import Output
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.poses import PoseSearch
+from body_tracking.filters.ekf.priors import Priors
+from body_tracking.filters.ekf.sensor_errors import SensorErrors
+from body_tracking.filters.ekf.skeletons import SkeletonUpdate
+from body_tracking.filters.ekf.sources import pose_of
+from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.measurement import INFERRED_FACTOR
+from body_tracking.orientation import SegmentOrientation
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+
+_TRACKED = np.uint8(TrackingState.TRACKED)
+_EYE3 = np.eye(3)
+_START_FRAMES = 4
+"""Frames of one sensor that tell its noise."""
+_WAIT_NS = NANOSECONDS // 2
+"""Frames farther apart than this do not make a start together."""
+_MAX_COORDINATE = 100.0
+_LONGEST_WAIT_NS = NANOSECONDS // 10
+"""Orientations that nobody asks for wait no longer than this."""
+_UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
+"""Metres and radians: of the base where orientations alone start the body."""
+
+
+class ExtendedKalmanFilter:
+    """The filter ``ekf``.
+
+    Attributes:
+        model: the body.
+        counters: what happened since the construction, for diagnostics.
+    """
+
+    def __init__(self, parameters: EkfParameters | None = None, model: UpperBody | None = None) -> None:
+        self.parameters = p = parameters or EkfParameters()
+        self.model = model or UpperBody()
+        self.counters: dict[str, int] = dict.fromkeys(
+            (
+                "frames",
+                "measured",
+                "rejected",
+                "restarts",
+                "branches",
+                "repeated_stamps",
+                "late_frames",
+                "taken_again",
+                "too_late",
+                "backward_jumps",
+                "gaps",
+                "frame_changes",
+                "no_trunk",
+                "broken_covariances",
+                "orientations",
+                "orientations_used",
+                "orientations_rejected",
+                "rates_rejected",
+                "orientations_late",
+                "orientations_refused",
+                "slips",
+            ),
+            0,
+        )
+        self._space = space = StateSpace(self.model)
+        self._motion = Motion(space, p)
+        self._sensors = SensorErrors(space, p)
+        self._priors = Priors(space, p, self.counters)
+        self._poses = PoseSearch(space, self._motion, self._sensors, p, self.counters)
+        self._displacement = Displacement(space, p)
+        self._orientations = OrientationUpdate(space, self._motion, self._priors, self._displacement, p, self.counters)
+        self._skeletons = SkeletonUpdate(
+            space,
+            self._motion,
+            self._sensors,
+            self._poses,
+            self._priors,
+            self._orientations,
+            p,
+            self.counters,
+        )
+        self._output = Output(space, self._displacement, p)
+        self.reset()
+
+    # --- what users call
+
+    def reset(self) -> None:
+        """Forget the person; the counters stay."""
+        self._last: State | None = None
+        self._late: list[Measurement | SegmentOrientation] = []
+        self._frame_id = ""
+        self._newest: Skeleton | None = None
+        self._history: deque[tuple[State, Measurement | SegmentOrientation]] = deque()
+        self._waiting: list[Measurement] = []
+        self._turned_only: dict[str, SegmentOrientation] = {}
+        self._turned_since: int | None = None
+        self._newest_of: dict[str, int] = {}
+        self._poses.started_by = None
+        self._skeletons.forget()
+        self._displacement.forget()
+        self._output.forget()
+
+    @property
+    def innovation_distance(self) -> float:
+        """The last frame's normalised innovation squared over all its accepted points; NaN before a first."""
+        return self._skeletons.innovation_distance
+
+    @property
+    def innovation_dimension(self) -> int:
+        """Its expectation."""
+        return self._skeletons.innovation_dimension
+
+    def start(
+        self, q: FloatArray, lengths: FloatArray | None = None, stamp_ns: int = 0, frame_id: str = "world"
+    ) -> None:
+        """Set the pose instead of finding it by inverse kinematics from the first frame.
+
+        Args:
+            q: (35,) configuration.
+            lengths: (21,) metres; those of an average person where None.
+            stamp_ns: when it is so.
+            frame_id: of the base.
+        """
+        self.reset()
+        lengths = self.model.default_lengths() if lengths is None else lengths
+        self._frame_id = frame_id
+        stddev = np.sqrt(self._space.base_variance)
+        self._state = self._poses.new_state(stamp_ns, q, lengths, stddev, None)
+
+    def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
+        """Take one frame, and say what it shows: :meth:`take` and then :attr:`filtered`.
+
+        Returns:
+            None where the frame is a repetition, came late, or shows no trunk yet.
+        """
+        return self.filtered if self.take(skeleton, sensor) else None
+
+    def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
+        """Take one frame; one that comes late counts from when the estimate is next needed, together with others.
+
+        Args:
+            skeleton: in a fixed frame with z up; ``/fused/skeleton``, or one sensor's brought into ``world``.
+            sensor: whose it is, as each has its own noise.
+
+        Returns:
+            Whether there is an estimate of its time now: not where the frame is a repetition, came late, or shows no
+            trunk yet.
+        """
+        measurement = self._measurement(skeleton, sensor)
+        state = self._last
+        if state is not None and measurement.stamp_ns >= state.stamp_ns and not self._is_awaited(measurement):
+            state = self._state
+        if state is not None and not self._in_time(measurement, state):
+            return False
+        state = self._last  # a jump of time may have reset it
+        self.counters["frames"] += 1
+        if state is not None and state.unplaced:
+            return self._placed(measurement)
+        if state is not None and (self._is_awaited(measurement) or self._is_late(measurement, state)):
+            # orientations come sooner than frames of the same time, which are the newest of their kind all the same
+            overtaken = self._is_awaited(measurement) or bool((state.sources.stamps >= measurement.stamp_ns).any())
+            late = not overtaken or self._newest is None or measurement.stamp_ns < self._newest.stamp_ns
+            self.counters["late_frames"] += late
+            self._late.append(measurement)
+            if not late:
+                self._newest = skeleton
+            return not late
+        self._newest = skeleton
+        if state is None:
+            self._frame_id = skeleton.frame_id
+            self._state = self._begun(measurement)
+            return self._state is not None
+        if not (state.sensors and state.fresh and state.stamp_ns == measurement.stamp_ns):
+            self._state = self._remember(state, measurement)  # else it was started from this frame, after a gap
+        return True
+
+    def take_orientation(self, measurement: SegmentOrientation) -> bool:
+        """Take the orientation of one segment, at its own time among frames and others.
+
+        Where there are no skeletons, the body is started after ``start_after`` by orientations alone, its base at the
+        origin with a deviation that says that nothing tells where it is. The first skeletons then start it anew.
+
+        Returns:
+            Whether there is an estimate of about its time now: not where it is a repetition or came late.
+        """
+        self.counters["orientations"] += 1
+        state = self._last
+        if state is None:
+            return self._begun_turned(measurement)
+        if not self._orientation_in_time(measurement, state):
+            return False
+        state = self._last
+        if state is None:
+            return self._begun_turned(measurement)
+        late = self._is_late(measurement, state)
+        self.counters["orientations_late"] += late
+        # It waits until somebody asks: a camera's frame of an earlier time may still be to come before.
+        self._late.append(measurement)
+        if measurement.stamp_ns - state.stamp_ns > _LONGEST_WAIT_NS:
+            self._last = self._replay(state)
+        return not late
+
+    @property
+    def filtered(self) -> Skeleton | None:
+        """The modelled joints after the last frame in its order, with covariances and velocities; None before a first.
+
+        INFERRED where predicted, NOT_TRACKED where not modelled.
+        """
+        if self._state is None:
+            return None
+        newest = self._newest
+        if newest is None:
+            if not self._state.unplaced:
+                return None
+            newest = self._empty(self._state.stamp_ns)
+        return self._output.skeleton(self._state, newest)
+
+    @property
+    def estimate(self) -> ModelEstimate | None:
+        """The state of the model after the last frame; None before a first."""
+        return None if self._state is None else self._output.estimate(self._state, self._frame_id, self._body())
+
+    def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
+        """What is to be expected at a later time, without any change of the filter; None where the person is lost."""
+        state = self._state
+        if state is None:
+            return None
+        last_ns = max(int(state.used_ns.max()), state.oriented_ns)
+        if stamp_ns - last_ns > self.parameters.predict_for * NANOSECONDS:
+            return None
+        state = self._priors.within(self._motion.predicted(state, stamp_ns))
+        estimate = self._output.estimate(state, self._frame_id, self._body())
+        return self._output.skeleton(state, self._empty(stamp_ns)), estimate
+
+    # --- input
+
+    def _measurement(self, skeleton: Skeleton, sensor: str) -> Measurement:
+        joints = self.model.joints
+        measured = skeleton.valid[joints]
+        positions = np.where(measured[:, None], skeleton.positions[joints], 0.0)
+        states = skeleton.states[joints]
+        inferred = np.where(states == _TRACKED, 1.0, INFERRED_FACTOR**2)
+        model = self._space.base_variance * inferred
+        if skeleton.covariances is not None:
+            given = skeleton.covariances[joints]
+            diagonal = given.diagonal(axis1=1, axis2=2)
+            # a sum is finite where all its numbers are
+            sound = (diagonal > 0.0).all(axis=1) & (np.abs(given).sum(axis=(1, 2)) < _MAX_COORDINATE**2)
+            model = np.where(sound, diagonal.mean(axis=1), model)
+        return Measurement(sensor, skeleton.stamp_ns, positions, measured, model, skeleton)
+
+    def _in_time(self, measurement: Measurement, state: State) -> bool:
+        """Whether to take a frame; a jump of time, a gap or another frame of reference reset the filter."""
+        p = self.parameters
+        elapsed = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        last = state.sensors.get(measurement.sensor)
+        if measurement.skeleton.frame_id != self._frame_id:
+            self.counters["frame_changes"] += 1
+            self.reset()
+        elif elapsed > p.predict_for:
+            self.counters["gaps"] += 1
+            self._history.clear()
+            self._late.clear()
+            started = self._poses.first_state(measurement, state)
+            if started is None:
+                return False  # what is known of person and sensors stays for the first frame that shows a trunk
+            self._state = started
+        elif self._is_known(measurement, state, last):
+            self.counters["repeated_stamps"] += 1
+            return False
+        elif elapsed < -p.late_window:
+            jump = elapsed < -max(1.0, 2.0 * p.late_window)
+            self.counters["backward_jumps" if jump else "too_late"] += 1
+            if jump:
+                self.reset()
+            return jump
+        return True
+
+    def _is_known(self, measurement: Measurement, state: State, last: SensorState | None) -> bool:
+        """Whether this sensor's frame of this stamp was taken before."""
+        if measurement.stamp_ns > state.stamp_ns:
+            return False
+        if last is not None and measurement.stamp_ns in last.stamps:
+            return True
+        own = measurement.sensor, measurement.stamp_ns
+        taken = (*self._late, *(each for _, each in self._history))
+        return own == self._poses.started_by or any(
+            (each.sensor, each.stamp_ns) == own for each in taken if isinstance(each, Measurement)
+        )
+
+    def _orientation_in_time(self, measurement: SegmentOrientation, state: State) -> bool:
+        """Whether to take an orientation. What one source says of the time resets nothing that cameras see."""
+        p = self.parameters
+        elapsed = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        alone = state.unplaced and (elapsed > p.predict_for or elapsed < -max(1.0, 2.0 * p.late_window))
+        if measurement.frame_id != self._frame_id or (elapsed > p.predict_for and not alone):
+            self.counters["orientations_refused"] += 1
+            return False
+        if alone:
+            self.counters["gaps" if elapsed > 0.0 else "backward_jumps"] += 1
+            self.reset()
+            return True
+        known = self._newest_of.get(measurement.source)
+        if known is None or measurement.stamp_ns > known:
+            self._newest_of[measurement.source] = measurement.stamp_ns
+        elif any(
+            each.stamp_ns == measurement.stamp_ns and each.source == measurement.source
+            for each in (*self._late, *(each for _, each in self._history))
+            if isinstance(each, SegmentOrientation)
+        ):
+            self.counters["repeated_stamps"] += 1
+            return False
+        if elapsed < -p.late_window:
+            self.counters["too_late"] += 1
+            return False
+        return True
+
+    def _begun_turned(self, measurement: SegmentOrientation) -> bool:
+        """Start the body by orientations alone, where no skeleton comes for some time."""
+        since, stamp_ns = self._turned_since, measurement.stamp_ns
+        if since is None or abs(stamp_ns - since) > (self.parameters.start_after + 1.0) * NANOSECONDS:
+            self._turned_only, since = {}, stamp_ns
+        self._turned_since = since = min(since, stamp_ns)
+        latest = self._turned_only.get(measurement.source)
+        if latest is None or latest.stamp_ns < stamp_ns:
+            self._turned_only[measurement.source] = measurement
+        seen = self._waiting and abs(self._waiting[-1].stamp_ns - stamp_ns) < self.parameters.start_after * NANOSECONDS
+        if seen or stamp_ns - since < self.parameters.start_after * NANOSECONDS:
+            return False
+        together = [each for each in self._turned_only.values() if each.frame_id == measurement.frame_id]
+        self._frame_id = measurement.frame_id
+        self._turned_only, self._turned_since, self._waiting = {}, None, []
+        q = pose_of(self.model, self._space.ranges, together)
+        unseen = np.full(self._space.points, np.inf)
+        state = self._poses.new_state(measurement.stamp_ns, q, self.model.default_lengths(), unseen, None)
+        covariance = state.covariance.copy()
+        covariance[:3, :3] = _UNPLACED_STDDEV**2 * _EYE3
+        covariance[3:6, 3:6] = _UNTURNED_STDDEV**2 * _EYE3
+        self._state = self._remember(state.but(covariance=covariance, unplaced=True), measurement)
+        return True
+
+    def _placed(self, measurement: Measurement) -> bool:
+        """Start anew by skeletons what orientations alone had started."""
+        self._history.clear()
+        self._late.clear()
+        began = self._begun(measurement)
+        if began is None:
+            return False
+        self._frame_id, self._newest = measurement.skeleton.frame_id, measurement.skeleton
+        self._state, self._newest_of = began, {}
+        return True
+
+    # --- time
+
+    @property
+    def _state(self) -> State | None:
+        """After all frames, the late ones in their places; None before a start."""
+        if self._late and self._last is not None:
+            self._last = self._replay(self._last)
+        return self._last
+
+    @_state.setter
+    def _state(self, state: State | None) -> None:
+        self._last = state
+
+    def _is_late(self, measurement: Measurement | SegmentOrientation, state: State) -> bool:
+        """Whether it belongs before what was taken already."""
+        if measurement.stamp_ns < state.stamp_ns:
+            return True
+        return bool(self._history) and _order(self._history[-1][1]) > _order(measurement)
+
+    def _is_awaited(self, measurement: Measurement) -> bool:
+        """Whether orientations of later times wait to be taken, before which it has its place."""
+        return any(
+            isinstance(each, SegmentOrientation) and each.stamp_ns >= measurement.stamp_ns for each in self._late
+        )
+
+    def _remember(self, state: State, measurement: Measurement | SegmentOrientation) -> State:
+        """Take a frame in its order, and keep what a later, older one would have to be put before."""
+        horizon = measurement.stamp_ns - self.parameters.late_window * NANOSECONDS
+        while self._history and self._history[0][1].stamp_ns < horizon:
+            self._history.popleft()
+        self._history.append((state, measurement))
+        return self._step(state, measurement)
+
+    def _replay(self, state: State) -> State:
+        """Go back to before the first late frame, and take all late and all later ones in their order.
+
+        A connection that stalls delivers many at once: to go back for each of them would cost the later ones so many
+        times.
+        """
+        oldest_ns = self._history[0][0].stamp_ns if self._history else state.stamp_ns
+        late = [each for each in self._late if each.stamp_ns >= oldest_ns]  # others are older than all remembered ones
+        self._late = []
+        if not late:
+            return state
+        first = min(map(_order, late))
+        again = []
+        while self._history and _order(self._history[-1][1]) > first:
+            state, measurement = self._history.pop()
+            again.append(measurement)
+        self.counters["taken_again"] += len(again)
+        # of frames of one stamp the late ones come last
+        for measurement in sorted(again[::-1] + late, key=_order):
+            state = self._remember(state, measurement)
+        return state
+
+    def _step(self, state: State, measurement: Measurement | SegmentOrientation) -> State:
+        if isinstance(measurement, SegmentOrientation):
+            try:
+                return self._orientations.oriented(state, measurement)
+            except np.linalg.LinAlgError:
+                self.counters["broken_covariances"] += 1
+                unseen = np.full(self._space.points, np.inf)
+                anew = self._poses.new_state(state.stamp_ns, state.q, state.lengths, unseen, None)
+                return anew.but(sensors=state.sensors, unplaced=state.unplaced)
+        state = self._motion.predicted(state, measurement.stamp_ns)
+        if state.sources.names:
+            measurement = self._orientations.without_thumbs(state, measurement)
+        try:
+            return self._skeletons.taken(state, measurement)
+        except np.linalg.LinAlgError:
+            # Rounding, or numbers beyond all measure, have made of the covariance what is none: nothing of it is kept.
+            self.counters["broken_covariances"] += 1
+            learnt = state.sensors
+            unseen = np.full(self._space.points, np.inf)
+            return self._poses.first_state(measurement, None, learnt) or self._poses.new_state(
+                state.stamp_ns, state.q, state.lengths, unseen, None
+            ).but(sensors=learnt)
+
+    def _begun(self, measurement: Measurement) -> State | None:
+        """The state after the first few frames, as many as tell a sensor's noise: without it the start is a guess."""
+        if self._waiting and abs(measurement.stamp_ns - self._waiting[-1].stamp_ns) > _WAIT_NS:
+            self._waiting.clear()
+        if any((each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for each in self._waiting):
+            self.counters["repeated_stamps"] += 1
+            return None
+        self._waiting.append(measurement)
+        self._waiting.sort(key=lambda each: each.stamp_ns)
+        by_sensor = [each for each in self._waiting if each.sensor == measurement.sensor]
+        if len(by_sensor) < _START_FRAMES:
+            return None
+        sensors: dict[str, SensorState] = {}
+        for each in self._waiting:
+            known = sensors.get(each.sensor) or self._sensors.unknown(each)
+            known = self._sensors.seen_by(known, each, each.measured)
+            slow = np.maximum(known.slow, self._sensors.least_slow(known.white, each))
+            sensors[each.sensor] = known.but(slow=slow)
+        # only the noise is kept: the frames themselves are still to come
+        learnt = {name: sensor.but(stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}
+        first, *others = self._waiting
+        self._waiting = []
+        state = self._poses.first_state(first, None, learnt)
+        for each in others:
+            state = self._remember(state, each) if state is not None else self._poses.first_state(each, None, learnt)
+        return state
+
+    # --- output
+
+    def _body(self) -> int:
+        return 0 if self._newest is None else self._newest.body
+
+    def _empty(self, stamp_ns: int) -> Skeleton:
+        """A frame that shows nothing."""
+        nowhere, unseen = np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8)
+        return Skeleton(stamp_ns, self._frame_id, nowhere, unseen, self._body())
+
+
+def _order(measurement: Measurement | SegmentOrientation) -> tuple[int, str]:
+    """Where it belongs among others: by its time; of the same time, frames come before orientations."""
+    return measurement.stamp_ns, measurement.source if isinstance(measurement, SegmentOrientation) else ""

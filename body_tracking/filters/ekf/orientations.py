@@ -1,0 +1,311 @@
+"""What orientations of segments say, and of their sources."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, whitening_of
+from body_tracking.filters.ekf.displacement import Displacement
+from body_tracking.filters.ekf.motion import Motion
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.priors import Priors
+from body_tracking.filters.ekf.sources import PER_SOURCE, about, expect, slipped
+from body_tracking.filters.ekf.state import Measurement, State, StateSpace
+from body_tracking.kinematics import so3
+from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+
+_AHEAD_OF = 0.9
+"""Share of the period of the greatest rate from which on the next orientation counts: clocks jitter."""
+_TOGETHER_NS = NANOSECONDS // 125
+"""An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
+the motion model adds in the meantime (1 mrad) comes with the next one."""
+_SLIP_TIME = 0.5
+"""Seconds over which innovations of orientations are summed, to see them lean."""
+_SLIPPED = 30.0
+"""Squared normalised sum that a source which fits does not come to (chi-square with 3 degrees of freedom)."""
+
+
+class OrientationUpdate:
+    """Takes orientations into a state.
+
+    Args:
+        space: of the states.
+        motion: of the filter.
+        priors: of the filter.
+        displacement: of the filter.
+        parameters: of the filter.
+        counters: of the filter.
+    """
+
+    def __init__(
+        self,
+        space: StateSpace,
+        motion: Motion,
+        priors: Priors,
+        displacement: Displacement,
+        parameters: EkfParameters,
+        counters: dict[str, int],
+    ) -> None:
+        self._space, self._model, self._ranges = space, space.model, space.ranges
+        self._motion, self._priors, self._displacement = motion, priors, displacement
+        self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
+        self._by_thumbs = self._thumb_table()
+
+    def oriented(self, state: State, measurement: SegmentOrientation) -> State:
+        """A state corrected by an orientation, at its time; the same state where it comes too soon.
+
+        Raises:
+            LinAlgError: its covariance is none.
+        """
+        space = self._space
+        p, sources = self._parameters, state.sources
+        number = sources.find(measurement.source)
+        since = math.inf if number is None else (measurement.stamp_ns - int(sources.stamps[number])) / NANOSECONDS
+        if since < _AHEAD_OF / p.orientation_rate:
+            return state
+        before_ns = state.oriented_ns or measurement.stamp_ns
+        if measurement.stamp_ns - state.stamp_ns > _TOGETHER_NS:
+            state = self._motion.predicted(state, measurement.stamp_ns)
+        segment = SEGMENT_NUMBER[measurement.segment]
+        heard = measurement.stamp_ns - sources.stamps <= p.forget_after * NANOSECONDS
+        if number is not None:
+            heard[number] &= segment == sources.segments[number]
+        if not heard.all():
+            state = self._forgotten(state, heard)
+        number = state.sources.find(measurement.source)
+        known = number is not None
+        if number is None:
+            state = self._with_source(state, measurement)
+            number = len(state.sources) - 1
+        sources = state.sources
+        own = slice(space.size + PER_SOURCE * number, space.size + PER_SOURCE * (number + 1))
+        restated = sources.restated(number, measurement, p)
+        if restated is not None:
+            sources, left, new = restated
+            errors = slice(own.start, own.start + len(left))
+            covariance, crosses = state.covariance.copy(), state.crosses.copy()
+            covariance[errors] *= left[:, None]
+            covariance[:, errors] *= left
+            covariance[errors, errors] += np.diag(new)
+            crosses[errors] *= left[:, None]
+            state = state.but(covariance=covariance, crosses=crosses, sources=sources)
+
+        fade = math.exp(-since / _SLIP_TIME)
+        lean, leaning = fade * sources.lean[number], fade * fade * float(sources.leaning[number])
+        corrected, white = self._turned_by(state, measurement, number, own)
+        distance = float(white @ white)
+        near = distance < self._gate
+        lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
+        leaning += 1.0
+        fits = near and float(lean @ lean) < _SLIPPED * leaning
+        passed = min(since, p.slip_after) if known else 0.0  # of a new one nothing has passed
+        unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + passed
+        if unfit_for > p.slip_after:
+            self._counters["slips"] += 1
+            state = state.but(covariance=slipped(state.covariance, own, p))
+            lean, leaning, unfit_for, near = np.zeros(3), 0.0, 0.0, True
+            corrected, _ = self._turned_by(state, measurement, number, own)
+        if near:
+            corrected = self._spun_by(corrected, measurement, number, own)
+            before, after = (m.covariance.diagonal()[space.velocities] for m in (state, corrected))
+            moved = state.moved + (corrected.velocity - state.velocity)
+            moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
+            dt = (measurement.stamp_ns - before_ns) / NANOSECONDS
+            state = corrected.but(
+                log_density=self._motion.densities_learnt(state, moved, moved_variance, after, dt),
+                moved=moved,
+                moved_variance=moved_variance,
+                oriented_ns=measurement.stamp_ns,
+            )
+        self._counters["orientations_used" if near else "orientations_rejected"] += 1
+        looked_at = state.sources.looked_at(number, measurement, p, unfit_for, lean, leaning)
+        return self._priors.within(self._priors.bounded(state.but(sources=looked_at)))
+
+    def _turned_by(
+        self,
+        state: State,
+        measurement: SegmentOrientation,
+        number: int,
+        own: slice,
+    ) -> tuple[State, FloatArray]:
+        """The Kalman update by an orientation, linearised anew until it is close; and (3,) the normalised innovation.
+
+        Args:
+            state: of the orientation's time.
+            measurement: the orientation.
+            number: of its source.
+            own: the rows of what is known of that.
+        """
+        space = self._space
+        t, v = space.tangent, space.velocities
+        ahead = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
+        q = self._model.integrate(state.q, ahead * state.velocity) if ahead > 0.0 else state.q
+        correction, white = np.zeros(len(state.covariance)), np.zeros(3)
+        first: FloatArray | None = None
+        for left in reversed(range(LINEARISATIONS)):
+            seen = expect(
+                self._model,
+                q,
+                state.sources,
+                number,
+                measurement.rotation,
+                None if first is None else correction[own],
+            )
+            by_tangent, by_source, innovation = seen.by_tangent, seen.by_source, seen.innovation
+            if first is not None:
+                for ball in self._model.ball_v:  # in the tangent of the state
+                    by_tangent[:, ball] = by_tangent[:, ball] @ so3.right_jacobian(correction[ball])
+                step = correction[t] + ahead * correction[v]
+                innovation = innovation + by_tangent @ step + by_source @ correction[own]
+            cross = by_tangent @ state.covariance[t] + by_source @ state.covariance[own]
+            if ahead > 0.0:
+                cross += by_tangent @ (ahead * state.covariance[v])
+            s = (cross[:, t] + ahead * cross[:, v]) @ by_tangent.T + cross[:, own] @ by_source.T
+            s.reshape(-1)[::4] += self._parameters.orientation_noise**2
+            whitening = whitening_of(s)
+            white = whitening @ innovation
+            first = white if first is None else first
+            gain = whitening @ cross
+            before, correction = correction, white @ gain
+            turned = float(np.abs(correction[3 : space.nv]).max())
+            if not left or turned < FAR or np.abs(correction - before)[3 : space.nv].max() < CLOSE:
+                break
+            step = correction[t] + ahead * (state.velocity + correction[v])
+            q = self._model.integrate(state.q, step)
+        assert first is not None
+        covariance = state.covariance - gain.T @ gain
+        kalman = gain.T @ whitening
+        if state.settled:
+            correction[space.lengths] = 0.0
+            kalman[space.lengths] = 0.0
+            covariance[space.lengths, space.lengths] = state.covariance[space.lengths, space.lengths]
+        if len(state.null):
+            for part in (correction[t], correction[space.velocities]):
+                part -= (state.null @ part) @ state.null
+        crosses = state.crosses
+        if crosses.shape[1]:
+            crosses = crosses - kalman @ (by_tangent @ (crosses[t] + ahead * crosses[v]) + by_source @ crosses[own])
+        if turned >= FAR:
+            for ball in self._model.ball_v:
+                turn = so3.right_jacobian(correction[ball])
+                covariance[ball] = turn @ covariance[ball]
+                covariance[:, ball] = covariance[:, ball] @ turn.T
+                crosses[ball] = turn @ crosses[ball]
+        return space.moved(state.but(covariance=covariance, crosses=crosses), correction), first
+
+    def _spun_by(self, state: State, measurement: SegmentOrientation, number: int, own: slice) -> State:
+        """The velocities corrected by the angular velocity that comes with an orientation; nothing else is.
+
+        What it errs by (how the source sits, axes that are the person's own) it errs by alike all the time, and would
+        teach the pose and its sources what is not so: these are considered but not corrected (Schmidt 1966).
+        """
+        rate, p = measurement.angular_velocity, self._parameters
+        if rate is None or not p.rate_factor:
+            return state
+        v = self._space.velocities
+        rotation, turning = self._model.turning(state.q, int(state.sources.segments[number]))
+        innovation = rotation @ (state.sources.misalignment[number] @ rate) - turning @ state.velocity
+        # about axes that are off by a misalignment that is known only so well
+        misaligned = float(state.covariance.diagonal()[own][:3].mean())
+        cross = turning @ state.covariance[v]
+        s = cross[:, v] @ turning.T
+        s.reshape(-1)[::4] += p.rate_factor**2 * measurement.angular_velocity_variance + misaligned * float(rate @ rate)
+        whitening = whitening_of(s)
+        white = whitening @ innovation
+        if float(white @ white) > self._gate:
+            self._counters["rates_rejected"] += 1  # a blow, or the pose is far off
+            return state
+        half = whitening @ cross  # of it the columns of velocities are the gain's
+        gain = half[:, v]
+        taken = gain.T @ half
+        covariance = state.covariance.copy()
+        covariance[v] -= taken
+        covariance[:, v] -= taken.T
+        covariance[v, v] += gain.T @ gain
+        correction = np.zeros(len(covariance))
+        correction[v] = white @ gain
+        if len(state.null):
+            correction[v] -= (state.null @ correction[v]) @ state.null
+        crosses = state.crosses
+        if crosses.shape[1]:
+            crosses = crosses.copy()
+            crosses[v] -= gain.T @ (whitening @ (turning @ crosses[v]))
+        return self._space.moved(state.but(covariance=covariance, crosses=crosses), correction)
+
+    def _with_source(self, state: State, measurement: SegmentOrientation) -> State:
+        """A state with one more source of orientations."""
+        sources, added = state.sources.with_new(measurement, self._parameters)
+        old = len(state.covariance)
+        covariance = np.zeros((old + PER_SOURCE, old + PER_SOURCE))
+        covariance[:old, :old] = state.covariance
+        covariance[old:, old:] = added
+        crosses = np.concatenate([state.crosses, np.zeros((PER_SOURCE, state.crosses.shape[1]))])
+        # what thumbs have said so far was said with too much confidence
+        doubtful = self._by_thumbs[sources.segments[-1]]
+        covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2
+        # so was all, as if a camera took joints to be elsewhere at other times, which from now on it is not taken to
+        if not state.sources.names and any(sensor.stated for sensor in state.sensors.values()):
+            known = slice(0, self._space.observed)
+            lines = self._model.linearise(state.q, state.lengths)
+            covariance[known, known] += self._displacement.covariance(
+                state.but(sources=sources), lines, self._displacement.prior_information
+            )
+        # what was unobserved may be so no longer
+        null = np.empty((0, self._space.nv))
+        return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
+
+    def without_thumbs(self, state: State, measurement: Measurement) -> Measurement:
+        """A frame without the thumbs of forearms or hands whose orientation is measured.
+
+        A thumb is all that tells a camera how a forearm is turned about itself, and it is off for as long as it looks
+        the same: by 50 degrees with a Kinect v2. Any alignment of an inertial sensor is better than what it would be
+        corrected to.
+        """
+        unseen = self._space.thumbs[state.sources.segments].any(axis=0)
+        return replace(measurement, measured=measurement.measured & ~unseen)
+
+    def unlearnt(self, state: State) -> tuple[FloatArray, FloatArray] | None:
+        """What a camera must not teach of sources: how their forearm or hand is turned about itself.
+
+        Thumbs apart (:meth:`without_thumbs`) nothing shows a camera that but which way an arm is bent, of which it is
+        sure and wrong for as long as the arm looks the same. That combination of a source's numbers is only considered
+        (Schmidt 1966): its gain is zero, along the direction in which what is known of the source varies with it.
+
+        Returns:
+            (n, 85 and more) combinations, and (85 and more, n) what takes them from a correction; None where there are
+            none.
+        """
+        space = self._space
+        hidden = np.flatnonzero(space.thumbs[state.sources.segments].any(axis=1))
+        if not len(hidden):
+            return None
+        axes = self._model.forward(state.q, state.lengths).rotations[state.sources.segments[hidden], :, 2]
+        combinations = np.zeros((len(hidden), len(state.covariance)))
+        back = np.zeros((len(state.covariance), len(hidden)))
+        for place, (number, axis) in enumerate(zip(hidden, axes, strict=True)):
+            own = slice(space.size + PER_SOURCE * int(number), space.size + PER_SOURCE * (int(number) + 1))
+            combinations[place, own] = about(axis)
+            spread = state.covariance[own, own] @ combinations[place, own]
+            back[own, place] = spread / (combinations[place, own] @ spread)
+        return combinations, back
+
+    def _forgotten(self, state: State, kept: BoolArray) -> State:
+        """A state with some (n,) of its sources of orientations."""
+        rows = np.concatenate([np.ones(self._space.size, dtype=np.bool_), np.repeat(kept, PER_SOURCE)])
+        return state.but(
+            sources=state.sources.kept(kept), covariance=state.covariance[rows][:, rows], crosses=state.crosses[rows]
+        )
+
+    def _thumb_table(self) -> list[IntArray]:
+        """(12,) of each segment the coordinates that rest on its thumb."""
+        coordinates = [np.empty(0, dtype=np.intp) for _ in self._model.segment_names]
+        for number in np.flatnonzero(self._space.thumbs.any(axis=1)).tolist():
+            side = self._model.segment_names[number].rsplit("_", 1)[1]
+            resting = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
+            places = [self._model.coordinate_names.index(f"{each}_{side}") for each in resting]
+            coordinates[number] = np.array(places, dtype=np.intp)
+        return coordinates

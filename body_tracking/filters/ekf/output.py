@@ -1,0 +1,111 @@
+"""What is handed out of a state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.filters.ekf.displacement import Displacement
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.priors import VAGUE
+from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import Linearisation
+from body_tracking.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
+
+_INFERRED = np.uint8(TrackingState.INFERRED)
+_UNKNOWN = np.zeros((N_JOINTS, 3, 3))
+_UNKNOWN[:] = np.diag([np.inf] * 3)
+
+
+class Output:
+    """Makes of a state what users get.
+
+    Args:
+        space: of the states.
+        displacement: of the filter.
+        parameters: of the filter.
+    """
+
+    def __init__(self, space: StateSpace, displacement: Displacement, parameters: EkfParameters) -> None:
+        self._space, self._model, self._ranges = space, space.model, space.ranges
+        self._displacement, self._parameters = displacement, parameters
+        names = space.model.coordinate_names[6:]
+        self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
+        self._last_handed_out: tuple[State, FloatArray, Linearisation, FloatArray] | None = None
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._last_handed_out = None
+
+    def _handed_out(self, state: State) -> tuple[FloatArray, Linearisation, FloatArray]:
+        """The configuration, where its points are, and the covariance (85, 85) to hand out: what the filter knows, and
+        what it cannot.
+        """
+        space = self._space
+        if self._last_handed_out is None or self._last_handed_out[0] is not state:
+            lines, covariance = self._model.linearise(state.q, state.lengths), state.covariance
+            if self._parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
+                covariance = covariance.copy()
+                covariance[: space.observed, : space.observed] += self._displacement.displaced(state, lines)
+            q = state.q
+            if state.sources.names:
+                q = self._middled(q, state.covariance[space.tangent, space.tangent])
+                lines = self._model.linearise(q, state.lengths)
+            self._last_handed_out = state, q, lines, covariance
+        return self._last_handed_out[1:]
+
+    def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(35,) a configuration of covariance (32, 32) told the middle of the ranges once, where it is vague."""
+        soft = self._ranges.soft_coordinates(q)
+        gradients = np.zeros((self._space.nv - 6, self._space.nv))
+        gradients[:, 6:] = soft.gradients
+        stddev = self._ranges.stddev
+        vague = ((gradients @ covariance) * gradients).sum(axis=1) > (VAGUE * stddev) ** 2
+        vague &= self._twists
+        rows = gradients[vague]
+        cross = covariance @ rows.T
+        away = soft.values[vague] - self._ranges.centre[vague]
+        return self._model.integrate(q, -cross @ np.linalg.solve(rows @ cross + np.diag(stddev[vague] ** 2), away))
+
+    def estimate(self, state: State, frame_id: str, body: int) -> ModelEstimate:
+        """The state of the model.
+
+        Args:
+            state: of the filter.
+            frame_id: in which the base is.
+            body: whose it is.
+        """
+        space = self._space
+        q, _, told = self._handed_out(state)
+        covariance = np.empty((2 * space.nv, 2 * space.nv))
+        for row, rows in enumerate((space.tangent, space.velocities)):
+            for column, columns in enumerate((space.tangent, space.velocities)):
+                block = slice(row * space.nv, (row + 1) * space.nv), slice(column * space.nv, (column + 1) * space.nv)
+                covariance[block] = told[rows, columns]
+        return ModelEstimate(
+            state.stamp_ns,
+            frame_id,
+            body,
+            q,
+            state.velocity,
+            covariance,
+            state.lengths,
+            np.sqrt(told.diagonal()[space.lengths]),
+        )
+
+    def skeleton(self, state: State, skeleton: Skeleton) -> Skeleton:
+        """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
+        space = self._space
+        _, lines, told = self._handed_out(state)
+        joints = self._model.joints
+        observation = space.observation(lines)
+        spread = observation @ told[: space.observed, : space.observed] @ observation.T
+        positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
+        covariances = _UNKNOWN.copy()
+        states = np.zeros(N_JOINTS, dtype=np.uint8)
+        positions[joints] = lines.posture.positions
+        velocities[joints] = (observation[:, space.tangent] @ state.velocity).reshape(-1, 3)
+        covariances[joints] = spread.reshape(-1).take(space.own)
+        used = state.used_ns == skeleton.stamp_ns
+        states[joints] = np.where(used, skeleton.states[joints], _INFERRED)
+        return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)

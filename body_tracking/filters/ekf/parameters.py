@@ -1,0 +1,98 @@
+"""The settings of the extended filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scipy.special import chdtri
+
+from body_tracking.filters.ekf.sources import OrientationParameters
+from body_tracking.filters.linear import FilterError
+from body_tracking.parameters import check_fields, number_field
+
+
+@dataclass(frozen=True, slots=True)
+class EkfParameters(OrientationParameters):
+    """The settings of the extended filter; each field's metadata says what it is, its unit and its range.
+
+    Raises:
+        FilterError: a value out of its range.
+    """
+
+    velocity_time: float = number_field(0.8, "time in which a velocity fades when nothing renews it", "s", 0.05, 100.0)
+    density_translation: float = number_field(
+        1.0, "spectral density of the base's acceleration per axis, before it is learnt", "m2/s3", 1e-5, 1e3
+    )
+    density_trunk: float = number_field(
+        2.0,
+        "spectral density of the angular acceleration of the base's tilt, spine, neck, clavicles, at first",
+        "rad2/s3",
+        1e-4,
+        1e4,
+    )
+    density_turn: float = number_field(
+        20.0,
+        "spectral density of the angular acceleration with which the whole person turns, at first: people stand, and "
+        "then turn at once",
+        "rad2/s3",
+        1e-4,
+        1e4,
+    )
+    density_limb: float = number_field(
+        3.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
+    )
+    density_hand: float = number_field(
+        3.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
+    )
+    density_rate: float = number_field(
+        0.1, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
+    )
+    white_stddev: float = number_field(
+        0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
+    )
+    slow_scale: float = number_field(
+        0.3,
+        "variance of the slow errors of a sensor that states covariances, as a share of these, before it is learnt",
+        "1",
+        0.0,
+        9.0,
+    )
+    offset_scale: float = number_field(
+        1.0,
+        "distance of the joints' centres by a sensor that states covariances from the anatomical ones, in standard "
+        "deviations of body_tracking.measurement; no filter can know it, and it is added to what is handed out",
+        "1",
+        0.0,
+        10.0,
+    )
+    slow_time: float = number_field(3.0, "time for which a sensor's slow errors persist", "s", 0.05, 1000.0)
+    gate_probability: float = number_field(
+        0.9999,
+        "a point is rejected where its innovation lies beyond this chi-square quantile (3 degrees of freedom)",
+        "1",
+        0.5,
+        1.0,
+    )
+    reacquire_after: float = number_field(
+        0.12,
+        "points rejected without a break for longer than this may start the pose anew, where it fits them",
+        "s",
+        0.0,
+        60.0,
+    )
+    settle_stddev: float = number_field(
+        0.003, "lengths stay as they are from when they are known as well as this", "m", 1e-5, 1.0
+    )
+    settle_time: float = number_field(60.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
+    late_window: float = number_field(0.2, "frames that come late by no more than this still count", "s", 0.0, 2.0)
+    predict_for: float = number_field(
+        2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self, "extended filter", FilterError)
+
+    @property
+    def gate(self) -> float:
+        """The squared Mahalanobis distance of three numbers from which on they are rejected."""
+        return float(chdtri(3, 1.0 - self.gate_probability))

@@ -1,0 +1,327 @@
+"""Poses by inverse kinematics: the first one, and another one where the filter is in a wrong one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from body_tracking.filters.ekf.algebra import CLOSE, squared_distance
+from body_tracking.filters.ekf.motion import Motion
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.sensor_errors import SensorErrors
+from body_tracking.filters.ekf.sources import PER_SOURCE
+from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, State, StateSpace
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.inverse import InverseKinematics
+from body_tracking.kinematics.lengths import SegmentLengths
+from body_tracking.kinematics.model import ModelError
+from body_tracking.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
+
+_EYE3 = np.eye(3)
+_REST_NS = NANOSECONDS // 4
+"""At least so long from one search for another pose to the next."""
+_MOST_ATTEMPTS = 4
+"""Times that the rest doubles where the strain is back soon after another pose was looked for: sensors that contradict
+each other are the cause then, and no pose is right for all of them."""
+_SOON = 4
+"""Rests after which it is another matter."""
+_LOOK_NS = NANOSECONDS // 2
+"""The same where only a hand is suspected, which much noise makes it be time and again, and lengths stay as they are:
+these do not give way to a wrong hand, and its strain remains."""
+_WHOLE = 15
+"""Points that a frame must show to tell a person's size from."""
+_MUCH_BETTER = 0.5
+_LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
+"""Seconds over which innovations are averaged, and how many it takes to see them lean."""
+_STRAINED = 4.0
+"""Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
+with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 2 to 5."""
+_SUSPICIOUS = 1.0
+"""The same, from which it is worth a look whether a hand is bent and turned the wrong way about. That is seldom with
+little noise, and most of the time in such a pose: lengths that are still learnt give way to it."""
+_LIKELIER = 3.0
+"""Half the difference of two costs, the logarithm of how much likelier a pose is: 20 to 1."""
+_MISFIT = 0.02
+"""Metres by which a person's points lie beside any pose of the model for a while."""
+_FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
+"""m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
+_CONTRADICTION = 0.8
+"""Radians by which no other pose that points suggest may turn such a segment at once."""
+_ANOTHER_SIZE = 1.2
+"""Times that a person is larger or smaller than the one before, who must be another one."""
+
+
+class PoseSearch:
+    """Finds poses that fit frames.
+
+    Args:
+        space: of the states.
+        motion: of the filter.
+        sensors: of the filter.
+        parameters: of the filter.
+        counters: of the filter.
+
+    Attributes:
+        inverse: the inverse kinematics.
+        started_by: sensor and stamp of the frame of the last first pose.
+    """
+
+    def __init__(
+        self,
+        space: StateSpace,
+        motion: Motion,
+        sensors: SensorErrors,
+        parameters: EkfParameters,
+        counters: dict[str, int],
+    ) -> None:
+        self._space, self._model, self._motion, self._sensors = space, space.model, motion, sensors
+        self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
+        self.inverse = InverseKinematics(space.model, space.ranges)
+        self.started_by: tuple[str, int] | None = None
+        self._velocity_variance = np.full(space.nv, _FIRST_TURN_RATE**2)
+        self._velocity_variance[:3] = _FIRST_SPEED**2
+        path = {Joint(joint): number for number, joint in enumerate(space.model.joints)}
+        bones = [(path[a], path[b]) for a, b in BONES if a in path and b in path]
+        self._bones = np.array([a for a, _ in bones], dtype=np.intp), np.array([b for _, b in bones], dtype=np.intp)
+
+    def first_state(
+        self, measurement: Measurement, previous: State | None, learnt: dict[str, SensorState] | None = None
+    ) -> State | None:
+        """The pose of one frame by inverse kinematics; None where no trunk is seen."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        known = learnt if learnt is not None else {} if previous is None else previous.sensors
+        stddev = self._sensors.point_stddev(measurement, known)
+        lengths = self._lengths_of(points) if previous is None else previous.lengths
+        try:
+            fit = self.inverse.solve(points, stddev, lengths)
+        except ModelError:
+            self._counters["no_trunk"] += 1
+            return None
+        self.started_by = measurement.sensor, measurement.stamp_ns
+        state = self.new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
+        state = state.but(fresh=True, sensors=state.sensors if learnt is None else learnt)
+        sensor = state.sensors.get(measurement.sensor) or self._sensors.unknown(measurement)
+        sensor = self._sensors.seen_by(sensor, measurement, measurement.measured)
+        return state.but(sensors={**state.sensors, measurement.sensor: sensor})
+
+    def new_state(
+        self,
+        stamp_ns: int,
+        q: FloatArray,
+        lengths: FloatArray,
+        stddev: FloatArray,
+        previous: State | None,
+        *,
+        keep_lengths: bool = True,
+    ) -> State:
+        """A state at rest at a pose, as uncertain as a fit to points of this deviation (19,) leaves it."""
+        space = self._space
+        lines = self._model.linearise(q, lengths)
+        weights = np.where(np.isfinite(stddev), 1.0 / stddev**2, 0.0)
+        by_tangent = lines.jacobian.reshape(-1, space.nv)
+        by_length = lines.length_jacobian.reshape(-1, space.nl)
+        weighted = by_tangent * np.repeat(weights, 3)[:, None]
+        information = weighted.T @ by_tangent
+        information[np.arange(space.nv), np.arange(space.nv)] += space.rest_information
+        tangent = np.linalg.inv(information)
+        # the fit took the lengths for true: their errors are in the pose
+        from_lengths = -tangent @ (weighted.T @ by_length)
+        lengths_covariance = (
+            previous.covariance[space.lengths, space.lengths]
+            if previous is not None and keep_lengths
+            else space.lengths_covariance
+        )
+        sources = NOBODY if previous is None else previous.sources
+        size = space.size + PER_SOURCE * len(sources)
+        covariance = np.zeros((size, size))
+        if previous is not None:
+            covariance[space.size :, space.size :] = previous.covariance[space.size :, space.size :]
+        t, n, v = space.tangent, space.lengths, space.velocities
+        covariance[t, t] = tangent + from_lengths @ lengths_covariance @ from_lengths.T
+        covariance[t, n] = from_lengths @ lengths_covariance
+        covariance[n, t] = covariance[t, n].T
+        covariance[n, n] = lengths_covariance
+        covariance[v, v] = np.diag(self._velocity_variance)
+        zero = np.zeros(space.nv)
+        return State(
+            stamp_ns,
+            q,
+            lengths,
+            zero,
+            covariance,
+            self._motion.first_log_density if previous is None else previous.log_density,
+            zero,
+            zero,
+            {} if previous is None else previous.sensors,
+            (),
+            np.empty((size, 0)),
+            np.zeros(space.points),
+            np.zeros((space.points, 3)),
+            np.zeros(space.points),
+            0.0,
+            np.full(space.points, stamp_ns, dtype=np.intp),
+            0.0,
+            0.0 if previous is None else previous.tracked,
+            False if previous is None else previous.settled,
+            SegmentLengths(self._parameters.slow_time) if previous is None else previous.seen,
+            np.empty((0, space.nv)),
+            sources=sources,
+        )
+
+    def searched(self, state: State, measurement: Measurement, back: BoolArray) -> State:
+        """A state that a frame has corrected, or another one where that is in a wrong pose.
+
+        Args:
+            state: after the frame.
+            measurement: the frame.
+            back: (19,) which of its points had been away for long.
+        """
+        # another pose takes ten times as long to look for as a frame to filter
+        if state.stamp_ns - state.attempted_ns <= _REST_NS:
+            return state
+        if state.rejected_for.max() > self._parameters.reacquire_after:
+            return self._reacquired(state, measurement).but(attempted_ns=state.stamp_ns)
+        if back.any() and self._astray(state, measurement, back):
+            points, stddev = self._as_fitted(measurement, state)
+            return self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
+        return self._looked_anew(state, measurement) if state.strain > _SUSPICIOUS else state
+
+    def _looked_anew(self, state: State, measurement: Measurement) -> State:
+        """Look for another pose that fits better, the more seldom the more often that was of no use."""
+        elapsed, rest = state.stamp_ns - state.attempted_ns, _REST_NS << min(state.attempts, _MOST_ATTEMPTS)
+        if elapsed < rest or (state.strain < _STRAINED and state.settled and elapsed < _LOOK_NS):
+            return state
+        attempts = state.attempts + 1 if elapsed < _SOON * rest else 0
+        return self._straightened(state, measurement).but(attempted_ns=state.stamp_ns, attempts=attempts)
+
+    def _reacquired(self, state: State, measurement: Measurement) -> State:
+        """Start the pose anew where another one fits the rejected points much better."""
+        space = self._space
+        points, stddev = self._as_fitted(measurement, state)
+        started = self._restarted(state, points, stddev, _MUCH_BETTER)
+        if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
+            return started
+        # No pose fits: lengths that came from a wrong start would shut the right points out for ever.
+        covariance = state.covariance.copy()
+        covariance[space.lengths, space.lengths] += space.lengths_covariance
+        return state.but(covariance=covariance)
+
+    def _astray(self, state: State, measurement: Measurement, back: BoolArray) -> bool:
+        """Whether an update by points (19,) that were away for long ended where they are not."""
+        off = measurement.positions - self._model.forward(state.q, state.lengths).positions
+        variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
+        return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
+
+    def _as_fitted(self, measurement: Measurement, state: State) -> tuple[FloatArray, FloatArray]:
+        """(19, 3) points, NaN where not measured, and their deviations (19,)."""
+        points = np.where(measurement.measured[:, None], measurement.positions, np.nan)
+        return points, self._sensors.point_stddev(measurement, state.sensors)
+
+    def _restarted(self, state: State, points: FloatArray, stddev: FloatArray, share: float) -> State:
+        """A pose that fits points with at most a share of the present one's cost; else the present state."""
+        try:
+            # to tell whether a pose is worth it takes half the steps that it takes to tell the pose
+            fit = self.inverse.solve(points, stddev, state.lengths, tolerance=CLOSE)
+            # lengths that were learnt in a wrong pose are wrong, too
+            lengths = self._lengths_of(points)
+            size = float(np.median(lengths / state.lengths))
+            other = not state.settled or not 1.0 / _ANOTHER_SIZE < size < _ANOTHER_SIZE
+            fresh = self.inverse.solve(points, stddev, lengths, fit.q) if other else fit
+        except ModelError:
+            return state
+        if self._contradicts(state, fit.q) or (other and self._contradicts(state, fresh.q)):
+            return state
+        present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
+        whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
+        if other and whole and fresh.cost < share * min(fit.cost, present):
+            self._counters["restarts"] += 1
+            seen = SegmentLengths(self._parameters.slow_time) if state.settled else state.seen
+            state = state.but(settled=False, tracked=0.0, seen=seen)
+            return self.new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
+        if fit.cost > share * present:
+            return state
+        self._counters["restarts"] += 1
+        fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
+        return self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
+
+    def leaning(
+        self,
+        state: State,
+        innovation: FloatArray,
+        covariance: FloatArray,
+        measured: BoolArray,
+        distances: FloatArray,
+        white: FloatArray,
+        dt: float,
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """The faded mean of the innovations (19, 3), its weights (19,) and the strain."""
+        fade = math.exp(-dt / _LEAN_TIME)
+        bounded = np.minimum(1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9)))  # one outlier is no lean
+        weight = fade * state.leaning + measured
+        step = measured / np.maximum(weight, 1.0)
+        lean = state.lean + step[:, None] * (bounded[:, None] * innovation - state.lean)
+        # variance of a faded mean of white innovations with this weight
+        worth = (0.5 + 0.5 * fade) * weight
+        # a body is no model: what is off by less than this needs no other pose
+        averaged = white * (1.0 - 1.0 / np.maximum(worth, 1.0))  # only what is white averages out
+        spread = covariance + (_MISFIT**2 - averaged)[:, None, None] * _EYE3
+        strain = np.where(weight > _LEAN_FRAMES, squared_distance(spread, lean), 0.0)
+        return lean, weight, float(strain.max())
+
+    def _straightened(self, state: State, measurement: Measurement) -> State:
+        """Start the pose anew where another one fits much better what the points have shown for some time.
+
+        A filter can settle in a wrong pose that no single frame contradicts: an elbow that looks straight because
+        the upper arm is turned the wrong way about itself.
+        """
+        sure = state.leaning > _LEAN_FRAMES
+        posture = self._model.forward(state.q, state.lengths)
+        points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
+        stddev = self._sensors.point_stddev(measurement, state.sensors)
+        stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2), np.inf)
+        turned = self._hands_turned(state, points, stddev)
+        if turned is not state or state.strain < _STRAINED:
+            return turned
+        state = state.but(lean=np.zeros_like(state.lean), leaning=np.zeros(self._space.points), strain=0.0)
+        return self._restarted(state, points, stddev, _MUCH_BETTER)
+
+    def _hands_turned(self, state: State, points: FloatArray, stddev: FloatArray) -> State:
+        """Start anew with a hand turned about itself where that is much likelier; else the present state.
+
+        A hand that is bent and turned the wrong way about soon has lengths to match, a thumb that does not stand out.
+        So the lengths count, too: what is average against what they were learnt to be.
+        """
+        lengths, unlikely = state.lengths, 0.0
+        if not state.settled:
+            lengths = self._lengths_of(points)
+            off = state.lengths - lengths
+            unlikely = 0.5 * float(off @ np.linalg.solve(self._space.lengths_covariance, off))
+        fit = self.inverse.solve(points, stddev, lengths, state.q, tolerance=CLOSE, alternatives=True)
+        if not self.inverse.is_turned(state.q, fit.q) or self._contradicts(state, fit.q):
+            return state
+        stays = self.inverse.solve(points, stddev, state.lengths, state.q, tolerance=CLOSE)
+        if stays.cost + unlikely < fit.cost + _LIKELIER:
+            return state
+        self._counters["restarts"] += 1
+        return self.new_state(state.stamp_ns, fit.q, lengths, stddev, state, keep_lengths=state.settled)
+
+    def _lengths_of(self, points: FloatArray) -> FloatArray:
+        """(21,) average proportions at the size of the person that is seen."""
+        lengths = self._model.default_lengths()
+        neutral = self._model.forward(self._model.neutral(), lengths).positions
+        starts, ends = self._bones
+        seen = np.sqrt(((points[ends] - points[starts]) ** 2).sum(axis=1))
+        expected = np.sqrt(((neutral[ends] - neutral[starts]) ** 2).sum(axis=1))
+        ratio = seen / expected
+        ratio = ratio[np.isfinite(ratio)]
+        return lengths * float(np.clip(np.median(ratio), 0.5, 1.4)) if len(ratio) else lengths
+
+    def _contradicts(self, state: State, q: FloatArray) -> bool:
+        """Whether another pose turns a segment far from where a source that fits has it."""
+        segments = state.sources.segments[state.sources.unfit_for == 0.0]
+        if not len(segments):
+            return False
+        now, then = (self._model.forward(each, state.lengths).rotations[segments] for each in (state.q, q))
+        apart = so3.log(so3.matrix_to_quat(now @ then.swapaxes(-1, -2)))
+        return bool(((apart * apart).sum(axis=1) > _CONTRADICTION**2).any())

@@ -1,0 +1,239 @@
+"""What is known of a pose without any measurement: ranges of motion, and how people hold themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+
+from body_tracking.filters.ekf.algebra import cholesky
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+_PRIOR_PERIOD = 0.1
+"""Seconds between two looks at the ranges of motion."""
+_POSTURE_TIME = 10.0
+"""Seconds for which people hold a trunk alike: to sources of orientations the middle of its ranges is news once in
+twice that time, however often it is told."""
+VAGUE = 0.5
+"""Share of the range's deviation from which an angle is drawn to the middle of its range."""
+_SPURIOUS = 0.7
+"""Share of what the ranges say below which the variance of an unobserved direction is taken to be false."""
+_NULL = 1e-6
+"""Singular value, as a share of the greatest, below which a direction moves no point."""
+_LIMIT_STDDEV = 3.0
+"""Degrees: how softly limits push back, each time."""
+_HARD_STDDEV = 0.2
+_PROJECTIONS = 3
+_FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
+"""An estimate farther beyond a range than the first is brought back to the second."""
+_HELD_STDDEV = 0.02
+"""Radians by which what moves a pose without any measurement may turn a segment whose orientation is measured."""
+_HELD_FOR_NS = NANOSECONDS // 4
+"""A source that is silent for longer does not hold its segment any more."""
+
+
+class Priors:
+    """Keeps a state where a body can be.
+
+    Args:
+        space: of the states.
+        parameters: of the filter.
+        counters: of the filter.
+    """
+
+    def __init__(self, space: StateSpace, parameters: EkfParameters, counters: dict[str, int]) -> None:
+        self._space, self._model, self._ranges = space, space.model, space.ranges
+        self._parameters, self._counters = parameters, counters
+        trunk = [name.startswith(("lumbar", "thoracic", "clavicle")) for name in space.model.coordinate_names[6:]]
+        self._posture = np.append(trunk, True)
+
+    def bounded(self, state: State) -> State:
+        """Bring in the ranges of motion: softly push back what left them, and bound what nothing observes."""
+        space = self._space
+        if state.since_prior < _PRIOR_PERIOD:
+            return state
+        soft = self._ranges.soft_coordinates(state.q)
+        excess = self._ranges.excess_of(soft.values)
+        gradients = np.zeros((space.nv - 5, space.nv))
+        gradients[:-1, 6:] = soft.gradients
+        gradients[-1, 6:] = self._ranges.twist @ soft.gradients
+        values = np.append(soft.values - self._ranges.centre, self._ranges.twist @ soft.values)
+        stddev = np.append(self._ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
+        tangent = self._free(state)[0][space.tangent, space.tangent]
+        variance = ((gradients @ tangent) * gradients).sum(axis=1)
+        # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that:
+        # as far as no orientation holds it, for what is told again and again is wrong by the same each time.
+        limit = stddev**2
+        unknown = variance > limit
+        noise = variance * limit / np.maximum(variance - limit, 1e-12)
+        state = state.but(since_prior=0.0)
+        if state.seen is not None and state.tracked > self._parameters.settle_time:
+            state = state.but(settled=True, seen=None)
+        branch = self._ranges.nearest_branch(state.q)
+        if branch is not None:
+            return self._turned(state, *branch)
+        state = self._unsure(state)
+        if unknown.any():
+            state = self._told(state, gradients[unknown], -values[unknown], noise[unknown], self._free(state))
+        if state.sources.names:
+            rows, repeated = self._posture, 2.0 * _POSTURE_TIME / _PRIOR_PERIOD
+            whole = state.covariance, state.crosses
+            state = self._told(state, gradients[rows], -values[rows], repeated * limit[rows], whole)
+        vague = variance > (VAGUE * stddev) ** 2
+        if vague.any() and not state.sources.names:
+            state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
+        beyond = excess != 0.0
+        if beyond.any():
+            state = self._pushed_back(state, gradients[:-1][beyond], excess[beyond])
+        return state
+
+    def _turned(self, state: State, q: FloatArray, signs: FloatArray) -> State:
+        """The same state told by another configuration, whose tangent has other signs (32,)."""
+        self._counters["branches"] += 1
+        both = np.concatenate(
+            [signs, np.ones(self._space.nl), signs, np.ones(len(state.covariance) - self._space.size)]
+        )
+        return state.but(
+            q=q,
+            velocity=state.velocity * signs,
+            covariance=state.covariance * both * both[:, None],
+            moved=state.moved * signs,
+            crosses=state.crosses * both[:, None],
+        )
+
+    def _unsure(self, state: State) -> State:
+        """Take back what the update believes to know of directions that no point shows.
+
+        The unobserved directions are those of the estimate, which trembles; the update takes their turning from
+        frame to frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is
+        brought back to what the ranges of motion say.
+        """
+        space = self._space
+        lines = self._model.linearise(state.q, state.lengths)
+        jacobian = lines.jacobian.reshape(-1, space.nv)
+        if state.sources.names:
+            turning = lines.rotation_jacobian[state.sources.segments].reshape(-1, space.nv)
+            jacobian = np.concatenate([jacobian, turning])
+        _, singular, axes = np.linalg.svd(jacobian, full_matrices=False)
+        null = axes[singular < _NULL * singular[0]]
+        state = state.but(null=null)
+        if not len(null):
+            return state
+        tangent = state.covariance[space.tangent, space.tangent]
+        known = np.linalg.inv(null @ np.linalg.solve(tangent, null.T))
+        allowed = _SPURIOUS * np.linalg.inv((null * space.rest_information) @ null.T)
+        size, directions = np.linalg.eigh(allowed - known)
+        missing = (directions * np.maximum(size, 0.0)) @ directions.T
+        covariance = state.covariance.copy()
+        covariance[space.tangent, space.tangent] += null.T @ missing @ null
+        return state.but(covariance=covariance)
+
+    def _drawn(self, state: State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> State:
+        """The estimate drawn to the middle of the ranges, where nothing else holds it; the covariance stays.
+
+        Without this, an angle that nothing observes would wander with the noise of those that are. Beside orientations
+        it is done to what is handed out only (:meth:`Output._middled`): what cameras pull back again and again, as the
+        covariance stays, would end up in the headings and misalignments of the sources.
+        """
+        space = self._space
+        cross_covariance = self._free(state)[0][:, space.tangent] @ observation.T
+        s = observation @ cross_covariance[space.tangent] + np.diag(stddev**2)
+        correction = -cross_covariance @ np.linalg.solve(s, values)
+        correction[space.velocities] = 0.0
+        correction[space.size :] = 0.0
+        return space.moved(state, correction)
+
+    def within(self, state: State) -> State:
+        """The nearest state, by the covariance, that is not far beyond any range of motion.
+
+        Softly a range pushes back ten times a second; a velocity that runs on while nothing is seen, or a measurement
+        that no body can follow, is stopped here at once.
+        """
+        if self._ranges.surely_within(state.q, _FAR_BEYOND):
+            return state
+        for _ in range(_PROJECTIONS):
+            excess = self._ranges.excess(state.q)
+            size = np.abs(excess)
+            far = size > _FAR_BEYOND
+            if not far.any():
+                return state
+            gradients = self._ranges.soft_coordinates(state.q).gradients[far]
+            observation = np.zeros((len(gradients), self._space.nv))
+            observation[:, 6:] = gradients
+            back = excess[far] * (1.0 - _BACK_TO / size[far])
+            state = self._pushed_back(state, observation, back, _HARD_STDDEV)
+            velocity = state.velocity.copy()
+            rate = gradients @ velocity[6:]
+            outward = rate * excess[far] > 0.0
+            velocity[6:] -= gradients.T @ np.where(outward, rate, 0.0)
+            state = state.but(velocity=velocity)
+        return state.but(q=self._ranges.clipped(state.q, _FAR_BEYOND))
+
+    def _told(
+        self,
+        state: State,
+        observation: FloatArray,
+        error: FloatArray,
+        noise: FloatArray,
+        part: tuple[FloatArray, FloatArray],
+    ) -> State:
+        """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,).
+
+        Args:
+            state: to be corrected.
+            observation: rows.
+            error: of what is observed.
+            noise: variances.
+            part: the covariance, and with the slow errors of cameras: all of it, or what may be corrected.
+        """
+        space = self._space
+        free, free_crosses = part
+        cross_covariance = free[:, space.tangent] @ observation.T
+        s = observation @ cross_covariance[space.tangent] + np.diag(noise)
+        factor = cholesky(s)
+        gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
+        white, _ = dtrtrs(factor, error, lower=1)
+        covariance = state.covariance - gain.T @ gain
+        if state.settled:
+            covariance[space.lengths, space.lengths] = state.covariance[space.lengths, space.lengths]
+        half, _ = dtrtrs(factor, observation @ free_crosses[space.tangent], lower=1)
+        crosses = state.crosses - gain.T @ half
+        if state.settled:
+            crosses[space.lengths] = state.crosses[space.lengths]
+        return space.moved(state.but(covariance=covariance, crosses=crosses), white @ gain)
+
+    def _pushed_back(
+        self, state: State, observation: FloatArray, excess: FloatArray, stddev: float = _LIMIT_STDDEV
+    ) -> State:
+        """The nearest state, by the covariance, within the limits; softly (Simon 2010, projection of the estimate).
+
+        The covariance stays: that an angle is within its limits does not tell where.
+        """
+        space = self._space
+        cross_covariance = self._free(state)[0][:, space.tangent] @ observation.T
+        s = observation @ cross_covariance[space.tangent]
+        s[np.arange(len(s)), np.arange(len(s))] += np.radians(stddev) ** 2
+        correction = -cross_covariance @ np.linalg.solve(s, excess)
+        correction[space.size :] = 0.0  # as the covariance stays, sources would learn this again and again
+        return space.moved(state, correction)
+
+    def _free(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free.
+
+        A pose that is moved without any measurement must not turn what a source says the turn of: the source would be
+        corrected instead, each time a little.
+        """
+        space = self._space
+        speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
+        if not speaking.any():
+            return state.covariance, state.crosses
+        turning = self._model.linearise(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
+        rows = turning.reshape(-1, space.nv)
+        cross = state.covariance[:, space.tangent] @ rows.T
+        s = rows @ cross[space.tangent]
+        s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
+        held = np.linalg.solve(s, np.concatenate([cross.T, rows @ state.crosses[space.tangent]], axis=1))
+        size = len(state.covariance)
+        return state.covariance - cross @ held[:, :size], state.crosses - cross @ held[:, size:]

@@ -1,0 +1,237 @@
+"""What cameras err by: white noise, and what lasts for seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, StateSpace
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
+
+_DIMENSIONS = 3
+_MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
+_FLOOR = 1e-3
+"""Metres: no sensor's white noise is taken for less."""
+_MAX_SLOW = np.array([9.0, 1.0])
+"""Greatest scales of the slow variance: of points three times the model's deviation, of limbs as it is stated."""
+_THIRD_DIFFERENCE_SPAN = 0.25
+"""Seconds beyond which four frames in a row show motion, not noise."""
+_CORRELATED = 2.31
+"""So many third differences in a row, which overlap, tell of a variance as much as one and those after it, apart."""
+_NOISE_FRAMES = 600.0
+"""Frames over which the white noise of a point is averaged."""
+_POOL = 8.0
+"""Frames from which on a point's own noise counts alone."""
+_OUTLYING = 6.0
+"""A squared difference counts as at most so many times the variance."""
+NEGLIGIBLE_SLOW = 1e-3
+STRETCH = 0.1
+"""Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
+_SLOW_BOUND = 25.0
+_MEDIAN_OF_CHI2 = 0.455
+_LEAST_ERROR = 0.004
+"""Metres: no sensor knows where the centre of a joint is better than this."""
+_SIGNIFICANT = 2.0
+"""Standard deviations above zero from which a scale of slow errors is used."""
+SLOW_PERIOD_NS = NANOSECONDS // 15
+_SLOW_STEP = 0.02
+"""Share by which a scale changes at least: what it did to the state before has to be put right each time."""
+_SLOW_MEMORY = 0.7
+"""Seconds over which the scale of the slow errors is averaged."""
+
+
+class SensorErrors:
+    """Learns what sensors err by, and says what that does to their points.
+
+    Args:
+        space: of the states.
+        parameters: of the filter.
+
+    Attributes:
+        slow_size: how many slow errors a sensor has (61): three of each point, and one of each limb.
+    """
+
+    def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
+        self._space, self._model, self._parameters = space, space.model, parameters
+        self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
+        self._limb_points = self._limb_table()
+        self.slow_size = 3 * space.points + len(self._limbs)
+
+    def unknown(self, measurement: Measurement) -> SensorState:
+        """What is taken of a sensor before it is known; slow errors of one that states how much it errs."""
+        space = self._space
+        p = self._parameters
+        slow = p.slow_scale if measurement.skeleton.covariances is not None else 0.0
+        white = np.full(space.points, p.white_stddev**2)
+        return SensorState(
+            (),
+            np.empty((0, space.points, 3)),
+            white,
+            np.zeros(space.points),
+            np.zeros(space.points),
+            np.array([slow, 0.0]),
+            np.array([slow, 0.0]),
+            np.full(2, 4.0),
+            measurement.skeleton.covariances is not None,
+        )
+
+    def seen_by(self, sensor: SensorState, measurement: Measurement, used: BoolArray) -> SensorState:
+        """The variance of the white noise, from the third differences of the points that passed the gate."""
+        points = np.where(used[:, None], measurement.positions, np.nan)
+        stamps, frames = sensor.stamps, sensor.positions
+        if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
+            factors = _third_difference((*stamps, measurement.stamp_ns))
+            difference = (factors[:3] @ frames.reshape(3, -1)).reshape(-1, 3) + factors[3] * points
+            squared = (difference * difference) @ _MEAN
+            known = squared >= 0.0  # not NaN
+            if known.any():
+                sensor = self._white_learnt(sensor, squared, known)
+        frames = np.concatenate([frames[-2:], points[None]])
+        return sensor.but(stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames)
+
+    def _white_learnt(self, sensor: SensorState, squared: FloatArray, known: BoolArray) -> SensorState:
+        """The sensor's noise with one more squared difference (19,) of the known points."""
+        weight, differences = sensor.weight, sensor.differences
+        early = float(weight.min()) < 2.0 * _POOL
+        bound = differences
+        if early:
+            # what all points say together keeps one that was not seen yet from any value
+            bound = np.maximum(bound, _typical(squared[known], 1.0))
+        kept = np.minimum(weight, _NOISE_FRAMES)
+        differences = np.where(
+            known, (kept * differences + np.minimum(squared, _OUTLYING * bound)) / (kept + 1.0), differences
+        )
+        weight = np.where(known, kept + 1.0, weight)
+        white = differences
+        if early:
+            seen = weight > 0.0
+            share = np.maximum(1.0 - weight / (2.0 * _POOL), 0.0)
+            white = differences + share * (_typical(differences[seen], float(np.median(weight[seen]))) - differences)
+        return sensor.but(white=np.maximum(white, _FLOOR**2), differences=differences, weight=weight)
+
+    def slow_learnt(
+        self,
+        sensor: SensorState,
+        measurement: Measurement,
+        whitening: FloatArray,
+        white: FloatArray,
+        rows: slice | IntArray,
+        oriented: bool,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance.
+
+        Returns:
+            (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
+        """
+        least = self.least_slow(sensor.white, measurement)
+        if oriented and measurement.skeleton.covariances is not None:
+            least[0] = max(least[0], self._parameters.slow_beside_orientations)
+        # It changes slowly, and takes a while to compute.
+        soon = sensor.stamps and measurement.stamp_ns // SLOW_PERIOD_NS == sensor.stamps[-1] // SLOW_PERIOD_NS
+        # What is white is not known at first, and would be taken for slow.
+        if soon or sensor.weight.max() < 2.0 * _POOL:
+            scales = _kept(sensor.slow, np.maximum(sensor.slow, least))
+            return scales, sensor.slow_estimate, sensor.slow_information
+        basis = self._basis_of(measurement, measurement.positions)
+        half = np.zeros((len(white), self.slow_size))
+        half[:, rows] = whitening * basis.points[rows]
+        half[:, 3 * self._space.points :] = whitening @ basis.limbs[rows]
+        likely = white @ half
+        gram = half.T @ half
+        expected = gram.diagonal()
+        points = 3 * self._space.points
+        squares = likely**2
+        # one that is far from all others says nothing, where all are far they say much
+        shares = np.sort(squares[:points] / np.maximum(expected[:points], 1e-30))
+        usual = max(1.0, float(shares[points // 2]) / _MEDIAN_OF_CHI2)  # their number is odd
+        score = 0.5 * (np.minimum(squares, _SLOW_BOUND * usual * expected) - expected)
+        squared = gram * gram
+        scores = np.array([score[:points].sum(), score[points:].sum()])
+        information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
+        passed = SLOW_PERIOD_NS / NANOSECONDS
+        total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
+        # the mean of what each frame says, which may be less than nothing
+        estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
+        # an error is taken for real when it stands out: else every sensor would have a little of it
+        real = estimate * np.sqrt(total) > _SIGNIFICANT
+        scales = np.maximum(np.where(real, np.minimum(estimate, _MAX_SLOW), 0.0), least)
+        return _kept(sensor.slow, scales), estimate, total
+
+    def least_slow(self, white: FloatArray, measurement: Measurement) -> FloatArray:
+        """(2,) the scales that there are at least: what a sensor's points do not tremble by, they are wrong by."""
+        missing = self._space.points * _LEAST_ERROR**2 - float(white.sum())
+        return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), 0.0])
+
+    def per_error(self, scales: FloatArray) -> FloatArray:
+        """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
+        return np.repeat(scales, (3 * self._space.points, len(self._limbs)))
+
+    def slow_basis(self, scales: FloatArray, measurement: Measurement, positions: FloatArray) -> SlowBasis | None:
+        """Displacement of the points by each slow error of unit variance; None where these are negligible."""
+        if scales.max() < NEGLIGIBLE_SLOW:
+            return None
+        return self._basis_of(measurement, positions, *np.sqrt(scales))
+
+    def _basis_of(
+        self, measurement: Measurement, positions: FloatArray, of_points: float = 1.0, of_limbs: float = 1.0
+    ) -> SlowBasis:
+        """The same for slow errors of points and limbs that are so many times the stated deviations.
+
+        Each point is off by itself, and the upper arms and forearms are too long or too short in some poses, with all
+        that hangs on them: along a limb a depth sensor finds its joints by a tenth of the length nearer or farther.
+        """
+        starts, ends, beyond = self._limb_points
+        along = of_limbs * STRETCH * (positions[ends] - positions[starts])
+        return SlowBasis(
+            (of_points * np.sqrt(measurement.model_variance)).repeat(3),
+            (beyond[:, None, :] * along.T).reshape(-1, len(self._limbs)),
+        )
+
+    def point_stddev(self, measurement: Measurement, sensors: Mapping[str, SensorState]) -> FloatArray:
+        """(19,) metres; infinity where not measured."""
+        sensor = sensors.get(measurement.sensor) or self.unknown(measurement)
+        return np.where(
+            measurement.measured, np.sqrt(sensor.white + sensor.slow[0] * measurement.model_variance), np.inf
+        )
+
+    def _limb_table(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """(4,) points at the start and (4,) at the end of each limb, and (19, 4) which points it carries."""
+        point = {Joint(joint): number for number, joint in enumerate(self._model.joints)}
+        starts, ends = [], []
+        beyond = np.zeros((self._space.points, len(self._limbs)))
+        chain = ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
+        for column, limb in enumerate(self._limbs):
+            first = 0 if limb.startswith("upper_arm") else 1
+            parts = [point[Joint[f"{name}_{limb.rsplit('_', 1)[1].upper()}"]] for name in chain]
+            starts.append(parts[first])
+            ends.append(parts[first + 1])
+            beyond[parts[first + 1 :], column] = 1.0
+        return np.array(starts, dtype=np.intp), np.array(ends, dtype=np.intp), beyond
+
+
+def _kept(before: FloatArray, after: FloatArray) -> FloatArray:
+    """(2,) the new scales of slow errors, or the very same as before where they hardly differ."""
+    pairs = zip(before.tolist(), after.tolist(), strict=True)
+    return before if all(abs(b - a) <= _SLOW_STEP * a for a, b in pairs) else after
+
+
+def _typical(variances: FloatArray, weight: float) -> float:
+    """What several variances say together, each the mean of so many squared third differences, some of outliers."""
+    freedom = _DIMENSIONS * (1.0 + (weight - 1.0) / _CORRELATED)
+    # Wilson and Hilferty 1931: the median of chi-square over its mean
+    return float(np.median(variances)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
+
+
+def _third_difference(stamps: Sequence[int]) -> FloatArray:
+    """(4,) factors of the third divided difference at these nanoseconds; their squares sum up to 1."""
+    b, c, d = ((stamp - stamps[0]) / NANOSECONDS for stamp in stamps[1:])
+    factors = (
+        -1.0 / (b * c * d),
+        1.0 / (b * (b - c) * (b - d)),
+        1.0 / (c * (c - b) * (c - d)),
+        1.0 / (d * (d - b) * (d - c)),
+    )
+    return np.array(factors) / math.hypot(*factors)

@@ -1,0 +1,225 @@
+"""What the extended filter estimates, and the space in which it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from body_tracking.filters.ekf.sources import Sources
+from body_tracking.kinematics.lengths import SegmentLengths, proportions
+from body_tracking.kinematics.model import Linearisation
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.measurement import BASE_STDDEV
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
+
+NOBODY = Sources.none()
+
+
+class Changeable:
+    """A frozen dataclass without slots that is copied often."""
+
+    def but(self, **changes: Any) -> Self:
+        """What ``dataclasses.replace`` makes, which takes thirty times as long for that many fields."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.__dict__.update(changes)
+        return other
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlowBasis:
+    """Displacement (57, 61) of the points by each slow error of unit variance.
+
+    Attributes:
+        points: (57,) by those of each point alone, the diagonal of the first 57 columns.
+        limbs: (57, 4) by those of the limbs, the last columns.
+    """
+
+    points: FloatArray
+    limbs: FloatArray
+
+    def of(self, crosses: FloatArray) -> FloatArray:
+        """(n, 57) covariance with the displacement, of what has (n, 61) with the slow errors: C B^T."""
+        count = len(self.points)
+        result: FloatArray = crosses[:, :count] * self.points + crosses[:, count:] @ self.limbs.T
+        return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """One frame of one sensor, on the model's points.
+
+    Attributes:
+        sensor: who measured.
+        stamp_ns: capture time.
+        positions: (19, 3) metres in world; 0 where not measured.
+        measured: (19,) which are.
+        model_variance: (19,) square metres per axis by the measurement model, of white and slow errors together.
+        skeleton: where it comes from.
+    """
+
+    sensor: str
+    stamp_ns: int
+    positions: FloatArray
+    measured: BoolArray
+    model_variance: FloatArray
+    skeleton: Skeleton
+
+
+@dataclass(frozen=True, eq=False)
+class SensorState(Changeable):
+    """What the filter has learnt of a sensor.
+
+    Attributes:
+        stamps: nanoseconds of its last (at most 3) frames.
+        positions: (k, 19, 3) their points, NaN where not used.
+        white: (19,) variance of the white noise per axis, square metres.
+        differences: (19,) mean of the squared differences of each point alone.
+        weight: (19,) how many of these there were.
+        slow: (2,) scales of the slow variance: of points by themselves, of limbs.
+        slow_estimate: (2,) their running estimates, of which only significant ones are used.
+        slow_information: (2,) of the estimates.
+        stated: it says itself how much it errs, as one that was measured against anatomy does.
+    """
+
+    stamps: tuple[int, ...]
+    positions: FloatArray
+    white: FloatArray
+    differences: FloatArray
+    weight: FloatArray
+    slow: FloatArray
+    slow_estimate: FloatArray
+    slow_information: FloatArray
+    stated: bool
+
+
+@dataclass(frozen=True, eq=False)
+class State(Changeable):
+    """Everything that changes; never written into, so that an earlier one can be gone on from.
+
+    Attributes:
+        stamp_ns: of the state.
+        q, lengths, velocity: the estimate.
+        covariance: (85, 85) of the tangent, the lengths and the velocities; m more of m / 7 sources of orientations.
+        log_density: (groups,) log of the spectral density of each group of coordinates.
+        moved: (32,) faded sum of the corrections of the velocities.
+        moved_variance: (32,) its variance, if all is right.
+        sensors: what is known of each.
+        slow_names: (n,) those with whose slow errors the state is correlated.
+        crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation.
+        rejected_for: (19,) seconds.
+        lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
+        leaning: (19,) how many innovations it is worth.
+        strain: the greatest squared Mahalanobis distance of such a mean (chi-square with 3 degrees of freedom).
+        used_ns: (19,) stamp of the last accepted measurement of each point.
+        since_prior: seconds since ranges of motion were last brought in.
+        tracked: seconds since the start.
+        settled: the lengths are only considered.
+        seen: what tells the lengths; None from when they stay as they are.
+        measured_at: seconds since the start at which these were last brought in.
+        null: (k, 32) directions of the tangent that move no point.
+        fresh: started from a frame, without any after it.
+        attempted_ns: when another pose was looked for last.
+        attempts: how often that was, each time soon after the last.
+        sources: of orientations.
+        oriented_ns: stamp of the last accepted orientation.
+        unplaced: started by orientations: nothing tells where the base is.
+    """
+
+    stamp_ns: int
+    q: FloatArray
+    lengths: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    log_density: FloatArray
+    moved: FloatArray
+    moved_variance: FloatArray
+    sensors: dict[str, SensorState]
+    slow_names: tuple[str, ...]
+    crosses: FloatArray
+    rejected_for: FloatArray
+    lean: FloatArray
+    leaning: FloatArray
+    strain: float
+    used_ns: IntArray
+    since_prior: float
+    tracked: float
+    settled: bool
+    seen: SegmentLengths | None
+    null: FloatArray
+    measured_at: float = 0.0
+    fresh: bool = False
+    attempted_ns: int = 0
+    attempts: int = 0
+    sources: Sources = NOBODY
+    oriented_ns: int = 0
+    unplaced: bool = False
+
+    def cross(self, name: str) -> FloatArray | None:
+        """(85, 61) of ``crosses``, those of one sensor; None for zero."""
+        if name not in self.slow_names:
+            return None
+        place, size = self.slow_names.index(name), self.crosses.shape[1] // len(self.slow_names)
+        return self.crosses[:, place * size : (place + 1) * size]
+
+
+class StateSpace:
+    """The body, and where in the state what of it is.
+
+    Args:
+        model: the body.
+
+    Attributes:
+        model: as given.
+        ranges: of its motion.
+        points: how many of its joints are observed (19).
+        nv: dimension of the tangent space (32).
+        nl: how many lengths it has (21).
+        observed: of both together (53): what points depend on.
+        size: of the state without any source of orientations (85).
+        tangent, lengths, velocities: where these are in the state.
+        own: (19, 3, 3) indices of each point's own block in the flat covariance (57, 57) of all.
+        base_variance: (19,) square metres by which a camera that says nothing of it errs.
+        rest_information: (32,) what is known of the tangent without any measurement.
+        lengths_covariance: (21, 21) of people's lengths.
+        thumbs: (12, 19) the thumb at the end of each segment, of forearms and hands.
+    """
+
+    def __init__(self, model: UpperBody) -> None:
+        self.model = model
+        self.ranges = Ranges(model)
+        self.points = len(model.joints)
+        self.nv, self.nl = model.nv, len(model.length_names)
+        self.observed = self.nv + self.nl
+        self.size = self.observed + self.nv
+        self.tangent = slice(0, self.nv)
+        self.lengths = slice(self.nv, self.observed)
+        self.velocities = slice(self.observed, self.size)
+        first = 3 * np.arange(self.points)[:, None] + np.arange(3)
+        self.own: IntArray = (3 * self.points * first[:, :, None] + first[:, None, :]).astype(np.intp)
+        self.base_variance = BASE_STDDEV[model.joints] ** 2
+        self.rest_information = np.full(self.nv, 1e-4)
+        self.rest_information[6:] = 1.0 / self.ranges.stddev**2
+        self.lengths_covariance = proportions()
+        self.thumbs = np.zeros((len(model.segment_names), self.points), dtype=np.bool_)
+        for number, name in enumerate(model.segment_names):
+            if name.startswith(("forearm", "hand")):
+                self.thumbs[number] = model.joints == Joint[f"THUMB_{name.rsplit('_', 1)[1].upper()}"]
+
+    def moved(self, state: State, correction: FloatArray) -> State:
+        """The state moved by a correction (85,)."""
+        lengths = state.lengths if state.settled else state.lengths + correction[self.lengths]
+        return state.but(
+            q=self.model.integrate(state.q, correction[self.tangent]),
+            lengths=lengths,
+            velocity=state.velocity + correction[self.velocities],
+            sources=state.sources if len(correction) == self.size else state.sources.moved(correction[self.size :]),
+        )
+
+    def observation(self, lines: Linearisation) -> FloatArray:
+        """(57, 53) derivative of the points by tangent and lengths."""
+        both = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
+        return both.reshape(-1, self.observed)
