@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+import traceback
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -18,7 +19,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter
 from body_tracking.sensors import check_sensor_name
-from body_tracking.sensors.live import SourceSettings, backends, open_source
+from body_tracking.sensors.live import SourceSettings, backends, described, open_source
 
 _DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0
@@ -90,15 +91,17 @@ class KinectSkeleton(GraphNode):
         self.thread.start()
 
     def publish_frames(self) -> None:
-        """Until the source or the node ends."""
+        """Until the source or the node ends, or the source fails: then the node stays, and says why."""
         try:
             while self.context.ok() and not self.source.ended:
                 frame = self.source.read(timeout=0.2)
                 if frame is not None:
                     self.send(self.output, encode_skeletons(frame.skeletons), frame.skeletons[0].stamp_ns)
-        except BodyTrackingError as error:
-            self.failure = str(error)
+        except Exception as error:  # whatever the library of a sensor raises
+            self.failure = described(error)
             self.get_logger().error(self.failure)
+            if not isinstance(error, BodyTrackingError):
+                self.get_logger().error(traceback.format_exc())
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether it plays, ended or failed, or what keeps frames from coming."""

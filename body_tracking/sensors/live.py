@@ -1,14 +1,15 @@
 """The place for live sensors: what a backend offers to the ``kinect_skeleton`` node, and how it is found by name.
 
-A new backend is a class with the methods of :class:`SkeletonSource` whose module calls :func:`register`; the node, its
-topics and everything after them stay as they are. There are ``recording`` (``recording/source.py``) and ``network``
-(``network.py``).
+A new backend is a class with the methods of :class:`SkeletonSource`; the node, its topics and everything after them
+stay as they are. There are ``recording`` (``recording/source.py``) and ``network`` (``network.py``). Another package
+brings one by an entry point of the group ``body_tracking.backends``: its name, and what opens it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Protocol
 
 from body_tracking.errors import BodyTrackingError
@@ -79,26 +80,40 @@ class SkeletonSource(Protocol):
 
 Opener = Callable[[SourceSettings], SkeletonSource]
 
+ENTRY_POINTS = "body_tracking.backends"
 _BACKENDS: dict[str, Opener] = {}
 
 
 def register(name: str, opener: Opener) -> None:
-    """Make a backend known under a name."""
+    """Make a backend of this package known under a name."""
     _BACKENDS[name] = opener
 
 
 def backends() -> tuple[str, ...]:
-    """The names of the backends."""
-    return tuple(sorted(_BACKENDS))
+    """The names of the backends, with those of other packages that are installed."""
+    return tuple(sorted({*_BACKENDS, *entry_points(group=ENTRY_POINTS).names}))
 
 
 def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
     """Open a sensor.
 
     Raises:
-        SourceError: no such backend.
+        SourceError: no such backend, or it is of another package and something is wrong with it.
         BodyTrackingError: the backend cannot open it.
     """
-    if backend not in _BACKENDS:
+    if backend not in backends():
         raise SourceError(f"unknown backend {backend!r}, expected one of {', '.join(backends())}")
-    return _BACKENDS[backend](settings)
+    if backend in _BACKENDS:
+        return _BACKENDS[backend](settings)
+    try:
+        opener: Opener = entry_points(group=ENTRY_POINTS)[backend].load()
+        return opener(settings)
+    except BodyTrackingError:
+        raise
+    except Exception as error:  # whatever others write
+        raise SourceError(f"backend {backend!r}: {described(error)}") from error
+
+
+def described(error: Exception) -> str:
+    """What went wrong, for people: an error of this package says that by itself."""
+    return str(error) if isinstance(error, BodyTrackingError) else f"{type(error).__name__}: {error}"

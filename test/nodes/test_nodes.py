@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -304,6 +305,63 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
         assert np.array_equal(last.positions, frames[-1].positions, equal_nan=True)
         assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == "ended")
         assert stop(running.processes["kinect_skeleton"]) == 0
+
+
+CAMERA = """
+import numpy as np
+
+from body_tracking.sensors import RecordedFrame
+from body_tracking.skeleton import Skeleton
+
+
+class Camera:
+    ended, problem, counters = False, "", {}
+
+    def __init__(self, settings):
+        self.sensor, self.stamps = settings.sensor, iter(range(1, 4))
+
+    def read(self, timeout):
+        stamp = next(self.stamps, None)
+        if stamp is None:
+            raise OSError("the cable was pulled")
+        points, states = np.ones((25, 3)), np.full(25, 2, np.uint8)
+        return RecordedFrame(self.sensor, stamp, (Skeleton(stamp, self.sensor, points, states, 1),))
+
+    def close(self):
+        pass
+"""
+
+
+def installed(folder: Path, entry: str) -> dict[str, str]:
+    """A package with a backend of its own, as pip leaves it; the environment in which it is found."""
+    (folder / "mycamera.py").write_text(CAMERA)
+    information = folder / "mycamera-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: mycamera\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(f"[body_tracking.backends]\nmine = {entry}\n")
+    return {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
+
+
+def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        running.environment |= installed(tmp_path, "mycamera:Camera")
+        process = running.start("kinect_skeleton", backend="mine")
+        told = "OSError: the cable was pulled"
+        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == told, 60.0)
+        assert running.diagnostics["kinect_skeleton"]["published"] == "3"
+        assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
+        assert process.poll() is None
+        assert stop(process) == 0
+
+
+@pytest.mark.parametrize("entry", ["nowhere:Camera", "mycamera:Film"])
+def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(tmp_path: Path, entry: str) -> None:
+    with Running(tmp_path) as running:
+        running.environment |= installed(tmp_path, entry)
+        assert running.start("kinect_skeleton", backend="mine").wait(60.0) == 2
+        (line,) = running.log("kinect_skeleton").splitlines()
+        assert line.startswith("kinect_skeleton: backend 'mine': ")
+        assert entry.split(":")["nowhere" not in entry] in line
 
 
 def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
