@@ -33,7 +33,9 @@ from sensor_msgs.msg import Imu, JointState, PointCloud2
 
 from body_tracking import graph
 from body_tracking.graph import GraphOptions
-from body_tracking.messages import RosMessages, imu_to_message, skeletons_to_cloud, to_nanoseconds
+from body_tracking.messages.base import RosMessages, to_nanoseconds
+from body_tracking.messages.imus import imu_to_message
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE
 from body_tracking.simulation.imus import SimulatedImu, usual_mounting

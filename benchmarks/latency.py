@@ -36,18 +36,10 @@ from body_tracking import graph
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.graph import GraphOptions
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages import (
-    TIME_REFERENCE,
-    TRANSFORM,
-    RosMessages,
-    angles_to_joint_states,
-    cloud_to_skeletons,
-    skeletons_to_cloud,
-    time_reference_to_clock,
-    to_nanoseconds,
-    to_time,
-    transform_to_pose,
-)
+from body_tracking.messages.angles import angles_to_joint_states
+from body_tracking.messages.base import TIME_REFERENCE, TRANSFORM, RosMessages, to_nanoseconds, to_time
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.supervised import die_with_parent
 from body_tracking.recording.qos import RELIABLE

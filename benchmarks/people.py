@@ -44,7 +44,7 @@ from body_tracking.cdr import encode_skeletons
 from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.graph import GraphOptions
-from body_tracking.messages import statuses
+from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import frames_of, sensor_topics
 from body_tracking.recording.rosbag2 import BagReader

@@ -24,7 +24,8 @@ from body_tracking.calibration.result import CalibrationResult
 from body_tracking.cdr import decode_skeletons
 from body_tracking.graph import CALIBRATION, FILTERED
 from body_tracking.measurement import left_right_axes
-from body_tracking.messages import TRANSFORM, transform_to_pose
+from body_tracking.messages.base import TRANSFORM
+from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize

@@ -42,7 +42,8 @@ from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.filters.schlagenhauf import SchlagenhaufKalmanFilter
 from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
+from body_tracking.messages.base import POINT_CLOUD
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.recording.stages import ReplaySettings

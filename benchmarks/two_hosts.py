@@ -47,7 +47,9 @@ from body_tracking.calibration.result import CalibrationResult, ClockModel, Sens
 from body_tracking.calibration.storage import save
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
-from body_tracking.messages import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, cloud_to_skeletons, statuses, to_nanoseconds
+from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import SECTION
 from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize

@@ -38,7 +38,8 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState, PointCloud2
 
 from body_tracking import graph
-from body_tracking.messages import RosMessages, skeletons_to_cloud, to_nanoseconds, to_time
+from body_tracking.messages.base import RosMessages, to_nanoseconds, to_time
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE
 from body_tracking.skeleton import NANOSECONDS

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
-from body_tracking.messages import (
+from body_tracking.messages.model import (
     COVARIANCE_ENCODING,
     coordinates_to_configuration,
     covariance_rows,
     rows_to_covariance,
-    skeletons_to_cloud,
     stddevs,
 )
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"

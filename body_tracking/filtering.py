@@ -36,7 +36,7 @@ from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL, HeldSubject
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, segment_poses
-from body_tracking.messages import POINT_CLOUD
+from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.skeleton import NANOSECONDS, Skeleton

@@ -17,7 +17,7 @@ from typing import Any, Final
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion.subject import ALL, MAX_PEOPLE, SUBJECTS
-from body_tracking.messages import (
+from body_tracking.messages.base import (
     CLOCK,
     DIAGNOSTICS,
     IMAGE,

@@ -15,7 +15,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker, Told
-from body_tracking.messages import message_to_magnetic_field, message_to_sample
+from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample
 from body_tracking.parameters import Parameter, parameters_from
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 

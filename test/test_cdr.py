@@ -22,20 +22,16 @@ from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages import (
-    IMAGE,
-    SEGMENTS,
-    STRING,
-    MessageError,
-    angles_to_joint_states,
-    cloud_to_skeletons,
+from body_tracking.messages.angles import angles_to_joint_states
+from body_tracking.messages.base import IMAGE, SEGMENTS, STRING, MessageError
+from body_tracking.messages.model import (
     covariance_to_image,
     estimate_to_joint_states,
     image_to_covariance,
     joint_state_to_model,
     segments_to_joint_state,
-    skeletons_to_cloud,
 )
+from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 from body_tracking.skeleton import Skeleton
 
@@ -120,7 +116,7 @@ def test_a_message_that_is_cut_off_is_left_to_others(seed: int, kind: int, missi
 def test_the_padding_may_hold_anything() -> None:
     """Fast CDR leaves in the padding what was in its buffer."""
     serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
-    from body_tracking.messages import RosMessages
+    from body_tracking.messages.base import RosMessages
 
     for kind in (0, 1, 2):
         (body,) = skeletons(kind, 10**9, "world", 1, kind)

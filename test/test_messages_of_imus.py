@@ -10,13 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from body_tracking.messages import (
-    MessageTypes,
-    RosMessages,
-    message_to_magnetic_field,
-    message_to_sample,
-    sample_to_messages,
-)
+from body_tracking.messages.base import MessageTypes, RosMessages
+from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.recording.rosbag2 import BAG_MESSAGES
 from body_tracking.sensors.imu import ImuSample, ImuSampleError
 from body_tracking.skeleton import FloatArray

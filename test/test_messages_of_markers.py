@@ -11,15 +11,10 @@ from scipy.spatial.transform import Rotation
 from body_tracking.calibration.result import level_pose
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages import (
-    MARKERS,
-    SEGMENTS,
-    Markers,
-    MessageError,
-    joint_state_to_segments,
-    joint_state_values,
-    segments_to_joint_state,
-)
+from body_tracking.messages.angles import joint_state_values
+from body_tracking.messages.base import MARKERS, SEGMENTS, MessageError
+from body_tracking.messages.markers import Markers
+from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 from body_tracking.skeleton import BONES, N_JOINTS, Joint, Skeleton
 from body_tracking.viewing.colours import INFERRED, PALETTE

@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.messages import (
-    FLOAT_ARRAY,
-    JOINT_TRAJECTORY,
-    MessageError,
-    MessageTypes,
-    RosMessages,
-    angles_to_joint_states,
-    command_to_array,
-    command_to_trajectory,
-    joint_states_to_angles,
-)
+from body_tracking.messages.angles import angles_to_joint_states, joint_states_to_angles
+from body_tracking.messages.base import FLOAT_ARRAY, JOINT_TRAJECTORY, MessageError, MessageTypes, RosMessages
+from body_tracking.messages.robots import command_to_array, command_to_trajectory
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 
 ANGLES = JointAngles(

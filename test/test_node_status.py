@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from body_tracking.messages import diagnostics, statuses
+from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.node_status import NodeStatus
 from body_tracking.recording.rosbag2 import BAG_MESSAGES
 
@@ -19,7 +19,7 @@ def test_there_and_back() -> None:
 
 def test_the_same_through_the_client_library() -> None:
     pytest.importorskip("rclpy", reason="ROS is not installed")
-    from body_tracking.messages import RosMessages
+    from body_tracking.messages.base import RosMessages
 
     (status,) = statuses(diagnostics(5, "fusion: stream", "", 2, "", {}, RosMessages()))
     assert (status.node, status.level, status.text) == ("fusion", 2, "")

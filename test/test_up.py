@@ -32,7 +32,7 @@ from body_tracking.fusion.fusion import FusionParameters  # noqa: E402
 from body_tracking.fusion.people import PeopleParameters  # noqa: E402
 from body_tracking.fusion.subject import ALL  # noqa: E402
 from body_tracking.graph import GraphOptions  # noqa: E402
-from body_tracking.messages import to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.parameters import SECTION, ParameterError  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402

@@ -8,7 +8,7 @@ from pathlib import Path
 from body_tracking import graph
 from body_tracking.doctor.finding import OK, PROBLEM, WARNING, Finding
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import IMU, POINT_CLOUD
+from body_tracking.messages.base import IMU, POINT_CLOUD
 from body_tracking.recording.info import TopicSummary, bag_info
 
 SLOW_RATE = 20.0

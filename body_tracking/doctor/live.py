@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 from body_tracking import graph
 from body_tracking.doctor.finding import OK, PROBLEM, WARNING, Finding
-from body_tracking.messages import POINT_CLOUD
+from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.node_status import NodeStatus
 
 Tick: TypeAlias = Callable[[float], None]

@@ -45,14 +45,9 @@ from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convent
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages import (
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    coordinates_to_configuration,
-    time_reference_to_clock,
-    transform_to_pose,
-)
+from body_tracking.messages.base import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.skeleton import (
     JOINT_NAMES,

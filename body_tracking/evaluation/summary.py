@@ -11,7 +11,8 @@ import numpy as np
 from body_tracking import graph
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import JOINT_STATE, POINT_CLOUD, MessageError, cloud_to_skeletons, to_nanoseconds
+from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, MessageError, to_nanoseconds
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 

@@ -13,7 +13,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from body_tracking import graph
-from body_tracking.messages import to_time
+from body_tracking.messages.base import to_time
 from body_tracking.nodes.bag_topics import UnknownTypeError, message_class, to_profile
 from body_tracking.nodes.common import ROS, STEADY, GraphNode, run
 from body_tracking.parameters import Parameter, Value

@@ -15,7 +15,9 @@ from visualization_msgs.msg import MarkerArray
 from body_tracking import graph
 from body_tracking.calibration.result import SensorPose
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages import Markers, cloud_to_skeletons, segments_to_transforms, transform_to_pose
+from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.messages.markers import Markers, segments_to_transforms
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import BODY, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Parameter

@@ -19,7 +19,7 @@ from body_tracking.calibration.online import CalibrationParameters, CalibrationU
 from body_tracking.calibration.storage import load, save
 from body_tracking.errors import BodyTrackingError
 from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.messages import clock_to_time_reference, pose_to_transform
+from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from

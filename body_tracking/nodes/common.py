@@ -44,7 +44,9 @@ from body_tracking import dds, graph
 from body_tracking.backlog import Backlog, Sequences
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import MessageError, RosMessages, cloud_to_skeletons, diagnostics, to_nanoseconds
+from body_tracking.messages.base import MessageError, RosMessages, to_nanoseconds
+from body_tracking.messages.diagnostics import diagnostics
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.executor import LeanExecutor
 from body_tracking.parameters import (

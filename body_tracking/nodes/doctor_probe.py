@@ -32,7 +32,9 @@ from body_tracking import dds, graph
 from body_tracking.cdr import decode_skeletons
 from body_tracking.doctor.live import Observation, Stream
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import IMU, POINT_CLOUD, cloud_to_skeletons, statuses, to_nanoseconds
+from body_tracking.messages.base import IMU, POINT_CLOUD, to_nanoseconds
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_status import NodeStatus
 
 _LOOK_PERIOD_S = 0.3

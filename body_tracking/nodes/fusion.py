@@ -17,7 +17,7 @@ from body_tracking.cdr import encode_skeletons
 from body_tracking.filtering import PEOPLE, people_from
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people_fusion import PeopleFusion
-from body_tracking.messages import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of, parameters_from

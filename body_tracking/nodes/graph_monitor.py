@@ -21,7 +21,8 @@ from sensor_msgs.msg import JointState
 
 from body_tracking import graph
 from body_tracking.graph import GraphOptions
-from body_tracking.messages import statuses, to_nanoseconds
+from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.diagnostics import statuses
 from body_tracking.node_status import NodeStatus
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE

@@ -19,7 +19,7 @@ from body_tracking.fusion.association import HOLD
 from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.parameters import TrackingParameters
-from body_tracking.messages import orientation_to_message
+from body_tracking.messages.imus import orientation_to_message
 from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of
 from body_tracking.skeleton import Skeleton

@@ -20,7 +20,7 @@ from body_tracking.fusion.association import HOLD
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import AngleStream, state_estimate
-from body_tracking.messages import image_to_covariance, joint_state_to_model
+from body_tracking.messages.model import image_to_covariance, joint_state_to_model
 from body_tracking.nodes.common import BODY, RELIABLE, GraphNode, deserialized, run
 from body_tracking.parameters import Value
 from body_tracking.skeleton import Skeleton

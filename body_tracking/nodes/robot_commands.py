@@ -27,14 +27,11 @@ from trajectory_msgs.msg import JointTrajectory
 
 from body_tracking import graph
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.messages import (
-    command_to_array,
-    command_to_trajectory,
-    joint_states_to_angles,
-    statuses,
-    to_nanoseconds,
-    transform_to_pose,
-)
+from body_tracking.messages.angles import joint_states_to_angles
+from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.robots import command_to_array, command_to_trajectory
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import BODY, RELIABLE, ROS, SENSORS, STEADY, GraphNode, run
 from body_tracking.parameters import Parameter, Value

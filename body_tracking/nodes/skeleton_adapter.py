@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 
 from body_tracking import graph
 from body_tracking.cdr import encode_skeletons
-from body_tracking.messages import markers_to_points
+from body_tracking.messages.skeletons import markers_to_points
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter

@@ -36,14 +36,9 @@ from body_tracking.filtering import (
     orientation_topics,
     people_from,
 )
-from body_tracking.messages import (
-    SEGMENTS,
-    STRING,
-    message_to_orientation,
-    time_reference_to_clock,
-    to_header,
-    transform_to_pose,
-)
+from body_tracking.messages.base import SEGMENTS, STRING, to_header
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.imus import message_to_orientation
 from body_tracking.nodes.bag_topics import message_class, to_profile
 from body_tracking.nodes.common import (
     BODY,

@@ -32,14 +32,12 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
 from body_tracking.graph import GraphOptions
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
-from body_tracking.messages import (
-    MessageError,
-    cloud_to_skeletons,
-    joint_state_to_segments,
-    joint_state_values,
-    statuses,
-    transform_to_pose,
-)
+from body_tracking.messages.angles import joint_state_values
+from body_tracking.messages.base import MessageError
+from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.model import joint_state_to_segments
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_status import NodeStatus
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run

@@ -22,15 +22,10 @@ import numpy as np
 from body_tracking.errors import BodyTrackingError
 from body_tracking.graph import DEFAULT_BODY, TRUE_ANGLES
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.messages import (
-    IMU,
-    JOINT_STATE,
-    MAGNETIC_FIELD,
-    POINT_CLOUD,
-    angles_to_joint_states,
-    sample_to_messages,
-    skeletons_to_cloud,
-)
+from body_tracking.messages.angles import angles_to_joint_states
+from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
+from body_tracking.messages.imus import sample_to_messages
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.qos import RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.sensors import RecordedFrame, Recording

@@ -38,7 +38,8 @@ from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
-from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons
+from body_tracking.messages.base import POINT_CLOUD
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.recording.stages import JUMP_BACK_NS, ReplaySettings, Sink, Upstream, start_downstream

@@ -24,7 +24,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from body_tracking.messages import BagMessages
+from body_tracking.messages.base import BagMessages
 from body_tracking.recording import qos as quality
 from body_tracking.recording.mcap_file import LIBRARY, BagError, Block, McapFile, StoredMessage
 from body_tracking.recording.mcap_repair import finish

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from body_tracking.messages import MessageError, cloud_to_skeletons
+from body_tracking.messages.base import MessageError
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
 from body_tracking.recording.rosbag2 import BagError, BagReader, deserialize
 from body_tracking.sensors import RecordedFrame, check_sensor_name, optical_frame

@@ -44,7 +44,7 @@ from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import ImuSettings, ImuStage
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import state_estimate
-from body_tracking.messages import (
+from body_tracking.messages.base import (
     IMU,
     JOINT_STATE,
     MAGNETIC_FIELD,
@@ -53,14 +53,15 @@ from body_tracking.messages import (
     STRING,
     TIME_REFERENCE,
     TRANSFORM,
+)
+from body_tracking.messages.calibration import (
     clock_to_time_reference,
-    cloud_to_skeletons,
-    message_to_orientation,
-    orientation_to_message,
     pose_to_transform,
     time_reference_to_clock,
     transform_to_pose,
 )
+from body_tracking.messages.imus import message_to_orientation, orientation_to_message
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, deserialize, serialize
 from body_tracking.skeleton import NANOSECONDS, Skeleton

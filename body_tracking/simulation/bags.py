@@ -20,18 +20,9 @@ import numpy as np
 from body_tracking import graph
 from body_tracking.cdr import encode_angles, encode_model_state, encode_skeletons
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages import (
-    IMU,
-    JOINT_STATE,
-    MAGNETIC_FIELD,
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    clock_to_time_reference,
-    imu_to_message,
-    magnetic_field_to_message,
-    pose_to_transform,
-)
+from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
+from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize

@@ -40,7 +40,7 @@ from body_tracking.graph import (
     skeleton_topic,
 )
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.messages import statuses
+from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
 

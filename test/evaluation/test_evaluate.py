@@ -16,7 +16,8 @@ from body_tracking.cli import main
 from body_tracking.evaluation.comparison import Evaluation, evaluate, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.report import tables
-from body_tracking.messages import JOINT_STATE, POINT_CLOUD, skeletons_to_cloud
+from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.recording.stages import ReplaySettings

@@ -15,7 +15,9 @@ from body_tracking.evaluation.show import summarise
 from body_tracking.evaluation.summary import AngleSeries, EvaluationError, nearest, read, summaries, table
 from body_tracking.filters import make_filter
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.messages import JOINT_STATE, POINT_CLOUD, angles_to_joint_states, skeletons_to_cloud
+from body_tracking.messages.angles import angles_to_joint_states
+from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
+from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate

@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from body_tracking.graph import PARENT_VARIABLE
-from body_tracking.messages import statuses
+from body_tracking.messages.diagnostics import statuses
 from domains import domain
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)

@@ -29,7 +29,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking.messages import to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize, serialize  # noqa: E402
 from domains import domain  # noqa: E402

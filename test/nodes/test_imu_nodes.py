@@ -18,11 +18,9 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
 from body_tracking.imu_tracking import ImuSettings  # noqa: E402
-from body_tracking.messages import (  # noqa: E402
-    cloud_to_skeletons,
-    message_to_orientation,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.imus import message_to_orientation  # noqa: E402
+from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
 from body_tracking.simulation.bags import write_bag  # noqa: E402

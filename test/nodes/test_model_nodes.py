@@ -23,12 +23,9 @@ from std_msgs.msg import String  # noqa: E402
 from body_tracking import graph  # noqa: E402
 from body_tracking.kinematics.tracking import AngleStream, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
-from body_tracking.messages import (  # noqa: E402
-    cloud_to_skeletons,
-    image_to_covariance,
-    joint_state_to_model,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.model import image_to_covariance, joint_state_to_model  # noqa: E402
+from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS, Joint, Skeleton, TrackingState  # noqa: E402
 

@@ -20,7 +20,8 @@ from running import RELIABLE, Running, environment, stop  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
-from body_tracking.messages import cloud_to_skeletons, to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.sensors.azure import AzureJoint  # noqa: E402
 from body_tracking.skeleton import Joint, TrackingState  # noqa: E402
 

@@ -26,14 +26,9 @@ from std_srvs.srv import Trigger  # noqa: E402
 from body_tracking import graph  # noqa: E402
 from body_tracking.calibration.result import level_pose  # noqa: E402
 from body_tracking.calibration.storage import load  # noqa: E402
-from body_tracking.messages import (  # noqa: E402
-    RosMessages,
-    cloud_to_skeletons,
-    pose_to_transform,
-    skeletons_to_cloud,
-    to_nanoseconds,
-    to_time,
-)
+from body_tracking.messages.base import RosMessages, to_nanoseconds, to_time  # noqa: E402
+from body_tracking.messages.calibration import pose_to_transform  # noqa: E402
+from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
 from body_tracking.skeleton import Skeleton  # noqa: E402
 

@@ -29,7 +29,8 @@ from body_tracking.cdr import encode_angles  # noqa: E402
 from body_tracking.kinematics.conventions import angles_of  # noqa: E402
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
-from body_tracking.messages import joint_state_to_model, to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.model import joint_state_to_model  # noqa: E402
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
 from body_tracking.recording.qos import SENSOR_DATA  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize  # noqa: E402

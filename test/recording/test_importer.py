@@ -12,7 +12,9 @@ import pytest
 
 from body_tracking.cli import main
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import POINT_CLOUD, cloud_to_skeletons, message_to_magnetic_field, message_to_sample
+from body_tracking.messages.base import POINT_CLOUD
+from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.info import bag_info
 from body_tracking.recording.qos import SENSOR_DATA

@@ -19,16 +19,9 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages import (
-    JOINT_STATE,
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    cloud_to_skeletons,
-    time_reference_to_clock,
-    to_nanoseconds,
-    transform_to_pose,
-)
+from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM, to_nanoseconds
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import ParameterError
 from body_tracking.recording import replay as replay_module
 from body_tracking.recording import stages

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages import cloud_to_skeletons
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.recording.source import RecordingSource
 from body_tracking.sensors.live import SourceSettings, backends, open_source

@@ -18,19 +18,18 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.cli import main
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import left_right_axes
-from body_tracking.messages import (
+from body_tracking.messages.base import (
     IMU,
     JOINT_STATE,
     MAGNETIC_FIELD,
     POINT_CLOUD,
     TIME_REFERENCE,
     TRANSFORM,
-    cloud_to_skeletons,
-    joint_state_to_model,
-    time_reference_to_clock,
     to_nanoseconds,
-    transform_to_pose,
 )
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.model import joint_state_to_model
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.simulation.bags import SHIPPED, shipped, write_bag
 from body_tracking.simulation.imus import SimulatedImu, usual_mounting

@@ -1,0 +1,80 @@
+"""Joint angles, as ``sensor_msgs/JointState``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.messages.base import JOINT_STATE, MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.skeleton import FloatArray
+
+
+def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:
+    """Values and standard deviations as two ``sensor_msgs/JointState``.
+
+    Args:
+        angles: radians and radians per second.
+        body: the REP-155 body id; every name ends in ``_<body>``.
+        frame_id: written into both headers.
+        types: the family of message classes to build.
+    """
+    header = to_header(angles.stamp_ns, frame_id, types)
+    names = [f"{name}_{body}" for name in angles.names]
+
+    def joint_state(position: FloatArray, velocity: FloatArray) -> Any:
+        return types.make(
+            JOINT_STATE,
+            header=header,
+            name=names,
+            position=types.floats(position),
+            velocity=types.floats(velocity),
+            effort=types.floats(np.empty(0)),
+        )
+
+    return (
+        joint_state(angles.position, angles.velocity),
+        joint_state(angles.position_stddev, angles.velocity_stddev),
+    )
+
+
+def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngles:
+    """The inverse of :func:`angles_to_joint_states`.
+
+    Args:
+        values: ``sensor_msgs/JointState``.
+        deviations: the same, of the same stamp.
+        body: whose they are; the ending ``_<body>`` of their names is left out.
+
+    Raises:
+        MessageError: different names or stamps, a name without that ending, sizes that do not go together.
+    """
+    names, stamp_ns = tuple(values.name), to_nanoseconds(values.header.stamp)
+    if tuple(deviations.name) != names or to_nanoseconds(deviations.header.stamp) != stamp_ns:
+        raise MessageError("joint states and their standard deviations have other names or stamps")
+    other = next((name for name in names if not name.endswith(f"_{body}")), None)
+    if other is not None:
+        raise MessageError(f"name {other!r} does not end in _{body}")
+    columns = [
+        np.array(numbers, dtype=np.float64)
+        for message in (values, deviations)
+        for numbers in (message.position, message.velocity)
+    ]
+    if any(len(column) != len(names) for column in columns):
+        raise MessageError(f"{', '.join(str(len(column)) for column in columns)} numbers of {len(names)} names")
+    position, velocity, position_stddev, velocity_stddev = columns
+    short = tuple(name.removesuffix(f"_{body}") for name in names)
+    return JointAngles(stamp_ns, short, position, velocity, position_stddev, velocity_stddev)
+
+
+def joint_state_values(message: Any) -> tuple[int, tuple[str, ...], FloatArray]:
+    """Stamp in nanoseconds, n names and (n,) positions of a ``sensor_msgs/JointState``.
+
+    Raises:
+        MessageError: another number of positions than of names.
+    """
+    names, values = tuple(message.name), np.array(message.position, dtype=np.float64)
+    if len(values) != len(names):
+        raise MessageError(f"{len(values)} positions for {len(names)} names")
+    return to_nanoseconds(message.header.stamp), names, values

@@ -1,0 +1,104 @@
+"""What every conversion needs: the classes of messages, their type names, stamps and headers."""
+
+from __future__ import annotations
+
+import array
+import importlib
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
+IMAGE = "sensor_msgs/msg/Image"
+SEGMENTS = "sensor_msgs/msg/MultiDOFJointState"
+IMU = "sensor_msgs/msg/Imu"
+MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
+STRING = "std_msgs/msg/String"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+CLOCK = "rosgraph_msgs/msg/Clock"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+TF = "tf2_msgs/msg/TFMessage"
+
+
+class MessageError(BodyTrackingError):
+    """A message does not have the layout that its topic promises."""
+
+
+class MessageTypes(Protocol):
+    """A family of message classes."""
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        """A message of type ``pkg/msg/Name`` with every one of its fields given."""
+
+    def octets(self, data: bytes) -> Any:
+        """The value of a ``uint8[]`` field."""
+
+    def floats(self, values: FloatArray) -> Any:
+        """The value of a ``float64[]`` field."""
+
+
+class RosMessages:
+    """The classes that ``rclpy`` publishes."""
+
+    @staticmethod
+    @cache
+    def _class(type_name: str) -> Any:
+        package, _, name = type_name.split("/")
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        return self._class(type_name)(**fields)
+
+    def octets(self, data: bytes) -> Any:
+        return array.array("B", data)
+
+    def floats(self, values: FloatArray) -> Any:
+        return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+class BagMessages:
+    """The classes of a ``rosbags`` type store."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        return self._types[type_name](**fields)
+
+    def octets(self, data: bytes) -> Any:
+        return np.frombuffer(data, dtype=np.uint8)
+
+    def floats(self, values: FloatArray) -> Any:
+        return np.asarray(values, dtype=np.float64)
+
+
+def to_nanoseconds(stamp: Any) -> int:
+    """``builtin_interfaces/Time`` to integer nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def to_time(nanoseconds: int, types: MessageTypes) -> Any:
+    """Integer nanoseconds to ``builtin_interfaces/Time``."""
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return types.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+
+def to_header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
+    """``std_msgs/Header``."""
+    return types.make("std_msgs/msg/Header", stamp=to_time(stamp_ns, types), frame_id=frame_id)
+
+
+def to_vector(values: FloatArray, types: MessageTypes) -> Any:
+    """``geometry_msgs/Vector3`` of (3,)."""
+    x, y, z = (float(value) for value in values)
+    return types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -1,0 +1,76 @@
+"""Poses and clocks of sensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.messages.base import (
+    TIME_REFERENCE,
+    TRANSFORM,
+    MessageError,
+    MessageTypes,
+    to_header,
+    to_nanoseconds,
+    to_time,
+)
+
+
+def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:
+    """``geometry_msgs/TransformStamped`` of a sensor's optical frame in ``world``; the stamp is ``valid_from_ns``."""
+    x, y, z = (float(value) for value in pose.translation)
+    qx, qy, qz, qw = (float(value) for value in pose.quat_xyzw)
+    return types.make(
+        TRANSFORM,
+        header=to_header(pose.valid_from_ns, world, types),
+        child_frame_id=f"{pose.sensor}_optical_frame",
+        transform=types.make(
+            "geometry_msgs/msg/Transform",
+            translation=types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+
+
+def transform_to_pose(message: Any) -> SensorPose:
+    """The inverse of :func:`pose_to_transform`.
+
+    Raises:
+        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a quaternion
+            far from unit length.
+    """
+    suffix = "_optical_frame"
+    child = str(message.child_frame_id)
+    if not child.endswith(suffix) or child == suffix:
+        raise MessageError(f"child_frame_id {child!r}, expected <sensor>{suffix}")
+    t, q = message.transform.translation, message.transform.rotation
+    translation, quat_xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
+    norm = float(np.linalg.norm(quat_xyzw))
+    if not np.isfinite(translation).all() or not abs(norm - 1.0) < 1e-3:
+        raise MessageError(f"transform of {child!r}: translation {translation}, quaternion of length {norm:.3g}")
+    return SensorPose(child.removesuffix(suffix), translation, quat_xyzw / norm, to_nanoseconds(message.header.stamp))
+
+
+def clock_to_time_reference(sensor: str, clock: ClockModel, at_ns: int, types: MessageTypes) -> Any:
+    """``sensor_msgs/TimeReference``: at ``header.stamp`` of the reference clock the sensor's clock showed ``time_ref``.
+
+    Args:
+        sensor: written into ``source``.
+        clock: the sensor's clock against the reference clock.
+        at_ns: the reference time from which the relation is valid.
+        types: the family of message classes to build.
+    """
+    return types.make(
+        TIME_REFERENCE,
+        header=to_header(at_ns, "", types),
+        time_ref=to_time(clock.to_sensor(at_ns), types),
+        source=sensor,
+    )
+
+
+def time_reference_to_clock(message: Any) -> tuple[str, int, ClockModel]:
+    """(sensor, valid from in the reference clock, the relation of the clocks from then on)."""
+    at_ns = to_nanoseconds(message.header.stamp)
+    return str(message.source), at_ns, ClockModel(to_nanoseconds(message.time_ref) - at_ns, 0.0, at_ns)

@@ -1,0 +1,189 @@
+"""Inertial sensors and the orientations of segments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.messages.base import (
+    IMU,
+    MAGNETIC_FIELD,
+    MessageError,
+    MessageTypes,
+    to_header,
+    to_nanoseconds,
+    to_vector,
+)
+from body_tracking.orientation import SegmentOrientation
+from body_tracking.sensors.imu import ImuSample, check_magnetic_field
+from body_tracking.skeleton import FloatArray
+
+
+def imu_to_message(
+    stamp_ns: int,
+    frame_id: str,
+    angular_velocity: FloatArray,
+    linear_acceleration: FloatArray,
+    quat_xyzw: FloatArray | None,
+    covariances: tuple[FloatArray, FloatArray, FloatArray],
+    types: MessageTypes,
+) -> Any:
+    """``sensor_msgs/Imu`` as REP-145 has it.
+
+    Args:
+        stamp_ns: capture time in the sensor's clock, nanoseconds.
+        frame_id: of the sensor.
+        angular_velocity: (3,) rad/s.
+        linear_acceleration: (3,) m/s2, specific force.
+        quat_xyzw: (4,) of the sensor in a world that is east, north, up; None for raw data.
+        covariances: (3, 3) each, of orientation, angular velocity and acceleration; -1 in [0, 0] where unknown.
+        types: the family of message classes to build.
+    """
+    x, y, z, w = (0.0, 0.0, 0.0, 1.0) if quat_xyzw is None else (float(value) for value in quat_xyzw)
+    orientation, angular, linear = (types.floats(covariance.reshape(-1)) for covariance in covariances)
+    return types.make(
+        IMU,
+        header=to_header(stamp_ns, frame_id, types),
+        orientation=types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        orientation_covariance=orientation,
+        angular_velocity=to_vector(angular_velocity, types),
+        angular_velocity_covariance=angular,
+        linear_acceleration=to_vector(linear_acceleration, types),
+        linear_acceleration_covariance=linear,
+    )
+
+
+def magnetic_field_to_message(
+    stamp_ns: int, frame_id: str, field: FloatArray, covariance: FloatArray, types: MessageTypes
+) -> Any:
+    """``sensor_msgs/MagneticField`` of (3,) tesla with a covariance (3, 3); the rest as :func:`imu_to_message`."""
+    return types.make(
+        MAGNETIC_FIELD,
+        header=to_header(stamp_ns, frame_id, types),
+        magnetic_field=to_vector(field, types),
+        magnetic_field_covariance=types.floats(covariance.reshape(-1)),
+    )
+
+
+def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any | None]:
+    """``sensor_msgs/Imu`` and, if there is a field, ``sensor_msgs/MagneticField`` of a reading.
+
+    What the reading does not have is marked by -1 as REP-145 says; a covariance that is not known is zero.
+    """
+    absent = np.zeros((3, 3))
+    absent[0, 0] = -1.0
+    unknown = np.zeros((3, 3))
+    stated = unknown if sample.orientation_covariance is None else sample.orientation_covariance
+    imu = imu_to_message(
+        sample.stamp_ns,
+        sample.frame_id,
+        np.zeros(3) if sample.angular_velocity is None else sample.angular_velocity,
+        np.zeros(3) if sample.acceleration is None else sample.acceleration,
+        sample.orientation,
+        (
+            absent if sample.orientation is None else stated,
+            absent if sample.angular_velocity is None else unknown,
+            absent if sample.acceleration is None else unknown,
+        ),
+        types,
+    )
+    if sample.magnetic_field is None:
+        return imu, None
+    field = magnetic_field_to_message(sample.stamp_ns, sample.frame_id, sample.magnetic_field, unknown, types)
+    return imu, field
+
+
+def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) -> ImuSample:
+    """The reading in a ``sensor_msgs/Imu``, without what its covariances say is absent (-1, REP-145).
+
+    Args:
+        message: of a ROS install or of a recording.
+        magnetic_field: (3,) tesla of the same instant, if there is one.
+
+    Raises:
+        MessageError: a covariance that has not nine elements.
+        ImuSampleError: what no inertial sensor can have said.
+    """
+    covariances = {}
+    for name in ("orientation", "angular_velocity", "linear_acceleration"):
+        values = np.array(getattr(message, f"{name}_covariance"), dtype=np.float64)
+        if values.size != 9:
+            raise MessageError(f"{name}_covariance of {values.size} elements, expected 9")
+        covariances[name] = values.reshape(3, 3)
+    there = {name: covariance[0, 0] != -1.0 for name, covariance in covariances.items()}
+    q, stated = message.orientation, covariances["orientation"]
+    return ImuSample(
+        to_nanoseconds(message.header.stamp),
+        str(message.header.frame_id),
+        np.array([q.x, q.y, q.z, q.w]) if there["orientation"] else None,
+        # all zeros: not known
+        stated if there["orientation"] and stated.any() else None,
+        _array(message.angular_velocity) if there["angular_velocity"] else None,
+        _array(message.linear_acceleration) if there["linear_acceleration"] else None,
+        magnetic_field,
+    )
+
+
+def message_to_magnetic_field(message: Any) -> tuple[int, str, FloatArray]:
+    """(stamp in nanoseconds, frame, (3,) tesla) of a ``sensor_msgs/MagneticField``.
+
+    Raises:
+        ImuSampleError: not finite, or beyond 1e-3 T.
+    """
+    field = _array(message.magnetic_field)
+    check_magnetic_field(field)
+    return to_nanoseconds(message.header.stamp), str(message.header.frame_id), field
+
+
+def _array(vector: Any) -> FloatArray:
+    return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
+
+
+def orientation_to_message(measurement: SegmentOrientation, types: MessageTypes) -> Any:
+    """``sensor_msgs/Imu`` of a segment's orientation: rotation and covariance in a fixed frame, rate in its own.
+
+    The header's frame is that fixed frame, such as ``world``; which segment it is, the topic says.
+    """
+    absent = np.zeros((3, 3))
+    absent[0, 0] = -1.0
+    rate = measurement.angular_velocity
+    return imu_to_message(
+        measurement.stamp_ns,
+        measurement.frame_id,
+        np.zeros(3) if rate is None else rate,
+        np.zeros(3),
+        so3.matrix_to_quat(measurement.rotation),
+        (
+            measurement.covariance,
+            absent if rate is None else measurement.angular_velocity_variance * np.eye(3),
+            absent,
+        ),
+        types,
+    )
+
+
+def message_to_orientation(message: Any, segment: str) -> SegmentOrientation:
+    """The inverse of :func:`orientation_to_message`.
+
+    Raises:
+        MessageError: a covariance that has not nine elements, no orientation or none of its covariance.
+        ImuSampleError: numbers that are not finite, a quaternion that is none, no frame.
+        OrientationError: no orientation of that segment.
+    """
+    sample = message_to_sample(message)
+    if sample.orientation is None or sample.orientation_covariance is None:
+        raise MessageError(f"orientation of {segment}: without orientation, or without its covariance")
+    variance = float(message.angular_velocity_covariance[0])
+    rate = sample.angular_velocity if variance > 0.0 else None
+    return SegmentOrientation(
+        sample.stamp_ns,
+        f"imu_{segment}",
+        segment,
+        so3.quat_to_matrix(sample.orientation),
+        sample.orientation_covariance,
+        rate,
+        variance if rate is not None else 0.0,
+        sample.frame_id,
+    )

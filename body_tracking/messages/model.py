@@ -1,0 +1,217 @@
+"""The state of a body model and its segments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import BodyModel
+from body_tracking.messages.base import (
+    IMAGE,
+    JOINT_STATE,
+    SEGMENTS,
+    MessageError,
+    MessageTypes,
+    to_header,
+    to_nanoseconds,
+)
+from body_tracking.skeleton import FloatArray
+
+
+def estimate_to_joint_states(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> tuple[Any, Any]:
+    """The coordinates of a body model and their standard deviations as two ``sensor_msgs/JointState``.
+
+    Args:
+        estimate: of the model.
+        model: gives the names.
+        types: the family of message classes to build.
+
+    Returns:
+        Positions: the tangent vector from the model's neutral pose, so that a rotation that is free is its rotation
+        vector; velocities: the tangent velocity. The deviations are those of small tangent vectors at the estimate.
+    """
+    header = to_header(estimate.stamp_ns, estimate.frame_id, types)
+
+    def joint_state(position: FloatArray, velocity: FloatArray) -> Any:
+        return types.make(
+            JOINT_STATE,
+            header=header,
+            name=list(model.coordinate_names),
+            position=types.floats(position),
+            velocity=types.floats(velocity),
+            effort=types.floats(np.empty(0)),
+        )
+
+    deviations = stddevs(estimate)
+    return (
+        joint_state(model.difference(model.neutral(), estimate.q), estimate.velocity),
+        joint_state(deviations[: model.nv], deviations[model.nv :]),
+    )
+
+
+def stddevs(estimate: ModelEstimate) -> FloatArray:
+    """(2 nv,) the standard deviations in an estimate's covariance."""
+    result: FloatArray = np.sqrt(np.maximum(estimate.covariance.diagonal(), 0.0))
+    return result
+
+
+def joint_state_to_model(message: Any, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray]:
+    """The inverse of :func:`estimate_to_joint_states`, without what that does not hold.
+
+    Args:
+        message: ``sensor_msgs/JointState``.
+        model: what it is to be about.
+
+    Returns:
+        Stamp in nanoseconds, frame, (nq,) configuration, (nv,) tangent velocity; NaN where that is not known.
+
+    Raises:
+        MessageError: other names, other sizes, a position that is not finite, an infinite velocity.
+    """
+    names = tuple(message.name)
+    if names != model.coordinate_names:
+        other = next((name for name in names if name not in model.coordinate_names), None)
+        what = f"unknown name {other!r}" if other is not None else f"{len(names)} names, or in another order"
+        raise MessageError(f"{what}; expected the {model.nv} coordinates of {model.name}")
+    position, velocity = (np.array(values, dtype=np.float64) for values in (message.position, message.velocity))
+    return (
+        to_nanoseconds(message.header.stamp),
+        str(message.header.frame_id),
+        *coordinates_to_configuration(position, velocity, model),
+    )
+
+
+def coordinates_to_configuration(
+    position: FloatArray, velocity: FloatArray, model: BodyModel
+) -> tuple[FloatArray, FloatArray]:
+    """(nq,) configuration and (nv,) tangent velocity of the numbers in a message.
+
+    Raises:
+        MessageError: other sizes, a position that is not finite, an infinite velocity.
+    """
+    for name, values, unsound in (
+        ("position", position, ~np.isfinite(position)),
+        ("velocity", velocity, np.isinf(velocity)),
+    ):
+        if len(values) != model.nv:
+            raise MessageError(f"{len(values)} {name} values, expected {model.nv}")
+        if unsound.any():
+            first = int(unsound.argmax())
+            raise MessageError(f"{name} of {model.coordinate_names[first]} is {values[first]}")
+    return model.integrate(model.neutral(), position), velocity
+
+
+COVARIANCE_ENCODING = "32FC1"
+"""Of the image that holds covariances: one float32 per pixel."""
+
+
+def covariance_rows(estimate: ModelEstimate) -> NDArray[np.float32]:
+    """(2 nv, nv) the covariance of the coordinates, and under it that of their rates."""
+    nv = len(estimate.velocity)
+    return np.concatenate([estimate.covariance[:nv, :nv], estimate.covariance[nv:, nv:]]).astype("<f4")
+
+
+def rows_to_covariance(rows: FloatArray) -> FloatArray:
+    """(2 nv, 2 nv) of (2 nv, nv) rows; nothing is said of how coordinates and rates depend on each other.
+
+    Raises:
+        MessageError: a NaN, or a negative variance.
+    """
+    nv = rows.shape[1]
+    covariance = np.zeros((2 * nv, 2 * nv))
+    covariance[:nv, :nv], covariance[nv:, nv:] = rows[:nv], rows[nv:]
+    if np.isnan(covariance).any():
+        raise MessageError("a covariance is NaN")
+    if (covariance.diagonal() < 0.0).any():
+        raise MessageError("a variance is negative")
+    return covariance
+
+
+def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
+    """``sensor_msgs/Image`` of :func:`covariance_rows`: 2 nv rows of nv columns."""
+    rows = covariance_rows(estimate)
+    return types.make(
+        IMAGE,
+        header=to_header(estimate.stamp_ns, estimate.frame_id, types),
+        height=rows.shape[0],
+        width=rows.shape[1],
+        encoding=COVARIANCE_ENCODING,
+        is_bigendian=0,
+        step=4 * rows.shape[1],
+        data=types.octets(rows.tobytes()),
+    )
+
+
+def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray]:
+    """(stamp in nanoseconds, (2 nv, 2 nv) covariance), the inverse of :func:`covariance_to_image`.
+
+    Raises:
+        MessageError: another encoding or size, big-endian numbers, a NaN, a negative variance.
+    """
+    height, width, nv = int(message.height), int(message.width), model.nv
+    if str(message.encoding) != COVARIANCE_ENCODING or message.is_bigendian:
+        order = "big-endian " if message.is_bigendian else ""
+        raise MessageError(f"{order}encoding {str(message.encoding)!r}, expected {COVARIANCE_ENCODING}")
+    if (height, width, int(message.step)) != (2 * nv, nv, 4 * nv) or len(message.data) != 8 * nv * nv:
+        size = f"{height} x {width} with {message.step} bytes a row and {len(message.data)} in all"
+        raise MessageError(f"covariance of {size}, expected {2 * nv} x {nv} float32")
+    rows = np.frombuffer(memoryview(message.data), "<f4").reshape(2 * nv, nv).astype(np.float64)
+    return to_nanoseconds(message.header.stamp), rows_to_covariance(rows)
+
+
+def segments_to_joint_state(
+    estimate: ModelEstimate, names: Sequence[str], origins: FloatArray, quats_xyzw: FloatArray, types: MessageTypes
+) -> Any:
+    """``sensor_msgs/MultiDOFJointState``: the pose of each segment in the estimate's frame.
+
+    Args:
+        estimate: for its stamp and frame.
+        names: s segments.
+        origins: (s, 3) metres.
+        quats_xyzw: (s, 4) unit quaternions.
+        types: the family of message classes to build.
+    """
+    return types.make(
+        SEGMENTS,
+        header=to_header(estimate.stamp_ns, estimate.frame_id, types),
+        joint_names=list(names),
+        transforms=[
+            types.make(
+                "geometry_msgs/msg/Transform",
+                translation=types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                rotation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            )
+            for (x, y, z), (qx, qy, qz, qw) in zip(origins.tolist(), quats_xyzw.tolist(), strict=True)
+        ],
+        twist=[],
+        wrench=[],
+    )
+
+
+def joint_state_to_segments(message: Any) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """The inverse of :func:`segments_to_joint_state`.
+
+    Returns:
+        Names of s segments, (s, 3) origins in metres, (s, 4) unit quaternions xyzw.
+
+    Raises:
+        MessageError: another number of transforms than of names, or numbers that are no pose.
+    """
+    names = tuple(message.joint_names)
+    if len(message.transforms) != len(names):
+        raise MessageError(f"{len(message.transforms)} transforms for {len(names)} segments")
+    rows = np.array(
+        [
+            (t.translation.x, t.translation.y, t.translation.z, t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w)
+            for t in message.transforms
+        ]
+    ).reshape(-1, 7)
+    lengths = np.linalg.norm(rows[:, 3:], axis=1)
+    unsound = ~np.isfinite(rows).all(axis=1) | (np.abs(lengths - 1.0) > 1e-3)
+    if unsound.any():
+        raise MessageError(f"the pose of {names[int(unsound.argmax())]} is {rows[int(unsound.argmax())]}")
+    return names, rows[:, :3], rows[:, 3:] / lengths[:, None]
