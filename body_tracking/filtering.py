@@ -383,6 +383,12 @@ class FilterStage:
             self._predicted += 1
             self._send(*predicted)
 
+    def settle(self) -> None:
+        """Do what the next frame would have to wait for; to be called when there is nothing else to do."""
+        expected_ns = self._ordering.expected_ns
+        if self._model_filter is not None and expected_ns is not None:
+            self._model_filter.settle(expected_ns)
+
     @property
     def deadline_ns(self) -> int | None:
         """When :meth:`poll` is to be called for a frame that waits, in the clock by which it does; None without one."""
@@ -566,6 +572,11 @@ class PeopleStage:
         for stage in self._stages:
             stage.poll(now_ns)
         self._flush()
+
+    def settle(self) -> None:
+        """As of :class:`FilterStage`."""
+        for stage in self._stages:
+            stage.settle()
 
     @property
     def deadline_ns(self) -> int | None:

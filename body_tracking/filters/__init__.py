@@ -58,6 +58,9 @@ class ModelFilter(SkeletonFilter, Protocol):
     def take_orientation(self, measurement: SegmentOrientation) -> bool:
         """Take the orientation of one segment; whether there is something to say of its time."""
 
+    def settle(self, until_ns: int) -> None:
+        """Do what waits, where nothing of before a time is to be expected any more; it changes no result."""
+
     @property
     def filtered(self) -> Skeleton | None:
         """The filtered skeleton after the last frame in its order; None before a first."""

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from body_tracking.fusion.placement import CLOCK_JUMP
-from body_tracking.fusion.rhythm import Rhythm
+from body_tracking.fusion.rhythm import DUE_MARGIN, Rhythm
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 SILENCE = 0.2
@@ -136,6 +136,22 @@ class Ordering:
         """When :meth:`poll` should be called, in the clock of ``now_ns``; None while nothing waits."""
         # an older frame that came later does not make those behind it wait longer
         return min((each.deadline_ns for each in self._waiting), default=None)
+
+    @property
+    def expected_ns(self) -> int | None:
+        """The time before which no frame is to be expected any more; None while no sensor is known."""
+        known = [
+            (newest_ns, each.rhythm) for each in self._sources.values() if (newest_ns := each.newest_ns) is not None
+        ]
+        if not known:
+            return None
+        last_ns = max(newest_ns for newest_ns, _ in known)
+        next_ns = [
+            newest_ns + round((rhythm.period - DUE_MARGIN) * NANOSECONDS)
+            for newest_ns, rhythm in known
+            if last_ns - newest_ns < SILENCE * NANOSECONDS
+        ]
+        return min([*next_ns, *(each.stamp_ns for each in self._waiting[:1])])
 
     def _due(self, stamp_ns: int) -> list[Rhythm]:
         """Those of the sensors whose frame captured up to a time should be here and is not."""

@@ -192,6 +192,7 @@ class SkeletonFilterNode(GraphNode):
         assert self.stage is not None
         if self.stage.by_sensor:
             self.on_alarm()
+            self.stage.settle()
         self.sent_ns = None
 
     def on_alarm(self) -> None:

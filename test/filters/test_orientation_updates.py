@@ -597,6 +597,32 @@ def test_the_order_of_arrival_does_not_matter() -> None:
         assert_allclose(getattr(one.estimate, name), getattr(other.estimate, name), rtol=0.0, atol=1e-9)
 
 
+def test_orientations_that_are_taken_before_a_frame_needs_them_make_no_difference() -> None:
+    person = somebody(5, 1.6)
+    sources = [Source(segment, (0.05, 0.0, 0.1), 0.1, 0.05) for segment in ("forearm_left", "head")]
+    events = in_order(person.skeletons, *(source.measure(person) for source in sources))
+    # orientations come some milliseconds after frames of the same time
+    arrival = [each.stamp_ns + (0 if isinstance(each, Skeleton) else 6_000_000) for each in events]
+    events = [events[k] for k in np.argsort(arrival, kind="stable")]
+    one, other = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+    waited = {one: 0, other: 0}
+    for estimator in waited:
+        frame_ns = 0
+        for each in events:
+            if isinstance(each, Skeleton) and estimator._last is not None:
+                frame_ns = each.stamp_ns
+                waited[estimator] += sum(isinstance(late, SegmentOrientation) for late in estimator._late)
+            give(estimator, each)
+            if estimator is other:
+                estimator.settle(frame_ns + 31_000_000)
+    assert 0 < waited[other] < 0.5 * waited[one]
+    # not more than once for each frame
+    assert other.counters["taken_again"] < 1.5 * one.counters["taken_again"]
+    assert one.estimate is not None and other.estimate is not None
+    for name in ("stamp_ns", "q", "velocity", "covariance", "lengths"):
+        assert_allclose(getattr(one.estimate, name), getattr(other.estimate, name), rtol=0.0, atol=1e-9)
+
+
 def test_orientations_of_one_stamp_count_alike_in_any_order() -> None:
     person = somebody(6, 1.5)
     stamps = {each.stamp_ns for each in person.skeletons}

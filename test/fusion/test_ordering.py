@@ -30,6 +30,24 @@ def known(ordering: Ordering, offsets: dict[str, int], rounds: int = 4) -> int:
     return rounds * PERIOD
 
 
+def test_it_says_before_when_no_frame_is_to_be_expected() -> None:
+    ordering = Ordering(["kinect1", "kinect2"], 0.04)
+    assert ordering.expected_ns is None
+    known(ordering, {"kinect1": 0, "kinect2": 12 * MS})
+    first_ns, second_ns = 3 * PERIOD, 3 * PERIOD + 12 * MS
+    assert ordering.expected_ns == first_ns + PERIOD - 2 * MS
+    ordering.push("kinect1", frame(first_ns + PERIOD), first_ns + PERIOD)
+    assert ordering.expected_ns == second_ns + PERIOD - 2 * MS
+    # a frame that waits for an older one is itself to come
+    ordering.push("kinect1", frame(first_ns + 2 * PERIOD), first_ns + 2 * PERIOD)
+    ordering.hold("kinect2", frame(first_ns + PERIOD + MS), first_ns + 2 * PERIOD)
+    assert ordering.expected_ns == first_ns + PERIOD + MS
+    # who falls silent is not waited for
+    for k in range(3, 12):
+        ordering.push("kinect1", frame(first_ns + k * PERIOD), first_ns + k * PERIOD)
+    assert ordering.expected_ns == first_ns + 12 * PERIOD - 2 * MS
+
+
 @given(
     delays=st.lists(st.integers(0, 25), min_size=2, max_size=4),
     phases=st.lists(st.integers(0, 32), min_size=4, max_size=4, unique=True),

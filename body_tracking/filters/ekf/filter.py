@@ -32,6 +32,8 @@ _WAIT_NS = NANOSECONDS // 2
 _MAX_COORDINATE = 100.0
 _LONGEST_WAIT_NS = NANOSECONDS // 10
 """Orientations that nobody asks for wait no longer than this."""
+_TOGETHER_NS = NANOSECONDS // 300
+"""Orientations of times so close to each other may come in any order."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
 """Metres and radians: of the base where orientations alone start the body."""
 
@@ -210,6 +212,22 @@ class ExtendedKalmanFilter:
         if measurement.stamp_ns - state.stamp_ns > _LONGEST_WAIT_NS:
             self._last = self._replay(state)
         return not late
+
+    def settle(self, until_ns: int) -> None:
+        """Take orientations that wait, as far as none of an earlier time is likely to come; it changes no result.
+
+        What is taken while there is nothing else to do need not be taken when the next frame comes.
+
+        Args:
+            until_ns: before this time no frame is to be expected any more.
+        """
+        state = self._last
+        if state is None or not self._late:
+            return
+        until_ns = min(until_ns, max(each.stamp_ns for each in self._late) - _TOGETHER_NS)
+        # others of before the last frame may still come, and it would have to be taken again for each of them
+        if until_ns > state.stamp_ns:
+            self._last = self._replay(state, until_ns)
 
     @property
     def filtered(self) -> Skeleton | None:
@@ -394,15 +412,22 @@ class ExtendedKalmanFilter:
         self._history.append((state, measurement))
         return self._step(state, measurement)
 
-    def _replay(self, state: State) -> State:
+    def _replay(self, state: State, until_ns: int | None = None) -> State:
         """Go back to before the first late frame, and take all late and all later ones in their order.
 
         A connection that stalls delivers many at once: to go back for each of them would cost the later ones so many
         times.
+
+        Args:
+            state: the last one.
+            until_ns: leave what is of a later time; None for nothing.
         """
         oldest_ns = self._history[0][0].stamp_ns if self._history else state.stamp_ns
         late = [each for each in self._late if each.stamp_ns >= oldest_ns]  # others are older than all remembered ones
         self._late = []
+        if until_ns is not None:
+            self._late = [each for each in late if each.stamp_ns > until_ns]
+            late = [each for each in late if each.stamp_ns <= until_ns]
         if not late:
             return state
         first = min(map(_order, late))
