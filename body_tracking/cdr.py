@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
+from body_tracking.messages.imus import orientation_to_message
 from body_tracking.messages.model import (
     COVARIANCE_ENCODING,
     coordinates_to_configuration,
@@ -30,6 +31,7 @@ from body_tracking.messages.model import (
     stddevs,
 )
 from body_tracking.messages.skeletons import skeletons_to_cloud
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
@@ -307,6 +309,16 @@ def encode_segments(
     start = _header(estimate.stamp_ns, estimate.frame_id) + _names(names) + struct.pack("<I", len(names))
     data = np.concatenate([origins, quats_xyzw], axis=1).astype("<f8").tobytes()
     return start + bytes(-(len(start) - 4) % 8) + data + struct.pack("<II", 0, 0)
+
+
+def encode_orientation(measurement: SegmentOrientation) -> bytes:
+    """``orientation_to_message``, serialised."""
+    message = orientation_to_message(measurement, _Plain())
+    numbers: list[Any] = []
+    for name in ("orientation", "angular_velocity", "linear_acceleration"):
+        numbers += [list(vars(getattr(message, name)).values()), getattr(message, f"{name}_covariance")]
+    start = _header(measurement.stamp_ns, measurement.frame_id)
+    return start + bytes(-(len(start) - 4) % 8) + np.concatenate(numbers).astype("<f8").tobytes()
 
 
 def encode_string(text: str) -> bytes:

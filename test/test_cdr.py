@@ -14,6 +14,7 @@ from body_tracking.cdr import (
     encode_angles,
     encode_covariance,
     encode_model_state,
+    encode_orientation,
     encode_segments,
     encode_skeletons,
     encode_string,
@@ -23,7 +24,8 @@ from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import IMAGE, SEGMENTS, STRING, MessageError
+from body_tracking.messages.base import IMAGE, IMU, SEGMENTS, STRING, MessageError, RosMessages
+from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.model import (
     covariance_to_image,
     estimate_to_joint_states,
@@ -32,6 +34,7 @@ from body_tracking.messages.model import (
     segments_to_joint_state,
 )
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
+from body_tracking.orientation import SegmentOrientation
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 from body_tracking.skeleton import Skeleton
 
@@ -211,6 +214,37 @@ def test_segments_and_text_are_written_as_by_the_serialiser(seed: int, stamp_ns:
     read = deserialize(SEGMENTS, cdr)
     assert len(read.transforms) == len(read.joint_names) == len(MODEL.segment_names)
     assert encode_string(frame_id) == serialize(BAG_MESSAGES.make(STRING, data=frame_id))
+
+
+@given(st.integers(0, 2**32), STAMPS, FRAMES.filter(bool), st.booleans())
+def test_an_orientation_is_written_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str, turning: bool) -> None:
+    measurement = orientation(seed, stamp_ns, frame_id, turning)
+    cdr = encode_orientation(measurement)
+    assert cdr == serialize(orientation_to_message(measurement, BAG_MESSAGES))
+    read = message_to_orientation(deserialize(IMU, cdr), "head")
+    assert (read.stamp_ns, read.frame_id, read.segment) == (stamp_ns, frame_id, "head")
+    np.testing.assert_allclose(read.rotation, measurement.rotation, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(read.covariance, measurement.covariance)
+    assert (read.angular_velocity is None) == (measurement.angular_velocity is None)
+
+
+def test_ros_reads_an_orientation_as_it_was_written() -> None:
+    serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
+    from sensor_msgs.msg import Imu
+
+    measurement = orientation(1, 10**18 + 5, "world", True)
+    message = serialization.deserialize_message(encode_orientation(measurement), Imu)
+    assert message == orientation_to_message(measurement, RosMessages())
+
+
+def orientation(seed: int, stamp_ns: int, frame_id: str, turning: bool) -> SegmentOrientation:
+    """A random one of a head."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(3, 3))
+    rotation = so3.quat_to_matrix(so3.exp(random.normal(size=3)))
+    rate = {"angular_velocity": random.normal(size=3), "angular_velocity_variance": 1e-3} if turning else {}
+    covariance = root @ root.T + 0.01 * np.eye(3)
+    return SegmentOrientation(stamp_ns, "imu_head", "head", rotation, covariance, frame_id=frame_id, **rate)
 
 
 @given(st.integers(0, 2**32), st.data())

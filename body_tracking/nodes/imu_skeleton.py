@@ -13,14 +13,13 @@ from sensor_msgs.msg import Imu, MagneticField, PointCloud2
 from std_srvs.srv import Trigger
 
 from body_tracking import graph
-from body_tracking.cdr import encode_skeletons
+from body_tracking.cdr import encode_orientation, encode_skeletons
 from body_tracking.filtering import PEOPLE
 from body_tracking.fusion.association import HOLD
 from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
 from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings, ImuStage
 from body_tracking.inertial.parameters import TrackingParameters
-from body_tracking.messages.imus import orientation_to_message
-from body_tracking.nodes.common import REFERENCE, RELIABLE, ROS, SENSORS, WORLD_FRAME, GraphNode, run
+from body_tracking.nodes.common import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, GraphNode, run
 from body_tracking.parameters import Value, fields_of
 from body_tracking.skeleton import Skeleton
 
@@ -76,7 +75,7 @@ class ImuSkeletonNode(GraphNode):
         told = self.stage.on_imu(topic, message, self.arrived_ns, skeleton=heard)
         if told.orientation is not None:
             publisher = self.orientations[told.orientation.segment]
-            self.send(publisher, orientation_to_message(told.orientation, ROS), told.orientation.stamp_ns, sent_ns)
+            self.send(publisher, encode_orientation(told.orientation), told.orientation.stamp_ns, sent_ns)
         if told.skeleton is not None:
             self.send(self.skeletons, encode_skeletons([told.skeleton]), told.skeleton.stamp_ns, sent_ns)
 
