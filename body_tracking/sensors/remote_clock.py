@@ -94,7 +94,8 @@ class RoundTrips:
         if t4 < t1 or t3 < t2 or trip < 0:
             return False
         remote, offset = (t2 + t3) // 2, (t1 - t2 + t4 - t3) // 2
-        if self.known and abs(offset - self.offset_ns(remote)) > trip // 2 + _STEP * NANOSECONDS:
+        # the middle of a round trip is off by half of it, and what is known by half of the shortest one (eq. 1)
+        if self.known and abs(offset - self.offset_ns(remote)) > (trip + self.round_trip_ns) // 2 + _STEP * NANOSECONDS:
             self._contradictions += 1
             if self._contradictions < _CONTRADICTIONS:
                 return False
