@@ -44,6 +44,9 @@ from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 _STEP_NS = NANOSECONDS // 10
 """How often what changes slowly is looked at."""
+_AHEAD_OF = 0.85
+"""Share of the period of orientations from which on the next reading has one. Of 100 Hz every third one comes after
+nine tenths of the period of 30 Hz, and stamps jitter."""
 _POSE_S, _POSE_EVERY_S = 1.6, 0.25
 """Seconds of readings in which a pose is looked for, and how often."""
 _ASKED_S = 15.0
@@ -675,7 +678,7 @@ class InertialTracker:
 
     def _orientation(self, sensor: WornSensor, felt: Felt, stamp_ns: int) -> SegmentOrientation | None:
         last = self._told_ns.get(sensor.segment)
-        if last is not None and -JUMP_NS < stamp_ns - last < 0.9 * NANOSECONDS / self.parameters.orientation_rate:
+        if last is not None and -JUMP_NS < stamp_ns - last < _AHEAD_OF * NANOSECONDS / self.parameters.orientation_rate:
             return None
         number = self.segments.index(sensor.segment)
         world, covariance = self._placed(number, felt, felt.rotation)

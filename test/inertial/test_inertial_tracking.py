@@ -292,6 +292,26 @@ def test_no_body_is_fitted_where_nobody_wants_one() -> None:
     assert [each is not None for each in told] == [True, False, True]
 
 
+def test_stamps_that_jitter_cost_no_orientations() -> None:
+    """Of 100 readings a second every third one has an orientation: that is as good as 30 times a second."""
+    tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
+    held(tracker)
+    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
+    jitter = np.random.default_rng(0).integers(-1_000_000, 1_000_000, 300).tolist()
+    stamps = [110 * NANOSECONDS + k * NANOSECONDS // 100 + off for k, off in enumerate(jitter)]
+    still = np.array([0.0, 0.0, 0.0, 1.0])
+    told = [
+        tracker.add(
+            "forearm_left",
+            ImuSample(stamp_ns, "forearm_left", still, level, np.zeros(3), up, None),
+            stamp_ns + 10_000_000,
+            skeleton=False,
+        ).orientation
+        for stamp_ns in stamps
+    ]
+    assert sum(each is not None for each in told) == 100
+
+
 def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_come() -> None:
     parameters = TrackingParameters(clock="own")
     told = [
