@@ -18,7 +18,7 @@ from body_tracking.kinematics import so3
 from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
-_AHEAD_OF = 0.9
+_AHEAD_OF = 0.8
 """Share of the period of the greatest rate from which on the next orientation counts: clocks jitter."""
 _TOGETHER_NS = NANOSECONDS // 125
 """An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
@@ -226,15 +226,14 @@ class OrientationUpdate:
         covariance[v] -= taken
         covariance[:, v] -= taken.T
         covariance[v, v] += gain.T @ gain
-        correction = np.zeros(len(covariance))
-        correction[v] = white @ gain
+        correction = white @ gain
         if len(state.null):
-            correction[v] -= (state.null @ correction[v]) @ state.null
+            correction -= (state.null @ correction) @ state.null
         crosses = state.crosses
         if crosses.shape[1]:
             crosses = crosses.copy()
             crosses[v] -= gain.T @ (whitening @ (turning @ crosses[v]))
-        return self._space.moved(state.but(covariance=covariance, crosses=crosses), correction)
+        return state.but(velocity=state.velocity + correction, covariance=covariance, crosses=crosses)
 
     def _with_source(self, state: State, measurement: SegmentOrientation) -> State:
         """A state with one more source of orientations."""
