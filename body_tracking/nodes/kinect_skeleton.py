@@ -98,10 +98,13 @@ class KinectSkeleton(GraphNode):
                 if frame is not None:
                     self.send(self.output, encode_skeletons(frame.skeletons), frame.skeletons[0].stamp_ns)
         except Exception as error:  # whatever the library of a sensor raises
-            self.failure = described(error)
-            self.get_logger().error(self.failure)
+            if not self.context.ok():
+                return  # closed while it was being read
+            failure = described(error)
+            self.get_logger().error(failure)
             if not isinstance(error, BodyTrackingError):
                 self.get_logger().error(traceback.format_exc())
+            self.failure = failure
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether it plays, ended or failed, or what keeps frames from coming."""

@@ -115,5 +115,6 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
 
 
 def described(error: Exception) -> str:
-    """What went wrong, for people: an error of this package says that by itself."""
-    return str(error) if isinstance(error, BodyTrackingError) else f"{type(error).__name__}: {error}"
+    """What went wrong, in a line: an error of this package says that by itself."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, BodyTrackingError) else f"{type(error).__name__}: {text}"

@@ -156,6 +156,8 @@ def test_offline_gives_the_angles_that_the_graph_gave(wrists: Wrists, tmp_path: 
     settings = ReplaySettings(("kinect1",), filter_name="ekf", imus=ImuSettings(FOREARMS), orientations=FOREARMS)
     replay(wrists.bag, tmp_path / "offline", settings)
     with BagReader(tmp_path / "offline") as reader:
+        first = next(reader.messages([graph.joint_states_topic("body1")]))
+        names = {tuple(deserialize("sensor_msgs/msg/JointState", first.cdr).name)}
         angles, stddevs = (
             {stamp(each): np.array(each.position) for each in messages}
             for messages in (
@@ -165,6 +167,7 @@ def test_offline_gives_the_angles_that_the_graph_gave(wrists: Wrists, tmp_path: 
         )
     common = [each for each in wrists.angles if stamp(each) in angles]
     assert len(common) > 0.95 * len(angles)
+    assert {tuple(each.name) for each in common} == names
     off = np.array([np.array(each.position) - angles[stamp(each)] for each in common])
     spread = np.array([stddevs[stamp(each)] for each in common])
     # skeletons reach imu_skeleton by way of the fusion, which takes its time: not the same to the last digit

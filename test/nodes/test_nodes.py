@@ -349,14 +349,16 @@ def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Pa
         assert stop(process) == 0
 
 
-@pytest.mark.parametrize("entry", ["nowhere:Camera", "mycamera:Film"])
-def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(tmp_path: Path, entry: str) -> None:
+@pytest.mark.parametrize(("entry", "said"), [("nowhere:Camera", "nowhere"), ("mycamera:Film", "Film")])
+def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
+    tmp_path: Path, entry: str, said: str
+) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, entry)
         assert running.start("kinect_skeleton", backend="mine").wait(60.0) == 2
         (line,) = running.log("kinect_skeleton").splitlines()
         assert line.startswith("kinect_skeleton: backend 'mine': ")
-        assert entry.split(":")["nowhere" not in entry] in line
+        assert said in line
 
 
 def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:

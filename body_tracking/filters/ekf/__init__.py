@@ -23,7 +23,8 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 One module each: the settings (``parameters``), what is estimated (``state``), how it moves (``motion``), what cameras
 and sources of orientations err by (``sensor_errors``, ``sources``), what frames (``skeletons``) and orientations
 (``orientations``) say, what is known without any measurement (``priors``), the search for another pose (``poses``),
-what is handed out (``displacement``, ``output``), and all of it in the order of time (``filter``).
+what is handed out (``displacement``, ``output``), small matrices (``algebra``), and all of it in the order of time
+(``filter``).
 """
 
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter

@@ -32,7 +32,7 @@ _WAIT_NS = NANOSECONDS // 2
 _MAX_COORDINATE = 100.0
 _LONGEST_WAIT_NS = NANOSECONDS // 10
 """Orientations that nobody asks for wait no longer than this."""
-_TOGETHER_NS = NANOSECONDS // 300
+_DISORDER_NS = NANOSECONDS // 300
 """Orientations of times so close to each other may come in any order."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
 """Metres and radians: of the base where orientations alone start the body."""
@@ -224,7 +224,7 @@ class ExtendedKalmanFilter:
         state = self._last
         if state is None or not self._late:
             return
-        until_ns = min(until_ns, max(each.stamp_ns for each in self._late) - _TOGETHER_NS)
+        until_ns = min(until_ns, max(each.stamp_ns for each in self._late) - _DISORDER_NS)
         # others of before the last frame may still come, and it would have to be taken again for each of them
         if until_ns > state.stamp_ns:
             self._last = self._replay(state, until_ns)

@@ -47,7 +47,7 @@ _MISFIT = 0.02
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
-"""Radians by which no other pose that points suggest may turn such a segment at once."""
+"""Radians by which no other pose that points suggest may turn a segment at once whose orientation is measured."""
 _ANOTHER_SIZE = 1.2
 """Times that a person is larger or smaller than the one before, who must be another one."""
 

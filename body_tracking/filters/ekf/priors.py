@@ -134,7 +134,7 @@ class Priors:
         """The estimate drawn to the middle of the ranges, where nothing else holds it; the covariance stays.
 
         Without this, an angle that nothing observes would wander with the noise of those that are. Beside orientations
-        it is done to what is handed out only (:meth:`Output._middled`): what cameras pull back again and again, as the
+        it is done to what is handed out only (``output``): what cameras pull back again and again, as the
         covariance stays, would end up in the headings and misalignments of the sources.
         """
         space = self._space
