@@ -137,16 +137,21 @@ class Ranges:
 
     def soft_coordinates(self, q: FloatArray) -> SoftCoordinates:
         """The bounded quantities of configurations (..., nq)."""
-        values = self._values(q)
+        values = self.values(q)
+        return SoftCoordinates(values, self.gradients(values))
+
+    def gradients(self, values: FloatArray) -> FloatArray:
+        """Those of :class:`SoftCoordinates`, of its values (..., 26)."""
         turned = values[..., self._soft]
         gradients = np.zeros((*values.shape, len(self.low)))
         gradients[...] = np.eye(len(self.low))
         jacobian = so3.right_jacobian_inverse(turned)
         for side, rows in enumerate(self._soft):
             gradients[..., rows[:, None], rows] = jacobian[..., side, :, :]
-        return SoftCoordinates(values, gradients)
+        return gradients
 
-    def _values(self, q: FloatArray) -> FloatArray:
+    def values(self, q: FloatArray) -> FloatArray:
+        """Those of :class:`SoftCoordinates` alone."""
         values = np.empty((*q.shape[:-1], len(self.low)))
         values[..., self._scalar_soft] = q[..., self._model.scalar_q]
         values[..., self._soft] = so3.log(so3.quat_multiply(self._to_centre, q[..., self._quaternions]))
@@ -157,7 +162,7 @@ class Ranges:
 
         The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
         """
-        return self.excess_of(self._values(q))
+        return self.excess_of(self.values(q))
 
     def surely_within(self, q: FloatArray, margin: float) -> bool:
         """Whether a configuration (nq,) is quickly seen to leave no range by more than a margin, radians."""
@@ -184,7 +189,7 @@ class Ranges:
         """(nq,) a configuration whose angles and shoulders are at most a margin (radians) beyond their ranges."""
         rows = self._model.scalar_v - 6
         clipped = q.copy()
-        turned = self._values(q)[self._soft]
+        turned = self.values(q)[self._soft]
         swing = np.sqrt((turned[:, :2] ** 2).sum(axis=1, keepdims=True))
         turned[:, :2] *= np.minimum(1.0, (np.radians(SHOULDER_SWING) + margin) / np.maximum(swing, 1e-12))
         twist = np.radians(SHOULDER_TWIST) + margin

@@ -41,7 +41,7 @@ class Displacement:
         """Begin anew."""
         self._last_displaced = None
 
-    def displaced(self, state: State, lines: Linearisation) -> FloatArray:
+    def displaced(self, state: State) -> FloatArray:
         """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
 
         By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
@@ -51,6 +51,7 @@ class Displacement:
         """
         period = state.stamp_ns // SLOW_PERIOD_NS
         if self._last_displaced is None or self._last_displaced[0] != period:  # it changes slowly, as the pose does
+            lines = self._space.model.linearise(state.q, state.lengths)
             information = self.prior_information
             if state.sources.names:
                 information = information + self._held(state, lines)

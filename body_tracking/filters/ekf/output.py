@@ -9,7 +9,6 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import VAGUE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.model import Linearisation
 from body_tracking.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
 
 _INFERRED = np.uint8(TrackingState.INFERRED)
@@ -31,27 +30,23 @@ class Output:
         self._displacement, self._parameters = displacement, parameters
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
-        self._last_handed_out: tuple[State, FloatArray, Linearisation, FloatArray] | None = None
+        self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
         """Begin anew."""
         self._last_handed_out = None
 
-    def _handed_out(self, state: State) -> tuple[FloatArray, Linearisation, FloatArray]:
-        """The configuration, where its points are, and the covariance (85, 85) to hand out: what the filter knows, and
-        what it cannot.
-        """
+    def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """The configuration and the covariance (85, 85) to hand out: what the filter knows, and what it cannot."""
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
-            lines, covariance = self._model.linearise(state.q, state.lengths), state.covariance
+            q, covariance = state.q, state.covariance
             if self._parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
                 covariance = covariance.copy()
-                covariance[: space.observed, : space.observed] += self._displacement.displaced(state, lines)
-            q = state.q
+                covariance[: space.observed, : space.observed] += self._displacement.displaced(state)
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
-                lines = self._model.linearise(q, state.lengths)
-            self._last_handed_out = state, q, lines, covariance
+            self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -76,7 +71,7 @@ class Output:
             body: whose it is.
         """
         space = self._space
-        q, _, told = self._handed_out(state)
+        q, told = self._handed_out(state)
         covariance = np.empty((2 * space.nv, 2 * space.nv))
         for row, rows in enumerate((space.tangent, space.velocities)):
             for column, columns in enumerate((space.tangent, space.velocities)):
@@ -96,7 +91,8 @@ class Output:
     def skeleton(self, state: State, skeleton: Skeleton) -> Skeleton:
         """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
         space = self._space
-        _, lines, told = self._handed_out(state)
+        q, told = self._handed_out(state)
+        lines = self._model.linearise(q, state.lengths)
         joints = self._model.joints
         observation = space.observation(lines)
         spread = observation @ told[: space.observed, : space.observed] @ observation.T

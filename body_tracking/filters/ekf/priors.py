@@ -154,12 +154,13 @@ class Priors:
         if self._ranges.surely_within(state.q, _FAR_BEYOND):
             return state
         for _ in range(_PROJECTIONS):
-            excess = self._ranges.excess(state.q)
+            values = self._ranges.values(state.q)
+            excess = self._ranges.excess_of(values)
             size = np.abs(excess)
             far = size > _FAR_BEYOND
             if not far.any():
                 return state
-            gradients = self._ranges.soft_coordinates(state.q).gradients[far]
+            gradients = self._ranges.gradients(values)[far]
             observation = np.zeros((len(gradients), self._space.nv))
             observation[:, 6:] = gradients
             back = excess[far] * (1.0 - _BACK_TO / size[far])
