@@ -229,14 +229,17 @@ def _doubles(position: int, *values: FloatArray) -> bytes:
 # --- the state of a body model
 
 
-def encode_model_state(estimate: ModelEstimate, model: BodyModel) -> tuple[bytes, bytes]:
-    """``estimate_to_joint_states``, serialised: values, and standard deviations."""
+def encode_model_state(estimate: ModelEstimate, model: BodyModel) -> bytes:
+    """The values of ``estimate_to_joint_states``, serialised."""
+    start = _header(estimate.stamp_ns, estimate.frame_id) + _names(model.coordinate_names)
+    return start + _doubles(len(start), model.difference(model.neutral(), estimate.q), estimate.velocity)
+
+
+def encode_model_stddev(estimate: ModelEstimate, model: BodyModel) -> bytes:
+    """The standard deviations of ``estimate_to_joint_states``, serialised."""
     start = _header(estimate.stamp_ns, estimate.frame_id) + _names(model.coordinate_names)
     deviations = stddevs(estimate)
-    return (
-        start + _doubles(len(start), model.difference(model.neutral(), estimate.q), estimate.velocity),
-        start + _doubles(len(start), deviations[: model.nv], deviations[model.nv :]),
-    )
+    return start + _doubles(len(start), deviations[: model.nv], deviations[model.nv :])
 
 
 def decode_model_state(cdr: bytes, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray] | None:

@@ -16,6 +16,7 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.cdr import (
     encode_covariance,
     encode_model_state,
+    encode_model_stddev,
     encode_segments,
     encode_skeletons,
     encode_string,
@@ -443,13 +444,10 @@ class FilterStage:
             assert skeleton is not None
             self._skeleton(skeleton)
         topics = self._topics
-        state_wanted, stddev_wanted = self._wanted(topics.state), self._wanted(topics.stddev)
-        if state_wanted or stddev_wanted:
-            state, stddev = encode_model_state(estimate, model)
-            if state_wanted:
-                self._publish(topics.state, state, stamp_ns)
-            if stddev_wanted:
-                self._publish(topics.stddev, stddev, stamp_ns)
+        if self._wanted(topics.state):
+            self._publish(topics.state, encode_model_state(estimate, model), stamp_ns)
+        if self._wanted(topics.stddev):
+            self._publish(topics.stddev, encode_model_stddev(estimate, model), stamp_ns)
         if self._wanted(topics.covariance):
             self._publish(topics.covariance, encode_covariance(estimate), stamp_ns)
         if self._wanted(topics.segments):

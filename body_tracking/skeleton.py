@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from body_tracking.errors import BodyTrackingError
 
 FloatArray = NDArray[np.float64]
+SingleArray = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 

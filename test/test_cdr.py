@@ -14,6 +14,7 @@ from body_tracking.cdr import (
     encode_angles,
     encode_covariance,
     encode_model_state,
+    encode_model_stddev,
     encode_orientation,
     encode_segments,
     encode_skeletons,
@@ -181,9 +182,10 @@ def estimate(seed: int, stamp_ns: int = 10**9, frame_id: str = "world") -> Model
 def test_a_model_state_is_written_and_read_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str) -> None:
     given_estimate = estimate(seed, stamp_ns, frame_id)
     messages = estimate_to_joint_states(given_estimate, MODEL, BAG_MESSAGES)
-    for cdr, message in zip(encode_model_state(given_estimate, MODEL), messages, strict=True):
+    encoded = encode_model_state(given_estimate, MODEL), encode_model_stddev(given_estimate, MODEL)
+    for cdr, message in zip(encoded, messages, strict=True):
         assert cdr == serialize(message)
-    cdr = encode_model_state(given_estimate, MODEL)[0]
+    cdr = encode_model_state(given_estimate, MODEL)
     fast = decode_model_state(cdr, MODEL)
     assert fast is not None
     for read in (fast, joint_state_to_model(deserialize(STATES, cdr), MODEL)):
@@ -249,7 +251,7 @@ def orientation(seed: int, stamp_ns: int, frame_id: str, turning: bool) -> Segme
 
 @given(st.integers(0, 2**32), st.data())
 def test_a_damaged_model_state_is_read_as_by_the_serialiser_or_left_to_it(seed: int, data: st.DataObject) -> None:
-    cdr = bytearray(encode_model_state(estimate(seed), MODEL)[0])
+    cdr = bytearray(encode_model_state(estimate(seed), MODEL))
     for _ in range(data.draw(st.integers(1, 4))):
         cdr[data.draw(st.integers(0, len(cdr) - 1))] = data.draw(st.integers(0, 255))
     damaged = bytes(cdr[: len(cdr) - data.draw(st.sampled_from([0, 0, 1, 8]))])
@@ -310,7 +312,7 @@ def test_ros_reads_a_model_state_as_it_was_written() -> None:
 
     for frame_id in ("", "a", "ab", "abc", "abcd", "world"):
         given_estimate = estimate(0, frame_id=frame_id)
-        state = serialization.deserialize_message(encode_model_state(given_estimate, MODEL)[0], JointState)
+        state = serialization.deserialize_message(encode_model_state(given_estimate, MODEL), JointState)
         assert tuple(state.name) == MODEL.coordinate_names
         np.testing.assert_array_equal(state.velocity, given_estimate.velocity)
         image = serialization.deserialize_message(encode_covariance(given_estimate), Image)

@@ -110,7 +110,9 @@ class _Backward:
         if self.starts(following):
             return None
         ekf = self._ekf
-        predicted = ekf._motion.predicted(state, following.stamp_ns)
+        # in double precision, as what it is divided by must be the same as what moves to more than seven digits
+        precise = state.but(crosses=state.crosses.astype(np.float64))
+        predicted = ekf._motion.predicted(precise, following.stamp_ns)
         known = _sensors(state)
         shared = tuple(name for name in known if name in _sensors(following))
         covariance = self._joint(predicted, shared)

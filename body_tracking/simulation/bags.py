@@ -151,7 +151,7 @@ def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
         skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
         # positions only, as a sensor's
         yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
-        yield log_ns, graph.TRUE_MODEL_STATE, encode_model_state(first.estimate(k), MODEL)[0]
+        yield log_ns, graph.TRUE_MODEL_STATE, encode_model_state(first.estimate(k), MODEL)
         yield log_ns, graph.TRUE_ANGLES, encode_angles(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD)[0]
         if stamp_ns >= due_ns:
             due_ns += NANOSECONDS

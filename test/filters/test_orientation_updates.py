@@ -32,7 +32,7 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
 
 NAMES = MODEL.coordinate_names
 PRONATION = [NAMES.index(f"forearm_pronation_{side}") for side in ("left", "right")]
@@ -621,6 +621,22 @@ def test_orientations_that_are_taken_before_a_frame_needs_them_make_no_differenc
     assert one.estimate is not None and other.estimate is not None
     for name in ("stamp_ns", "q", "velocity", "covariance", "lengths"):
         assert_allclose(getattr(one.estimate, name), getattr(other.estimate, name), rtol=0.0, atol=1e-9)
+
+
+def test_the_largest_matrix_stays_in_single_precision() -> None:
+    person = somebody(5, 4.0)
+    source = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05, slip=(2.0, (0.0, 0.5, 0.0)), spin=0.05)
+    estimator = ExtendedKalmanFilter()
+    stated = np.tile(0.03**2 * np.eye(3), (N_JOINTS, 1, 1))
+    for each in in_order(person.skeletons, source.measure(person)):
+        if isinstance(each, Skeleton):
+            estimator.take(replace(each, covariances=stated), f"kinect{each.stamp_ns % 2}")
+        else:
+            estimator.take_orientation(each)
+    state = estimator._state
+    assert state is not None and state.settled and len(state.sources) == 1
+    assert np.abs(state.crosses).max() > 0.0 and state.crosses.shape[1] == 122
+    assert state.crosses.dtype == np.float32 and state.covariance.dtype == np.float64
 
 
 def test_orientations_of_one_stamp_count_alike_in_any_order() -> None:

@@ -10,7 +10,7 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics import so3
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray
 
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
@@ -112,7 +112,7 @@ class Motion:
             self._diagonals[size] = starts[:, None] + (size + 1) * np.arange(self._space.nv)
         return self._diagonals[size]
 
-    def _turned_back(self, errors: FloatArray, turns: FloatArray) -> None:
+    def _turned_back(self, errors: FloatArray | SingleArray, turns: FloatArray) -> None:
         """Turn the rows (85, n) of the base's and the shoulders' rotation in place, by (3, 3, 3) for each of these."""
         errors[self._ball_rows] = (turns @ errors.take(self._model.ball_v, axis=0)).reshape(len(self._ball_rows), -1)
 

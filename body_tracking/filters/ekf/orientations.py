@@ -13,7 +13,7 @@ from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sources import PER_SOURCE, about, expect, slipped
-from body_tracking.filters.ekf.state import Measurement, State, StateSpace
+from body_tracking.filters.ekf.state import Measurement, State, StateSpace, single
 from body_tracking.kinematics import so3
 from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
@@ -188,7 +188,8 @@ class OrientationUpdate:
                 part -= (state.null @ part) @ state.null
         crosses = state.crosses
         if crosses.shape[1]:
-            crosses = crosses - kalman @ (by_tangent @ (crosses[t] + ahead * crosses[v]) + by_source @ crosses[own])
+            shown = single(by_tangent) @ (crosses[t] + ahead * crosses[v]) + single(by_source) @ crosses[own]
+            crosses = crosses - single(kalman) @ shown
         if turned >= FAR:
             for ball in self._model.ball_v:
                 turn = so3.right_jacobian(correction[ball])
@@ -242,7 +243,8 @@ class OrientationUpdate:
         covariance = np.zeros((old + PER_SOURCE, old + PER_SOURCE))
         covariance[:old, :old] = state.covariance
         covariance[old:, old:] = added
-        crosses = np.concatenate([state.crosses, np.zeros((PER_SOURCE, state.crosses.shape[1]))])
+        none = np.zeros((PER_SOURCE, state.crosses.shape[1]), dtype=state.crosses.dtype)
+        crosses = np.concatenate([state.crosses, none])
         # what thumbs have said so far was said with too much confidence
         doubtful = self._by_thumbs[sources.segments[-1]]
         covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2

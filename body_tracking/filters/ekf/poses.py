@@ -155,7 +155,7 @@ class PoseSearch:
             zero,
             {} if previous is None else previous.sensors,
             (),
-            np.empty((size, 0)),
+            np.empty((size, 0), dtype=np.float32),
             np.zeros(space.points),
             np.zeros((space.points, 3)),
             np.zeros(space.points),

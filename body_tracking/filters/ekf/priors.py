@@ -7,9 +7,9 @@ from scipy.linalg.lapack import dtrtrs
 
 from body_tracking.filters.ekf.algebra import cholesky
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.filters.ekf.state import State, StateSpace, single
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.skeleton import NANOSECONDS, FloatArray, SingleArray
 
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
@@ -100,7 +100,7 @@ class Priors:
             velocity=state.velocity * signs,
             covariance=state.covariance * both * both[:, None],
             moved=state.moved * signs,
-            crosses=state.crosses * both[:, None],
+            crosses=state.crosses * single(both)[:, None],
         )
 
     def _unsure(self, state: State) -> State:
@@ -178,7 +178,7 @@ class Priors:
         observation: FloatArray,
         error: FloatArray,
         noise: FloatArray,
-        part: tuple[FloatArray, FloatArray],
+        part: tuple[FloatArray, SingleArray],
     ) -> State:
         """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,).
 
@@ -200,7 +200,7 @@ class Priors:
         if state.settled:
             covariance[space.lengths, space.lengths] = state.covariance[space.lengths, space.lengths]
         half, _ = dtrtrs(factor, observation @ free_crosses[space.tangent], lower=1)
-        crosses = state.crosses - gain.T @ half
+        crosses = state.crosses - single(gain.T) @ single(half)
         if state.settled:
             crosses[space.lengths] = state.crosses[space.lengths]
         return space.moved(state.but(covariance=covariance, crosses=crosses), white @ gain)
@@ -220,7 +220,7 @@ class Priors:
         correction[space.size :] = 0.0  # as the covariance stays, sources would learn this again and again
         return space.moved(state, correction)
 
-    def _free(self, state: State) -> tuple[FloatArray, FloatArray]:
+    def _free(self, state: State) -> tuple[FloatArray, SingleArray]:
         """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free.
 
         A pose that is moved without any measurement must not turn what a source says the turn of: the source would be
@@ -237,4 +237,4 @@ class Priors:
         s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
         held = np.linalg.solve(s, np.concatenate([cross.T, rows @ state.crosses[space.tangent]], axis=1))
         size = len(state.covariance)
-        return state.covariance - cross @ held[:, :size], state.crosses - cross @ held[:, size:]
+        return state.covariance - cross @ held[:, :size], state.crosses - single(cross) @ single(held[:, size:])

@@ -14,9 +14,9 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.poses import PoseSearch
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sensor_errors import NEGLIGIBLE_SLOW, STRETCH, SensorErrors
-from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, State, StateSpace
+from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, State, StateSpace, single
 from body_tracking.kinematics import so3
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, TrackingState
+from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray, TrackingState
 
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
@@ -196,7 +196,8 @@ class SkeletonUpdate:
             names, crosses = _without(names, crosses, measurement.sensor)
         elif measurement.sensor not in names and basis is not None:
             names = (*names, measurement.sensor)
-            crosses = np.concatenate([crosses, np.zeros((len(crosses), self._sensors.slow_size))], axis=1)
+            none = np.zeros((len(crosses), self._sensors.slow_size), dtype=crosses.dtype)
+            crosses = np.concatenate([crosses, none], axis=1)
         own_cross = None
         if names:
             # Slow errors are only considered (Schmidt 1966): C - K H C, and - K B of the sensor's own.
@@ -205,7 +206,7 @@ class SkeletonUpdate:
                 kalman[space.lengths] = 0.0
             if unlearnt is not None:
                 kalman -= back @ (combinations @ kalman)
-            change = kalman @ observation[rows] @ crosses[: space.observed]
+            change = single(kalman @ observation[rows]) @ crosses[: space.observed]
             if basis is not None:
                 place = names.index(measurement.sensor) * self._sensors.slow_size
                 own_change = change[:, place : place + self._sensors.slow_size]
@@ -347,14 +348,14 @@ class SkeletonUpdate:
             state = state.but(seen=None)
         # The lengths' errors are new ones. What is known of the rest where the lengths are given stays as it is.
         before = state.covariance[space.lengths, space.lengths]
-        follows = np.linalg.solve(before, state.covariance[space.lengths]).T
-        crosses = state.crosses - follows @ state.crosses[space.lengths]
+        follows: FloatArray = np.linalg.solve(before, state.covariance[space.lengths]).T.astype(np.float64)
+        crosses = state.crosses - single(follows) @ state.crosses[space.lengths]
         covariance = state.covariance + follows @ (found.covariance - before) @ follows.T
         moved = space.moved(state.but(settled=False), follows @ (found.lengths - state.lengths))
         return moved.but(lengths=found.lengths, covariance=covariance, crosses=crosses, settled=True)
 
 
-def _without(names: tuple[str, ...], crosses: FloatArray, name: str) -> tuple[tuple[str, ...], FloatArray]:
+def _without(names: tuple[str, ...], crosses: SingleArray, name: str) -> tuple[tuple[str, ...], SingleArray]:
     """``slow_names`` and ``crosses`` of a state without those of one sensor."""
     kept = np.repeat([each != name for each in names], crosses.shape[1] // len(names))
     return tuple(each for each in names if each != name), crosses[:, kept]

@@ -13,9 +13,14 @@ from body_tracking.kinematics.model import Linearisation
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import BASE_STDDEV
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton
 
 NOBODY = Sources.none()
+
+
+def single(values: FloatArray) -> SingleArray:
+    """In the precision of ``State.crosses``."""
+    return values.astype(np.float32)
 
 
 class Changeable:
@@ -41,7 +46,7 @@ class SlowBasis:
     points: FloatArray
     limbs: FloatArray
 
-    def of(self, crosses: FloatArray) -> FloatArray:
+    def of(self, crosses: SingleArray) -> FloatArray:
         """(n, 57) covariance with the displacement, of what has (n, 61) with the slow errors: C B^T."""
         count = len(self.points)
         result: FloatArray = crosses[:, :count] * self.points + crosses[:, count:] @ self.limbs.T
@@ -109,7 +114,9 @@ class State(Changeable):
         moved_variance: (32,) its variance, if all is right.
         sensors: what is known of each.
         slow_names: (n,) those with whose slow errors the state is correlated.
-        crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation.
+        crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation. In
+            single precision: no other matrix is as large, with four cameras an eighth of a frame's time goes by half of
+            it, and what is only considered need not be known to more than seven digits.
         rejected_for: (19,) seconds.
         lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
         leaning: (19,) how many innovations it is worth.
@@ -139,7 +146,7 @@ class State(Changeable):
     moved_variance: FloatArray
     sensors: dict[str, SensorState]
     slow_names: tuple[str, ...]
-    crosses: FloatArray
+    crosses: SingleArray
     rejected_for: FloatArray
     lean: FloatArray
     leaning: FloatArray
@@ -158,7 +165,7 @@ class State(Changeable):
     oriented_ns: int = 0
     unplaced: bool = False
 
-    def cross(self, name: str) -> FloatArray | None:
+    def cross(self, name: str) -> SingleArray | None:
         """(85, 61) of ``crosses``, those of one sensor; None for zero."""
         if name not in self.slow_names:
             return None
