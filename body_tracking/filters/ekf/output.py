@@ -30,23 +30,22 @@ class Output:
         self._displacement, self._parameters = displacement, parameters
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
-        self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
+        self._last_handed_out: tuple[State, FloatArray, FloatArray | None] | None = None
 
     def forget(self) -> None:
         """Begin anew."""
         self._last_handed_out = None
 
-    def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray]:
-        """The configuration and the covariance (85, 85) to hand out: what the filter knows, and what it cannot."""
+    def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray | None]:
+        """The configuration to hand out, and what is added (53, 53) to the covariance: what the filter cannot know."""
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
-            q, covariance = state.q, state.covariance
+            q, displaced = state.q, None
             if self._parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
-                covariance = covariance.copy()
-                covariance[: space.observed, : space.observed] += self._displacement.displaced(state)
+                displaced = self._displacement.displaced(state)
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
-            self._last_handed_out = state, q, covariance
+            self._last_handed_out = state, q, displaced
         return self._last_handed_out[1:]
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -71,12 +70,16 @@ class Output:
             body: whose it is.
         """
         space = self._space
-        q, told = self._handed_out(state)
+        q, displaced = self._handed_out(state)
+        known, length_variance = state.covariance, state.covariance.diagonal()[space.lengths]
         covariance = np.empty((2 * space.nv, 2 * space.nv))
         for row, rows in enumerate((space.tangent, space.velocities)):
             for column, columns in enumerate((space.tangent, space.velocities)):
                 block = slice(row * space.nv, (row + 1) * space.nv), slice(column * space.nv, (column + 1) * space.nv)
-                covariance[block] = told[rows, columns]
+                covariance[block] = known[rows, columns]
+        if displaced is not None:
+            covariance[: space.nv, : space.nv] += displaced[space.tangent, space.tangent]
+            length_variance = length_variance + displaced.diagonal()[space.lengths]
         return ModelEstimate(
             state.stamp_ns,
             frame_id,
@@ -85,17 +88,20 @@ class Output:
             state.velocity,
             covariance,
             state.lengths,
-            np.sqrt(told.diagonal()[space.lengths]),
+            np.sqrt(length_variance),
         )
 
     def skeleton(self, state: State, skeleton: Skeleton) -> Skeleton:
         """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
         space = self._space
-        q, told = self._handed_out(state)
+        q, displaced = self._handed_out(state)
         lines = self._model.linearise(q, state.lengths)
+        told = state.covariance[: space.observed, : space.observed]
+        if displaced is not None:
+            told = told + displaced
         joints = self._model.joints
         observation = space.observation(lines)
-        spread = observation @ told[: space.observed, : space.observed] @ observation.T
+        spread = observation @ told @ observation.T
         positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
         covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)

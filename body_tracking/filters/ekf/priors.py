@@ -151,9 +151,9 @@ class Priors:
         Softly a range pushes back ten times a second; a velocity that runs on while nothing is seen, or a measurement
         that no body can follow, is stopped here at once.
         """
-        if self._ranges.surely_within(state.q, _FAR_BEYOND):
-            return state
         for _ in range(_PROJECTIONS):
+            if self._ranges.surely_within(state.q, _FAR_BEYOND):
+                return state
             values = self._ranges.values(state.q)
             excess = self._ranges.excess_of(values)
             size = np.abs(excess)
