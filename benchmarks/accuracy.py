@@ -32,7 +32,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,7 @@ class Run:
         if self.parameter:
             errors = errors.scaled(self.factor, (self.parameter,))
         if offsets_alone:
-            errors = replace(KinectErrors.none(), anatomical=errors.anatomical, offset=errors.offset)
+            errors = errors.offsets_alone()
         return simulate(Setup(self.motion, layout(self.layout), seed=self.seed, errors=errors))
 
 

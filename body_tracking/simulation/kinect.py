@@ -178,6 +178,10 @@ class KinectErrors:
     def __post_init__(self) -> None:
         check_fields(self, "simulated Kinect", SimulatedKinectError)
 
+    def offsets_alone(self) -> KinectErrors:
+        """Only where they take the joints' centres to be, beside where an anatomist does: what no method can know."""
+        return replace(self.none(), anatomical=self.anatomical, offset=self.offset)
+
     @classmethod
     def none(cls) -> KinectErrors:
         """A sensor that errs in nothing, though what is covered is still inferred or not tracked."""
