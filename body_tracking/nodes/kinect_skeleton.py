@@ -98,25 +98,36 @@ class KinectSkeleton(GraphNode):
                 if frame is not None:
                     self.send(self.output, encode_skeletons(frame.skeletons), frame.skeletons[0].stamp_ns)
         except Exception as error:  # whatever the library of a sensor raises
-            if not self.context.ok():
-                return  # closed while it was being read
-            failure = described(error)
-            self.get_logger().error(failure)
-            if not isinstance(error, BodyTrackingError):
-                self.get_logger().error(traceback.format_exc())
-            self.failure = failure
+            if self.context.ok():  # not closed while it was being read
+                self.failed(error)
+
+    def failed(self, error: Exception) -> None:
+        """Say what the source has raised, and where, for who writes it; to be called where it is caught."""
+        failure = described(error)
+        self.get_logger().error(failure)
+        if not isinstance(error, BodyTrackingError):
+            self.get_logger().error(traceback.format_exc())
+        self.failure = failure
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether it plays, ended or failed, or what keeps frames from coming."""
-        problem = self.source.problem
+        problem, ended, counters = "", False, dict[str, object]()
+        try:
+            problem, ended, counters = self.source.problem, self.source.ended, dict(self.source.counters)
+        except Exception as error:
+            if not self.failure:
+                self.failed(error)
         if problem:
             self.log_seldom("problem", problem, _PROBLEM_PERIOD_S)
-        text = self.failure or problem or ("ended" if self.source.ended else "streaming")
-        return (2 if self.failure else 1 if problem else 0), text, dict(self.source.counters)
+        text = self.failure or problem or ("ended" if ended else "streaming")
+        return (2 if self.failure else 1 if problem else 0), text, counters
 
     def close(self) -> None:
         """Let the thread end."""
-        self.source.close()
+        try:
+            self.source.close()
+        except Exception as error:
+            self.failed(error)
         self.thread.join(timeout=1.0)
 
 

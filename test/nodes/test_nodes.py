@@ -324,6 +324,18 @@ class Camera:
 
     def close(self):
         pass
+
+
+class Mute(Camera):
+    @property
+    def counters(self):
+        raise KeyError("temperature")
+
+    def read(self, timeout):
+        return super().read(timeout) if self.stamps.__length_hint__() else None
+
+    def close(self):
+        raise OSError("closed twice")
 """
 
 
@@ -347,6 +359,17 @@ def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Pa
         assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
         assert process.poll() is None
         assert stop(process) == 0
+
+
+def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        running.environment |= installed(tmp_path, "mycamera:Mute")
+        process = running.start("kinect_skeleton", backend="mine")
+        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("published") == "3", 60.0)
+        assert running.diagnostics["kinect_skeleton"][""] == "KeyError: 'temperature'"
+        assert "in counters" in running.log("kinect_skeleton")
+        assert stop(process) == 0
+        assert "OSError: closed twice" in running.log("kinect_skeleton")
 
 
 @pytest.mark.parametrize(("entry", "said"), [("nowhere:Camera", "nowhere"), ("mycamera:Film", "Film")])
