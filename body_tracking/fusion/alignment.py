@@ -16,8 +16,9 @@ import numpy as np
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.fusion.fusion import WORLD, FusionError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
-from body_tracking.fusion.sides import Sides, agree, headings_of, put_right
+from body_tracking.fusion.sides import Sides
 from body_tracking.measurement import joint_stddev, viewing_angle
+from body_tracking.sides import agree, headings_of, put_right
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 FRESH = 0.1

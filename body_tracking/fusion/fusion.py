@@ -20,9 +20,10 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
 from body_tracking.fusion.rhythm import Rhythm
-from body_tracking.fusion.sides import PAIRS, Sides
+from body_tracking.fusion.sides import Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
 from body_tracking.measurement import joint_stddev, viewing_angle
+from body_tracking.sides import PAIRS
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 WORLD = "world"

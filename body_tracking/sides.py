@@ -1,0 +1,88 @@
+"""Left and right of one body: which way its upper and its lower half face, and how both are exchanged.
+
+A Kinect takes every body to face it, and sometimes turns only the shoulders. Upper and lower body each have a heading
+here, the direction of their left-right axis in the horizontal plane of ``world``; it is a plain number, because the
+arithmetic of two angles per sensor is cheaper without arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from body_tracking.skeleton import MIRROR, N_JOINTS, FloatArray, Joint
+
+SAME_SENSE = 0.5
+"""Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
+
+_SHORTEST = 0.02
+"""An axis shorter than this has no direction, metres."""
+
+PAIRS = (
+    np.array([Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT], dtype=np.intp),
+    np.array([Joint.HIP_LEFT, Joint.HIP_RIGHT], dtype=np.intp),
+)
+"""The ends of the left-right axes of the upper and of the lower body."""
+
+_ENDS = np.concatenate(PAIRS)
+_LOWER = np.isin(
+    np.arange(N_JOINTS), [joint for joint in Joint if joint.name.startswith(("HIP", "KNEE", "ANKLE", "FOOT"))]
+)
+_LATERAL = np.arange(N_JOINTS) != MIRROR
+HALVES = (np.flatnonzero(_LATERAL & ~_LOWER), np.flatnonzero(_LATERAL & _LOWER))
+"""The joints that have a left and a right: of the upper and of the lower body."""
+
+
+def _headings(ends: Sequence[Sequence[float]]) -> list[float]:
+    """The headings of both halves from the (x, y) of their four ends, radians; NaN for an axis without direction."""
+    found = []
+    for (left_x, left_y, *_), (right_x, right_y, *_) in (ends[0:2], ends[2:4]):
+        x, y = left_x - right_x, left_y - right_y
+        found.append(math.atan2(y, x) if math.hypot(x, y) > _SHORTEST else math.nan)
+    return found
+
+
+def headings_of(points: FloatArray) -> list[float]:
+    """The headings of the upper and the lower body, radians, of (25, 3) joints in world; NaN where not known."""
+    return _headings(points[_ENDS].tolist())
+
+
+def agree(headings: Sequence[float], believed: Sequence[float]) -> bool:
+    """Whether nothing is to be put right, as far as that is known."""
+    return not any(math.cos(a - b) < SAME_SENSE for a, b in zip(headings, believed, strict=True))
+
+
+def put_right(
+    headings: Sequence[float],
+    believed: Sequence[float],
+    points: FloatArray,
+    variance: FloatArray,
+    states: np.ndarray,
+    counters: Counter[str],
+) -> None:
+    """Repair or reject, in place, what one sensor sees turned around or with its sides swapped.
+
+    Args:
+        headings: of both halves, as :func:`headings_of` says.
+        believed: those that are taken for true.
+        points: (25, 3) metres in world.
+        variance: (25,) square metres.
+        states: (25,).
+        counters: counts ``repaired`` and ``turned``.
+    """
+    for half, joints in enumerate(HALVES):
+        agreement = math.cos(headings[half] - believed[half])
+        if not agreement < SAME_SENSE:  # NaN for an axis that is not known: nothing to be said
+            continue
+        if agreement < -SAME_SENSE:
+            other = MIRROR[joints]
+            points[joints] = points[other]
+            variance[joints] = 2.0 * variance[other]
+            states[joints] = states[other]
+            counters["repaired"] += 1
+        else:
+            variance[joints] = np.inf
+            counters["turned"] += 1
