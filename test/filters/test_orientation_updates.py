@@ -428,6 +428,44 @@ def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turn
     assert taught[2] < 0.2 * np.hypot(*taught[:2])
 
 
+def turned_away(person: Person, begin: float, end: float) -> list[Skeleton]:
+    """Frames that have left and right exchanged for some time, as of somebody who has turned the back to a camera."""
+    return [
+        each.mirrored() if begin < (each.stamp_ns - START_NS) / NANOSECONDS < end else each for each in person.skeletons
+    ]
+
+
+def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -> None:
+    person = somebody(3, 8.0)
+    worn = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05)
+    estimator = ExtendedKalmanFilter()
+    errors, covariances = followed(estimator, in_order(turned_away(person, 3.0, 7.0), worn.measure(person)), person)
+    assert estimator.counters["put_right"] > 100
+    assert np.degrees(np.abs(errors[:, 5]).max()) < 15.0
+    assert rms(errors[:, 3:6]) < 1.5 * rms(followed_unturned(person, worn)[:, 3:6])
+    assert np.linalg.eigvalsh(covariances[-1])[0] > 0.0
+
+    # one that knows nothing but the camera cannot tell
+    alone = ExtendedKalmanFilter()
+    errors, _ = followed(alone, turned_away(person, 3.0, 7.0), person)
+    assert alone.counters["put_right"] == 0
+    assert np.degrees(np.abs(errors[:, 5]).max()) > 90.0
+
+
+def followed_unturned(person: Person, worn: Source) -> FloatArray:
+    return followed(ExtendedKalmanFilter(), in_order(person.skeletons, worn.measure(person)), person)[0]
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_filter_that_began_turned_round_does_not_put_right_what_is(seed: int) -> None:
+    """Twisted as its arms would have to be, and pointing to where the others are seen, it takes frames as they are."""
+    person = somebody(seed, 8.0)
+    worn = [Source(f"forearm_{side}", (0.02, 0.0, 0.02)) for side in ("left", "right")]
+    events = in_order(turned_away(person, -1.0, 1.0), *(each.measure(person) for each in worn))
+    errors, _ = followed(ExtendedKalmanFilter(), events, person, 5.0)
+    assert np.degrees(np.abs(errors[:, 5]).max()) < 45.0  # turned round it would be 180
+
+
 def arm_bent_to_the_wrong_side(seconds: float) -> list[Skeleton]:
     """What a camera shows of a straight right arm, held out to the side."""
     seen = out_to_the_side(elbow=25.0, twist=125.0)

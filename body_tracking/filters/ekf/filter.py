@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from body_tracking.filters.ekf.displacement import Displacement
+from body_tracking.filters.ekf.facing import Facing
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.orientations import OrientationUpdate
 from body_tracking.filters.ekf.output import Output
@@ -72,6 +73,7 @@ class ExtendedKalmanFilter:
                 "orientations_late",
                 "orientations_refused",
                 "slips",
+                "put_right",
             ),
             0,
         )
@@ -92,6 +94,7 @@ class ExtendedKalmanFilter:
             p,
             self.counters,
         )
+        self._facing = Facing(space, self.counters)
         self._output = Output(space, self._displacement, p)
         self.reset()
 
@@ -452,6 +455,9 @@ class ExtendedKalmanFilter:
                 return anew.but(sensors=state.sensors, unplaced=state.unplaced)
         state = self._motion.predicted(state, measurement.stamp_ns)
         if state.sources.names:
+            state, skeleton = self._facing.put_right(state, measurement.skeleton)
+            if skeleton is not measurement.skeleton:
+                measurement = self._measurement(skeleton, measurement.sensor)
             measurement = self._orientations.without_thumbs(state, measurement)
         try:
             return self._skeletons.taken(state, measurement)

@@ -134,6 +134,8 @@ class State(Changeable):
         sources: of orientations.
         oriented_ns: stamp of the last accepted orientation.
         unplaced: started by orientations: nothing tells where the base is.
+        doubt: faded logarithm of how much likelier frames are as seen than with left and right exchanged, of those
+            that contradict the state.
     """
 
     stamp_ns: int
@@ -164,6 +166,7 @@ class State(Changeable):
     sources: Sources = NOBODY
     oriented_ns: int = 0
     unplaced: bool = False
+    doubt: float = 0.0
 
     def cross(self, name: str) -> SingleArray | None:
         """(85, 61) of ``crosses``, those of one sensor; None for zero."""

@@ -1,0 +1,114 @@
+"""Frames of a body that a camera takes to face it, while arms whose orientation is measured tell that it does not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.kinematics.model import Posture
+from body_tracking.sides import agree, headings_of, put_right
+from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
+
+_IMPROBABLE = 20.0
+"""Squared normalised distance of the twists of both arms from the middle of their ranges (chi-square with 4 degrees of
+freedom) that one of 2000 poses has: rather than that, the filter is wrong about which way the person faces."""
+_TWISTS = ("shoulder_z", "forearm_pronation")
+_SPEAKING_NS = NANOSECONDS // 4
+"""A source that is silent for longer tells nothing."""
+_LIMBS = {"upper_arm": ("SHOULDER", "ELBOW"), "forearm": ("ELBOW", "WRIST")}
+_DIRECTION_STDDEV = 0.35
+"""Radians by which a camera errs in where a limb points."""
+_FADE = 0.95
+"""Share of a doubt that a frame later is left: it lasts for two thirds of a second."""
+_MOST, _DOUBTED = 1.0, 10.0
+"""Logarithms of a ratio of likelihoods: what one frame says at most, as the next errs alike, and what decides."""
+
+
+class Facing:
+    """Exchanges left and right of frames that contradict the state.
+
+    A Kinect takes every body to face it, and exchanges left and right of one that has turned away. A filter that has
+    followed the turn knows better. One that knows cameras alone may have been wrong from the beginning; where the
+    orientation of an arm is measured it is told so: the arms would have to be twisted as none is, or that arm points
+    where the other one is seen to.
+
+    Args:
+        space: of the states.
+        counters: of the filter; counts ``put_right``.
+    """
+
+    def __init__(self, space: StateSpace, counters: dict[str, int]) -> None:
+        self._space, self._counters = space, counters
+        self._twists: BoolArray = np.array([name.startswith(_TWISTS) for name in space.model.coordinate_names[6:]])
+        self._ends = {
+            number: tuple(Joint[f"{joint}_{side.upper()}"] for joint in _LIMBS[limb])
+            for number, name in enumerate(space.model.segment_names)
+            for limb, _, side in [name.rpartition("_")]
+            if limb in _LIMBS
+        }
+
+    def put_right(self, state: State, skeleton: Skeleton) -> tuple[State, Skeleton]:
+        """A frame with left and right as they are believed.
+
+        Args:
+            state: of the frame's time.
+            skeleton: in the state's frame of reference.
+
+        Returns:
+            The state with what the frame says of it, and the same frame where both have the same sense, no source
+            speaks, or the state is doubted; else with left and right of the upper body, the lower, or both exchanged,
+            or without these where they are seen across.
+        """
+        speaking = state.stamp_ns - state.sources.stamps < _SPEAKING_NS
+        if not speaking.any():
+            return state, skeleton
+        posture = self._space.model.forward(state.q, state.lengths)
+        expected = np.full((N_JOINTS, 3), np.nan)
+        expected[self._space.model.joints] = posture.positions
+        believed, seen = headings_of(expected), headings_of(skeleton.positions)
+        if agree(seen, believed):
+            return (state.but(doubt=_FADE * state.doubt) if state.doubt else state), skeleton
+        doubt = _FADE * state.doubt + self._evidence(posture, state.sources.segments[speaking], skeleton)
+        state = state.but(doubt=max(doubt, 0.0))
+        if doubt > _DOUBTED or self._is_improbable(state):
+            return state, skeleton
+        self._counters["put_right"] += 1
+        points, states, factors = skeleton.positions.copy(), skeleton.states.copy(), np.ones(N_JOINTS)
+        put_right(seen, believed, points, factors, states, Counter())
+        states[np.isinf(factors)] = 0
+        covariances = skeleton.covariances
+        if covariances is not None:
+            exchanged = np.isfinite(factors) & (factors != 1.0)
+            covariances = covariances.copy()
+            covariances[exchanged] = factors[exchanged, None, None] * covariances[MIRROR[exchanged]]
+        return state, replace(skeleton, positions=points, states=states, covariances=covariances)
+
+    def _evidence(self, posture: Posture, segments: IntArray, skeleton: Skeleton) -> float:
+        """Logarithm of how much likelier limbs whose orientation is measured are as seen than exchanged."""
+        evidence = 0.0
+        for number in segments.tolist():
+            if number not in self._ends:
+                continue
+            axis = -posture.rotations[number, :, 2]
+            start, end = self._ends[number]
+            as_seen, exchanged = (
+                _angle(axis, skeleton.positions[b] - skeleton.positions[a])
+                for a, b in ((start, end), (MIRROR[start], MIRROR[end]))
+            )
+            if np.isfinite(as_seen + exchanged):
+                evidence += (exchanged**2 - as_seen**2) / (2.0 * _DIRECTION_STDDEV**2)
+        return float(np.clip(evidence, -_MOST, _MOST))
+
+    def _is_improbable(self, state: State) -> bool:
+        """Whether arms are as twisted as they come to be where the body is turned round."""
+        ranges = self._space.ranges
+        away = (ranges.values(state.q) - ranges.centre)[self._twists] / ranges.stddev[self._twists]
+        return float(away @ away) > _IMPROBABLE
+
+
+def _angle(axis: FloatArray, direction: FloatArray) -> float:
+    """Radians between a unit vector and another one; NaN where that is not known."""
+    return float(np.arctan2(np.linalg.norm(np.cross(axis, direction)), axis @ direction))
