@@ -63,25 +63,6 @@ MIN_STDDEV = 0.002
 
 
 @dataclass(frozen=True, slots=True)
-class ExpectedClock:
-    """What is known of a clock without any motion.
-
-    Attributes:
-        offset: sensor clock minus reference clock, against the base of the fit, seconds.
-        at: time since the anchor at which it is so, seconds.
-        stddev: of the offset, seconds; by default that of times of receipt.
-        drift: seconds per second.
-        drift_stddev: of the drift.
-    """
-
-    offset: float
-    at: float
-    stddev: float = RECEIPT_PRIOR
-    drift: float = 0.0
-    drift_stddev: float = DRIFT_PRIOR
-
-
-@dataclass(frozen=True, slots=True)
 class OffsetEstimate:
     """Sensor clock minus reference clock.
 
@@ -196,13 +177,15 @@ class ClockFit:
     correlates badly and says little.
     """
 
-    def __init__(self, centre: float) -> None:
+    def __init__(self, centre: float, expected: tuple[float, float] | None = None) -> None:
         """Look around an offset.
 
         Args:
             centre: seconds; rounded to the grid, so that nearly equal centres look at the same lags.
+            expected: offset in seconds that the times of receipt tell, and the time since the anchor at which they do,
+                if any. Not to be believed where it is farther than :data:`FINE_RANGE` from the centre.
         """
-        self._centre = centre
+        self._expected = expected if expected is not None and abs(expected[0] - centre) <= FINE_RANGE else None
         first = round((centre - FINE_RANGE) / FINE_STEP)
         self._lags = FINE_STEP * (first + np.arange(round(2 * FINE_RANGE / FINE_STEP) + 1))
         self._elapsed: list[float] = []
@@ -210,11 +193,6 @@ class ClockFit:
 
     def __len__(self) -> int:
         return len(self._elapsed)
-
-    @property
-    def middle(self) -> float:
-        """The mean time of the windows by how much moved in them, seconds; there is at least one."""
-        return float(np.average(self._elapsed, weights=[float(sums[1, 0]) + 1e-9 for sums in self._sums]))
 
     def add(
         self,
@@ -256,12 +234,8 @@ class ClockFit:
             del self._elapsed[0], self._sums[0]
         return True
 
-    def solve(self, expected: ExpectedClock | None = None) -> tuple[float, float, float] | None:
+    def solve(self) -> tuple[float, float, float] | None:
         """The clock so far.
-
-        Args:
-            expected: what is known without any motion. Not to be believed where it is farther than :data:`FINE_RANGE`
-                from the centre.
 
         Returns:
             offset at the anchor (seconds), drift (seconds per second), standard deviation of the offset at the mean
@@ -269,7 +243,8 @@ class ClockFit:
         """
         if not self._elapsed:
             return None
-        sums, middle = np.stack(self._sums), self.middle
+        sums = np.stack(self._sums)
+        middle = float(np.average(self._elapsed, weights=sums[:, 1, 0] + 1e-9))
         elapsed = np.array(self._elapsed) - middle
         rho = np.clip(sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-12)), 0.0, 0.999999)
         likelihood = -0.5 * sums[:, 3] / SAMPLE_TIME * np.log1p(-(rho**2))
@@ -283,18 +258,16 @@ class ClockFit:
             at: FloatArray = values[rows, left] + (place - left) * (values[rows, left + 1] - values[rows, left])
             return at
 
-        # The prior of the offset: 1 / variance, and its time from the middle.
-        trust, at, prior = 0.0, 0.0, ExpectedClock(0.0, 0.0)
-        if expected is not None and abs(expected.offset - self._centre) <= FINE_RANGE:
-            trust, at, prior = expected.stddev**-2, expected.at - middle, expected
-        drift_trust = prior.drift_stddev**-2
+        # The prior of the offset: 1 / variance, the offset, and its time from the middle.
+        trust, expected, at = 0.0, 0.0, 0.0
+        if self._expected is not None:
+            trust, expected, at = RECEIPT_PRIOR**-2, self._expected[0], self._expected[1] - middle
         drifts = DRIFT_STEP * np.arange(-DRIFT_STEPS, DRIFT_STEPS + 1)
         # On the coarse grid each window is shifted by whole lags.
         shifts = np.rint(drifts[:, None] * elapsed / FINE_STEP).astype(np.intp)
         places = np.clip(np.arange(last + 1) + shifts[..., None], 0, last)
-        total = likelihood[rows[None, :, None], places].sum(axis=1)
-        total -= 0.5 * drift_trust * (drifts[:, None] - prior.drift) ** 2
-        total -= 0.5 * trust * (self._lags + drifts[:, None] * at - prior.offset) ** 2
+        total = likelihood[rows[None, :, None], places].sum(axis=1) - 0.5 * (drifts[:, None] / DRIFT_PRIOR) ** 2
+        total -= 0.5 * trust * (self._lags + drifts[:, None] * at - expected) ** 2
         best = np.unravel_index(int(np.argmax(total)), total.shape)
         drift, offset = float(drifts[best[0]]), float(self._lags[best[1]])
         # Newton's method on the smoothed likelihood, from the best point of the grid.
@@ -304,9 +277,9 @@ class ClockFit:
         hessian = np.zeros((2, 2))
         for _ in range(20):
             g, h = along(slope, offset, drift), along(bend, offset, drift)
-            off = trust * (offset + drift * at - prior.offset)
-            gradient = np.array([g.sum() - off, g @ elapsed - drift_trust * (drift - prior.drift) - off * at])
-            hessian = np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2 - drift_trust]])
+            off = trust * (offset + drift * at - expected)
+            gradient = np.array([g.sum() - off, g @ elapsed - drift / DRIFT_PRIOR**2 - off * at])
+            hessian = np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2 - DRIFT_PRIOR**-2]])
             hessian -= trust * np.array([[1.0, at], [at, at**2]])
             if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
                 return None

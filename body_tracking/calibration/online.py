@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, ExpectedClock, correlate_clocks
+from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
 from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
 from body_tracking.calibration.result import (
@@ -57,12 +57,7 @@ CLOCK_WINDOW_NS = 5 * NANOSECONDS
 """Length of the windows of motion that each tell the offset of the clock."""
 
 MOVED_SIGMAS = 5.0
-"""A sensor has been moved, or its clock set, when its pose or clock is this many standard deviations from the saved
-one."""
-
-SAVED_DRIFT = 50e-6
-"""Standard deviation of the drift of a clock from what was saved of it, 1: quartz follows the temperature. By it, what
-was saved of an offset says less than the times of receipt after a quarter of an hour."""
+"""A sensor has been moved when its pose is this many standard deviations from the saved one."""
 
 NO_POSE_AFTER = 8.0
 """Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
@@ -265,16 +260,10 @@ class _Sensor:
         self.turned = 0.0
         self.forget()
 
-    def note_clock(self, stddev: float) -> None:
-        """How well the clock is known, seconds."""
-        self.clock_stddev = stddev
-        self.quality = replace(self.quality, clock_stddev=stddev)
-
     def forget(self) -> None:
         """Start estimating anew; what is published stays."""
         self.clock_guessed = False
         self.clock_saved = False
-        self.saved_clock: ExpectedClock | None = None  # against no base: of the reference's time
         self.clock_received = False
         self.received: tuple[int, int] | None = None  # offset by the times of receipt, and the reference time of it
         self.clock_locked = False
@@ -402,7 +391,7 @@ class OnlineCalibration:
             if other.clock_received and not other.clock_locked:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
-                self._follow_clock(name, other, horizon)
+                self._follow_clock(other, horizon)
             self._estimate(name, other)
 
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
@@ -418,14 +407,10 @@ class OnlineCalibration:
             offset = GUESS_GRID * round(guess / GUESS_GRID)
             other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
         else:
-            saved, drift = other.clock, 1e-6 * other.clock.drift_ppm
-            other.clock = ClockModel(saved.to_sensor(self._anchor) - self._anchor, saved.drift_ppm, self._anchor)
+            other.clock = ClockModel(
+                other.clock.to_sensor(self._anchor) - self._anchor, other.clock.drift_ppm, self._anchor
+            )
             other.clock_saved = True
-            # since it was saved it may have drifted otherwise than it did then
-            age = abs(self._anchor - saved.anchor_ns) / NANOSECONDS
-            stddev = float(np.hypot(other.quality.clock_stddev, SAVED_DRIFT * age))
-            if stddev < RECEIPT_PRIOR:
-                other.saved_clock = ExpectedClock(other.clock.offset, 0.0, stddev, drift, SAVED_DRIFT)
         other.clock_guessed = True
         return True
 
@@ -445,12 +430,9 @@ class OnlineCalibration:
         other.clock_received = True
         offset = round(RECEIPT_GRID * round((own - theirs) / NANOSECONDS / RECEIPT_GRID) * NANOSECONDS)
         other.received = offset, (first + last) // 2 - offset
-        other.note_clock(RECEIPT_PRIOR)
+        other.clock_stddev = RECEIPT_PRIOR
         if other.clock_saved and abs(first - other.clock.to_reference(first) - offset) < FINE_RANGE * NANOSECONDS:
-            if other.saved_clock is not None:
-                other.note_clock(other.saved_clock.stddev)
             return  # a clock that was calibrated is better, where it has not drifted away since
-        other.saved_clock = None
         other.clock = ClockModel(offset, 0.0, other.clock.anchor_ns)
         self._pair_anew(other, horizon)
         self._changed = True
@@ -499,7 +481,7 @@ class OnlineCalibration:
             self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
-                other.quality = SensorQuality(residual=residual, clock_stddev=other.clock_stddev, frames=FRAMES)
+                other.quality = SensorQuality(residual=residual, frames=FRAMES)
                 self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
         elif self.parameters.method == "robust" and self._moved_enough(other, horizon):
             # Nobody stands still: the movement itself is a start.
@@ -525,10 +507,9 @@ class OnlineCalibration:
             or found.margin < self.parameters.clock_margin
         ):
             return
-        if other.saved_clock is None or abs(found.offset) > FINE_RANGE:
-            other.saved_clock = None
-            offset_ns = other.clock.offset_ns + round(found.offset * NANOSECONDS)
-            other.clock = ClockModel(offset_ns, other.clock.drift_ppm, self._anchor)
+        other.clock = ClockModel(
+            other.clock.offset_ns + round(found.offset * NANOSECONDS), other.clock.drift_ppm, self._anchor
+        )
         other.clock_locked = True
         other.movement_since = self._now
         self.events.append(f"{name}: clock offset {other.clock.offset:+.2f} s found from the motion")
@@ -549,35 +530,15 @@ class OnlineCalibration:
         stamps = np.array([stamp - self._anchor - offset_ns for stamp in track.stamps[first:last]]) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
-    def _expected(self, other: _Sensor) -> ExpectedClock | None:
-        """What the times of receipt say of the offset, against the base of the fit."""
+    def _expected(self, other: _Sensor) -> tuple[float, float] | None:
+        """What the times of receipt say of the offset against the base of the fit, and when; seconds."""
         if other.received is None:
             return None
         offset, at = other.received
         assert self._anchor is not None
-        return ExpectedClock((offset - other.clock_base_ns) / NANOSECONDS, (at - self._anchor) / NANOSECONDS)
+        return (offset - other.clock_base_ns) / NANOSECONDS, (at - self._anchor) / NANOSECONDS
 
-    def _fitted_clock(self, name: str, other: _Sensor) -> tuple[float, float, float] | None:
-        """The clock by all the motion so far, and by what was saved of it, unless these contradict each other."""
-        assert other.clock_fit is not None
-        found = other.clock_fit.solve(self._expected(other))
-        if other.saved_clock is None:
-            return found
-        saved = replace(other.saved_clock, offset=other.saved_clock.offset - other.clock_base_ns / NANOSECONDS)
-        if found is not None and self._was_set(other.clock_fit.middle, found, saved):
-            self.events.append(f"the clock of {name} is no longer the one that was calibrated: it was set since")
-            other.saved_clock = None
-            return found
-        return other.clock_fit.solve(saved)
-
-    @staticmethod
-    def _was_set(at: float, found: tuple[float, float, float], saved: ExpectedClock) -> bool:
-        """Whether at a time the motion says of a clock what cannot be if what was saved of it is right."""
-        offset, drift, stddev = found
-        apart = offset + drift * at - (saved.offset + saved.drift * (at - saved.at))
-        return bool(abs(apart) > MOVED_SIGMAS * np.hypot(stddev, np.hypot(saved.stddev, saved.drift_stddev * at)))
-
-    def _follow_clock(self, name: str, other: _Sensor, horizon: int) -> None:
+    def _follow_clock(self, other: _Sensor, horizon: int) -> None:
         """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
         around = round(2 * FINE_RANGE * NANOSECONDS)
@@ -587,7 +548,7 @@ class OnlineCalibration:
             other.clock_window_end = stop
             if other.clock_fit is None:
                 other.clock_base_ns = other.clock.offset_ns
-                other.clock_fit = ClockFit(0.0)
+                other.clock_fit = ClockFit(0.0, self._expected(other))
             measured |= other.clock_fit.add(
                 (start + CLOCK_WINDOW_NS // 2 - self._anchor) / NANOSECONDS,
                 self._since_anchor(self._track, 0, start, stop),
@@ -598,11 +559,11 @@ class OnlineCalibration:
                     other.clock.to_sensor(stop + around),
                 ),
             )
-        found = self._fitted_clock(name, other) if measured else None
+        found = other.clock_fit.solve() if measured and other.clock_fit is not None else None
         if found is None:
             return
         other.clock = ClockModel(other.clock_base_ns + round(found[0] * NANOSECONDS), 1e6 * found[1], self._anchor)
-        other.note_clock(found[2])
+        other.clock_stddev = found[2]
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
         if abs(moved) > REPAIR_CLOCK:
@@ -738,7 +699,7 @@ class OnlineCalibration:
                     # The recording is still here as a whole: measure every window with what is known now.
                     other.clock_fit, other.clock_window_end = None, self._anchor
                 if other.clock_locked:
-                    self._follow_clock(name, other, self._now)
+                    self._follow_clock(other, self._now)
                     if self._remembers_all(other):
                         self._pair_anew(other, self._now)
                 self._pair(other, self._now)

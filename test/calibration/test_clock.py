@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, ExpectedClock, correlate_clocks
+from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
 from body_tracking.skeleton import FloatArray
 from walkers import walk
 
@@ -106,12 +106,12 @@ def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
     own, theirs = seen(0.0, 0.0, 60.0, 4), seen(0.02, 0.0, 60.0, 5)
 
     def off(expected: float | None, windows: int) -> tuple[float, float]:
-        fit = ClockFit(0.0)
+        fit = ClockFit(0.0, None if expected is None else (expected, 2.0))
         for start in 5.0 * np.arange(windows):
             window = (own[0] > start) & (own[0] <= start + 5.0)
             around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
             fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
-        found = fit.solve(None if expected is None else ExpectedClock(expected, 2.0))
+        found = fit.solve()
         assert found is not None
         return found[0], found[2]
 

@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.offline import WHOLE, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
+from body_tracking.calibration.result import CalibrationResult
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import about_y, frame, walk
@@ -323,50 +322,6 @@ def test_a_saved_clock_of_another_session_is_not_believed() -> None:
     for sensor, skeleton, received in stream(20.0, offset=-30.0):
         calibration.push(sensor, skeleton, received)
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
-
-
-def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_from_either_side() -> None:
-    """And, as quartz drifts, for no longer than it may be believed."""
-    views = around(np.radians([45.0, -80.0]).tolist())
-    recording = simulate(Setup("torso_twist", views, seconds=30.0, seed=4, standard=True))
-    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    names, true = tuple(clocks), clocks["kinect2"]
-    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    quality = SensorQuality(0.03, 0.005, 0.01, 0.002, 500)
-    last_ns = recording.frames[-1].skeletons[0].stamp_ns
-
-    def off(saved: ClockModel | None) -> tuple[float, float]:
-        calibration = OnlineCalibration(names)
-        if saved is not None:
-            result = CalibrationResult(names[0], poses, {**clocks, "kinect2": saved}, dict.fromkeys(names, quality))
-            calibration.load(result)
-        for each in recording.frames:
-            calibration.push(each.sensor, each.skeletons[0], each.received_ns)
-        result = calibration.result()
-        apart = result.clocks["kinect2"].to_sensor(last_ns) - true.to_sensor(last_ns)
-        return apart / NANOSECONDS, result.quality["kinect2"].clock_stddev
-
-    error, stddev = off(None)
-    assert abs(error) > 0.01 and stddev > 0.005
-    kept, kept_stddev = off(true)
-    assert abs(kept) < 0.002 and kept_stddev < 0.005
-    # it was saved two days ago: what it says is no better than the times of receipt
-    then_ns = true.anchor_ns - 2 * 86_400 * NANOSECONDS
-    old = ClockModel(true.to_sensor(then_ns) - then_ns, true.drift_ppm, then_ns)
-    assert off(old) == pytest.approx((error, stddev), abs=1e-3)
-
-
-def test_a_clock_that_was_set_since_it_was_saved_is_found_anew() -> None:
-    saved = run(stream(30.0))[0].result()
-    saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    calibration.load(saved)
-    for sensor, skeleton, received in stream(40.0, offset=0.52):  # by less than times of receipt can tell
-        calibration.push(sensor, skeleton, received)
-    assert any("was set since" in event for event in calibration.events)
-    result = calibration.result()
-    within = 3.0 * result.quality["kinect2"].clock_stddev
-    assert result.clocks["kinect2"].offset == pytest.approx(0.52, abs=within)
 
 
 def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:
