@@ -14,7 +14,7 @@ about their own axes in world and of the model's pronation (degrees), and share 
 within 1.96 stated standard deviations.
 
 A third row is no Kinect: one that is wrong by nothing but where it takes the joints' centres to be
-(``KinectErrors.offsets_alone``), with the same inertial sensors. That is about the least that a method can err by.
+(``KinectErrors.offsets_alone``), with the same inertial sensors: about what is in reach of who knows nothing of these.
 
 The rules and defaults for orientations were chosen while looking at the person of seed 1000 in reaching, random,
 arm_raises, punching, hair_combing and standing_still, mostly at an azimuth of 45 degrees, and at those of 4000 and 4001

@@ -12,8 +12,8 @@ angles    RMSE in degrees of the angles of ``kinematics.positional`` against tho
           shoulder elevation and plane (4), elbow flexion (2). Trunk angles need hips, which the thesis's model has not:
           it is given those of its own fixed base, so that its trunk angles are its model's.
 offsets   ``offsets alone`` is no method: a sensor that is wrong by nothing but where it takes the joints' centres to
-          be, constantly beside an anatomist's (``KinectErrors.offsets_alone``). No method can know that; what it errs
-          by is about the least that one can come to.
+          be, constantly beside an anatomist's (``KinectErrors.offsets_alone``). Methods that know nothing of these
+          offsets come to about as much, one that knows a body's proportions to somewhat less.
 
 The bar: in the torso twist, errors of ``ekf`` at most 60 % of those of ``schlagenhauf_ekf``, positions (RMS, in world)
 and angles alike. ``--more N`` draws N recordings of each motion besides, of other people with other errors: one

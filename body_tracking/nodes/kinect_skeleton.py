@@ -71,6 +71,7 @@ class KinectSkeleton(GraphNode):
         """Open the source; a thread of its own waits for its frames."""
         given: dict[str, Any] = dict(self.values)
         self.failure = ""
+        self.untold: dict[str, str] = {}
         sensor = check_sensor_name(given["sensor"])
         settings = SourceSettings(
             sensor,
@@ -111,16 +112,26 @@ class KinectSkeleton(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether it plays, ended or failed, or what keeps frames from coming."""
-        problem, ended, counters = "", False, dict[str, object]()
-        try:
-            problem, ended, counters = self.source.problem, self.source.ended, dict(self.source.counters)
-        except Exception as error:
-            if not self.failure:
-                self.failed(error)
+        problem = self.told("problem", "")
         if problem:
             self.log_seldom("problem", problem, _PROBLEM_PERIOD_S)
-        text = self.failure or problem or ("ended" if ended else "streaming")
-        return (2 if self.failure else 1 if problem else 0), text, counters
+        text = self.failure or problem or ("ended" if self.told("ended", False) else "streaming")
+        counters = dict(self.told("counters", {}))
+        return (
+            (2 if self.failure else 1 if problem or self.untold else 0),
+            "; ".join([text, *self.untold.values()]),
+            counters,
+        )
+
+    def told(self, name: str, otherwise: Any) -> Any:
+        """What the source says of itself; where it raises, that is told for as long as it does, and frames go on."""
+        self.untold.pop(name, None)
+        try:
+            return getattr(self.source, name)
+        except Exception as error:
+            self.untold[name] = f"{name}: {described(error)}"
+            self.log_seldom(name, f"{self.untold[name]}\n{traceback.format_exc()}", _PROBLEM_PERIOD_S)
+            return otherwise
 
     def close(self) -> None:
         """Let the thread end."""

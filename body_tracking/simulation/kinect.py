@@ -179,7 +179,7 @@ class KinectErrors:
         check_fields(self, "simulated Kinect", SimulatedKinectError)
 
     def offsets_alone(self) -> KinectErrors:
-        """Only where they take the joints' centres to be, beside where an anatomist does: what no method can know."""
+        """Only where they take the joints' centres to be, beside where an anatomist does."""
         return replace(self.none(), anatomical=self.anatomical, offset=self.offset)
 
     @classmethod

@@ -366,7 +366,7 @@ def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
         running.environment |= installed(tmp_path, "mycamera:Mute")
         process = running.start("kinect_skeleton", backend="mine")
         assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("published") == "3", 60.0)
-        assert running.diagnostics["kinect_skeleton"][""] == "KeyError: 'temperature'"
+        assert running.diagnostics["kinect_skeleton"][""] == "streaming; counters: KeyError: 'temperature'"
         assert "in counters" in running.log("kinect_skeleton")
         assert stop(process) == 0
         assert "OSError: closed twice" in running.log("kinect_skeleton")
