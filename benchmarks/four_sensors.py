@@ -176,7 +176,7 @@ def running_graph(folder: Path, recording: SimulatedRecording, start: float) -> 
     names = [sensor.pose.sensor for sensor in recording.sensors]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500, 1.0) for name in names}
     save(CalibrationResult(names[0], poses, clocks, quality), calibration)
     values = {f"{name}_skeleton": {SECTION: {"file": str(bag), "start_time": start}} for name in names}
     file.write_text(yaml.safe_dump(values), encoding="utf-8")

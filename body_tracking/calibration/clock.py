@@ -7,8 +7,11 @@ not depend on where a sensor stands, so their correlation over time finds the of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import correlate1d, minimum_filter1d
 from scipy.signal import fftconvolve, savgol_filter
 
 from body_tracking.skeleton import BoolArray, FloatArray, IntArray
@@ -37,6 +40,9 @@ MAX_WINDOWS = 240
 SPAN = 4
 """Speeds are taken over this many frames: limbs move at up to about 5 Hz, what is faster is noise."""
 
+SMOOTHING = (0.0625, 0.25, 0.375, 0.25, 0.0625)
+"""Weights of neighbouring speeds."""
+
 MIN_JOINTS = 8
 """Joints that must be seen in both of two frames for their speed to count."""
 
@@ -60,6 +66,33 @@ SAMPLE_TIME = 0.1
 
 MIN_STDDEV = 0.002
 """No amount of motion tells the offset better than this, seconds: stamps jitter, and sensors smooth differently."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEstimate:
+    """Sensor clock minus reference clock: ``offset + drift (t - at)``, t in seconds since some anchor.
+
+    Attributes:
+        offset: seconds.
+        drift: seconds per second.
+        at: the time at which the errors of offset and drift have nothing to do with each other.
+        stddev: of the offset at that time, seconds; by default what times of receipt leave open.
+        drift_stddev: of the drift.
+    """
+
+    offset: float
+    drift: float = 0.0
+    at: float = 0.0
+    stddev: float = RECEIPT_PRIOR
+    drift_stddev: float = DRIFT_PRIOR
+
+    def offset_at(self, time: float) -> float:
+        """The offset at a time, seconds."""
+        return self.offset + self.drift * (time - self.at)
+
+    def stddev_at(self, time: float) -> float:
+        """And its standard deviation, seconds."""
+        return float(np.hypot(self.stddev, self.drift_stddev * (time - self.at)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +124,12 @@ def _speeds(stamps: FloatArray, positions: FloatArray) -> tuple[FloatArray, Floa
     value = np.log1p(5.0 * np.minimum(np.where(known, speed, 0.0), 5.0))
     # A joint that is not seen moves as the rest does on average.
     mean = value.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    return 0.5 * (stamps[SPAN:] + stamps[:-SPAN]), np.where(known, value, mean[:, None]), good
+    value = np.where(known, value, mean[:, None])
+    # Between two samples noise is halved, and it would draw the offset to where all are taken half-way: neighbours that
+    # have most of their noise in common do not.
+    value = correlate1d(value, SMOOTHING, axis=0, mode="nearest")
+    good = minimum_filter1d(good, len(SMOOTHING))
+    return 0.5 * (stamps[SPAN:] + stamps[:-SPAN]), value, good
 
 
 def _sample(series: tuple[FloatArray, FloatArray, BoolArray], at: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -175,17 +213,22 @@ class ClockFit:
     n / 2 log(1 / (1 - rho^2)) at its lag, the drift has a prior, and so has the offset where the times of receipt are
     known. No window has to decide alone, and one in which a sensor sees the body turned around, or nothing moves,
     correlates badly and says little.
+
+    Attributes:
+        LIKE: seconds of motion after which more of it says no more of the offset, though of the drift: what looks
+            different from either side does so again whenever it is done again. A twist that is seen from its side
+            moves an offset by up to 60 ms, for as long as somebody twists.
     """
 
-    def __init__(self, centre: float, expected: tuple[float, float] | None = None) -> None:
+    LIKE: ClassVar[float] = 60.0
+
+    def __init__(self, centre: float) -> None:
         """Look around an offset.
 
         Args:
             centre: seconds; rounded to the grid, so that nearly equal centres look at the same lags.
-            expected: offset in seconds that the times of receipt tell, and the time since the anchor at which they do,
-                if any. Not to be believed where it is farther than :data:`FINE_RANGE` from the centre.
         """
-        self._expected = expected if expected is not None and abs(expected[0] - centre) <= FINE_RANGE else None
+        self._centre = centre
         first = round((centre - FINE_RANGE) / FINE_STEP)
         self._lags = FINE_STEP * (first + np.arange(round(2 * FINE_RANGE / FINE_STEP) + 1))
         self._elapsed: list[float] = []
@@ -234,12 +277,15 @@ class ClockFit:
             del self._elapsed[0], self._sums[0]
         return True
 
-    def solve(self) -> tuple[float, float, float] | None:
+    def solve(self, expected: ClockEstimate | None = None) -> ClockEstimate | None:
         """The clock so far.
 
+        Args:
+            expected: what is known of it without this motion, if anything. Not to be believed where its offset is
+                farther than :data:`FINE_RANGE` from the centre.
+
         Returns:
-            offset at the anchor (seconds), drift (seconds per second), standard deviation of the offset at the mean
-            time of the windows (seconds); None while there is no motion or the best offset is at the grid's edge.
+            The clock; None while there is no motion or the best offset is at the grid's edge.
         """
         if not self._elapsed:
             return None
@@ -251,44 +297,72 @@ class ClockFit:
         rows = np.arange(len(elapsed))
         last = len(self._lags) - 1
 
-        def along(values: FloatArray, offset: float, drift: float) -> FloatArray:
-            """(windows,) of values (windows, lags) at each window's lag on a line, linear between the grid's."""
-            place = np.clip((offset + drift * elapsed - self._lags[0]) / FINE_STEP, 0, last - 1e-9)
-            left = place.astype(np.intp)
-            at: FloatArray = values[rows, left] + (place - left) * (values[rows, left + 1] - values[rows, left])
-            return at
+        def places_on(offset: float, drift: float) -> tuple[IntArray, FloatArray]:
+            """Where each window's lag on a line lies in the grid: the point before it, and how far after that."""
+            place = np.clip(offset + drift * elapsed, self._lags[0], self._lags[-1])
+            before = np.minimum(((place - self._lags[0]) / FINE_STEP).astype(np.intp), last - 1)
+            return before, place - self._lags[before]
 
-        # The prior of the offset: 1 / variance, the offset, and its time from the middle.
-        trust, expected, at = 0.0, 0.0, 0.0
-        if self._expected is not None:
-            trust, expected, at = RECEIPT_PRIOR**-2, self._expected[0], self._expected[1] - middle
+        # The prior: 1 / variance of the offset and its time from the middle, 1 / variance of the drift.
+        trust, at, prior = 0.0, 0.0, ClockEstimate(0.0)
+        if expected is not None and abs(expected.offset - self._centre) <= FINE_RANGE:
+            trust, at, prior = expected.stddev**-2, expected.at - middle, expected
+        drift_trust = prior.drift_stddev**-2
         drifts = DRIFT_STEP * np.arange(-DRIFT_STEPS, DRIFT_STEPS + 1)
-        # On the coarse grid each window is shifted by whole lags.
+        # Newton's method on the smoothed likelihood, from the best point of a coarse grid, on which each window is
+        # shifted by whole lags.
+        width = 2 * round(PEAK_WIDTH / FINE_STEP) + 1
+        slope, bend = (savgol_filter(likelihood, width, 2, deriv=deriv, delta=FINE_STEP, axis=1) for deriv in (1, 2))
+        uphill = CubicSpline(self._lags, slope, axis=1)
+        smooth = uphill.antiderivative()(self._lags)
         shifts = np.rint(drifts[:, None] * elapsed / FINE_STEP).astype(np.intp)
         places = np.clip(np.arange(last + 1) + shifts[..., None], 0, last)
-        total = likelihood[rows[None, :, None], places].sum(axis=1) - 0.5 * (drifts[:, None] / DRIFT_PRIOR) ** 2
-        total -= 0.5 * trust * (self._lags + drifts[:, None] * at - expected) ** 2
+        total = smooth[rows[None, :, None], places].sum(axis=1)
+        total -= 0.5 * drift_trust * (drifts[:, None] - prior.drift) ** 2
+        total -= 0.5 * trust * (self._lags + drifts[:, None] * at - prior.offset) ** 2
         best = np.unravel_index(int(np.argmax(total)), total.shape)
         drift, offset = float(drifts[best[0]]), float(self._lags[best[1]])
-        # Newton's method on the smoothed likelihood, from the best point of the grid.
-        width = 2 * round(PEAK_WIDTH / FINE_STEP) + 1
-        slope = savgol_filter(likelihood, width, 2, deriv=1, delta=FINE_STEP, axis=1)
-        bend = savgol_filter(likelihood, width, 2, deriv=2, delta=FINE_STEP, axis=1)
-        hessian = np.zeros((2, 2))
+        bounds = trust * np.array([[1.0, at], [at, at**2]]) + np.diag([0.0, drift_trust])  # what is expected
+        told = np.zeros(2)
         for _ in range(20):
-            g, h = along(slope, offset, drift), along(bend, offset, drift)
-            off = trust * (offset + drift * at - expected)
-            gradient = np.array([g.sum() - off, g @ elapsed - drift / DRIFT_PRIOR**2 - off * at])
-            hessian = np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2 - DRIFT_PRIOR**-2]])
-            hessian -= trust * np.array([[1.0, at], [at, at**2]])
-            if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
-                return None
-            step = -np.linalg.solve(hessian, gradient)
+            piece, x = places_on(offset, drift)
+            a, b, c, d = uphill.c[:, piece, rows]
+            g, h = ((a * x + b) * x + c) * x + d, (3.0 * a * x + 2.0 * b) * x + c
+            told = np.array([g.sum(), g @ elapsed])
+            motion = -np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2]])
+            off = trust * (offset + drift * at - prior.offset)
+            draws = told - np.array([off, off * at + drift_trust * (drift - prior.drift)])
+            # Between the points of the grid it can bend upwards: uphill even so.
+            curvatures, axes = np.linalg.eigh(motion + bounds)
+            step = axes @ ((axes.T @ draws) / np.maximum(np.abs(curvatures), 1e-9))
             step *= min(1.0, 0.5 * PEAK_WIDTH / max(abs(step[0]), 1e-12), DRIFT_STEP / max(abs(step[1]), 1e-12))
             offset, drift = offset + float(step[0]), drift + float(step[1])
             if abs(step[0]) < 1e-6:
                 break
         if not self._lags[0] + PEAK_WIDTH < offset < self._lags[-1] - PEAK_WIDTH or abs(drift) > drifts[-1]:
             return None
-        stddev = float(np.sqrt(np.linalg.inv(-hessian)[0, 0]))
-        return offset - drift * middle, drift, float(np.hypot(stddev, MIN_STDDEV))
+        piece, x = places_on(offset, drift)
+        h = bend[rows, piece] + x / FINE_STEP * (bend[rows, piece + 1] - bend[rows, piece])
+        motion = -np.array([[h.sum(), h @ elapsed], [h @ elapsed, h @ elapsed**2]])
+        # An error that all windows have in common, of the variance T / LIKE times that of the offset by the motion:
+        # by the formula of Sherman and Morrison, and the estimate is drawn to what is expected by as much.
+        share = np.zeros(2)
+        if motion[0, 0] > 0.0:
+            share = motion[0] / (motion[0, 0] * (1.0 + self.LIKE / float(sums[:, 3, 0].sum())))
+        information = motion + bounds - np.outer(share, motion[0])
+        if np.linalg.eigvalsh(information)[0] <= 0.0:
+            return None
+        offset, drift = np.array([offset, drift]) - np.linalg.solve(information, share * told[0])
+        (variance, both), (_, drift_variance) = np.linalg.inv(information)
+        apart = -both / drift_variance  # from the middle to where the two errors are independent
+        variance -= both**2 / drift_variance
+        # What the motion says of the drift counts as much less as it does of the offset for the jitter.
+        jitter = variance / (variance + MIN_STDDEV**2)
+        drift_trust += max(1.0 / drift_variance - drift_trust, 0.0) * jitter
+        return ClockEstimate(
+            float(offset + drift * apart),
+            float(drift),
+            float(middle + apart),
+            float(np.hypot(np.sqrt(variance), MIN_STDDEV)),
+            float(drift_trust**-0.5),
+        )

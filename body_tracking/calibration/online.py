@@ -9,17 +9,25 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
+from body_tracking.calibration.clock import (
+    DRIFT_PRIOR,
+    FINE_RANGE,
+    RECEIPT_PRIOR,
+    ClockEstimate,
+    ClockFit,
+    correlate_clocks,
+)
 from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
 from body_tracking.calibration.result import (
     CalibrationResult,
     ClockModel,
+    KnownClock,
     SensorPose,
     SensorQuality,
     level_pose,
@@ -56,8 +64,16 @@ REPAIR_CLOCK = 0.004
 CLOCK_WINDOW_NS = 5 * NANOSECONDS
 """Length of the windows of motion that each tell the offset of the clock."""
 
+REBASE_CLOCK = 0.05
+"""The offset is looked for around another line when the clock has gone this far from the one so far, seconds."""
+
 MOVED_SIGMAS = 5.0
-"""A sensor has been moved when its pose is this many standard deviations from the saved one."""
+"""A sensor has been moved, or its clock set, when its pose or clock is this many standard deviations from the saved
+one."""
+
+WANDER_PPM = 50.0
+"""Standard deviation by which the drift of a clock changes after it was saved, parts per million: quartz follows the
+temperature."""
 
 NO_POSE_AFTER = 8.0
 """Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
@@ -255,21 +271,27 @@ class _Sensor:
         self.rotation: FloatArray | None = None  # as published, slewing toward the target
         self.translation: FloatArray = np.zeros(3)
         self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
-        self.clock = ClockModel()
-        self.quality = SensorQuality()
+        self.known = KnownClock()  # the clock in use
+        self.loaded: KnownClock | None = None  # from another session
+        self.quality = SensorQuality()  # but for the clock
         self.turned = 0.0
         self.forget()
 
+    @property
+    def clock(self) -> ClockModel:
+        """The clock in use."""
+        return self.known.model
+
     def forget(self) -> None:
         """Start estimating anew; what is published stays."""
+        self.known = KnownClock(self.clock)
         self.clock_guessed = False
         self.clock_saved = False
-        self.clock_received = False
-        self.received: tuple[int, int] | None = None  # offset by the times of receipt, and the reference time of it
+        self.clock_expected: KnownClock | None = None  # from before the motion that the fit has seen
+        self.received: KnownClock | None = None  # by the times of receipt
         self.clock_locked = False
+        self.clock_base = self.clock  # what the fit is relative to
         self.clock_fit: ClockFit | None = None
-        self.clock_base_ns = 0
-        self.clock_stddev = float("inf")
         self.clock_window_end: int | None = None
         self.paired_clock = self.clock
         self.pairs = Coverage(self.parameters.pairs_per_place, self.parameters.capacity)
@@ -278,6 +300,12 @@ class _Sensor:
         self.next_estimate = 0
         self.estimated = False
         self.movement_since: int | None = None
+
+
+def _clock_from(sensor: _Sensor) -> str:
+    if sensor.clock_locked:
+        return "motion"
+    return "saved" if sensor.clock_saved else "receipt"
 
 
 class OnlineCalibration:
@@ -332,6 +360,7 @@ class OnlineCalibration:
         if other is not None and not other.track.push(skeleton, received_ns):
             self.events.append(f"the clock of {sensor} went back: looking for its offset again")
             other.track = _Track()
+            other.loaded = None
             other.forget()
             other.track.push(skeleton, received_ns)
         return []
@@ -372,8 +401,8 @@ class OnlineCalibration:
     def _follow(self, name: str, other: _Sensor, horizon: int) -> None:
         if not other.clock_guessed and not self._guess_clock(name, other):
             return
-        if not other.clock_received:
-            self._receive_clock(other, horizon)
+        if other.received is None:
+            self._receive_clock(name, other, horizon)
         own_horizon = other.clock.to_sensor(horizon)
         other.track.forget_before(own_horizon - round(self.parameters.history * NANOSECONDS))
         if not other.track.stamps or other.track.stamps[-1] < own_horizon - 2 * NANOSECONDS:
@@ -388,10 +417,10 @@ class OnlineCalibration:
         if other.started is None:
             self._start(name, other, horizon)
         if self.parameters.method == "robust":
-            if other.clock_received and not other.clock_locked:
+            if other.received is not None and not other.clock_locked:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
-                self._follow_clock(other, horizon)
+                self._follow_clock(name, other, horizon)
             self._estimate(name, other)
 
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
@@ -400,21 +429,27 @@ class OnlineCalibration:
         own, theirs = (np.median(track.delays[:GUESS_FRAMES]) for track in (self._track, other.track))
         guess = float(own - theirs) / NANOSECONDS
         assert self._anchor is not None
-        if other.rotation is None or abs(other.clock.offset - guess) > CLOCK_STEP:
+        if other.rotation is None or abs(other.clock.anchored_at(self._anchor).offset - guess) > CLOCK_STEP:
             if other.rotation is not None:
                 self.events.append(f"the clock of {name} is not the one that was calibrated: looking for its offset")
                 self._changed = True
             offset = GUESS_GRID * round(guess / GUESS_GRID)
-            other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
+            other.known = KnownClock(ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor))
+            other.loaded = None
+        elif other.loaded is None:
+            other.clock_saved = True  # of this session, whose motion is not to count twice
         else:
-            other.clock = ClockModel(
-                other.clock.to_sensor(self._anchor) - self._anchor, other.clock.drift_ppm, self._anchor
-            )
-            other.clock_saved = True
+            other.known = other.clock_expected = self._carried(other.loaded)
+            other.clock_saved = other.known.stddev < RECEIPT_PRIOR
         other.clock_guessed = True
         return True
 
-    def _receive_clock(self, other: _Sensor, horizon: int) -> None:
+    def _carried(self, loaded: KnownClock) -> KnownClock:
+        """What a clock of another session says of the beginning of this one."""
+        assert self._anchor is not None
+        return loaded.carried_to(self._anchor, WANDER_PPM)
+
+    def _receive_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         """Better than the guess: the delays over some seconds, of the frames that both sensors took in them."""
         stamps = other.track.stamps
         start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
@@ -427,13 +462,17 @@ class OnlineCalibration:
         theirs = other.track.delay(first, last)
         if own is None or theirs is None:
             return
-        other.clock_received = True
         offset = round(RECEIPT_GRID * round((own - theirs) / NANOSECONDS / RECEIPT_GRID) * NANOSECONDS)
-        other.received = offset, (first + last) // 2 - offset
-        other.clock_stddev = RECEIPT_PRIOR
+        middle = (first + last) // 2 - offset
+        other.received = KnownClock(ClockModel(offset, 0.0, middle), RECEIPT_PRIOR, 1e6 * DRIFT_PRIOR)
         if other.clock_saved and abs(first - other.clock.to_reference(first) - offset) < FINE_RANGE * NANOSECONDS:
+            if other.clock_expected is None:
+                other.known = replace(other.received, model=other.clock.anchored_at(middle))
             return  # a clock that was calibrated is better, where it has not drifted away since
-        other.clock = ClockModel(offset, 0.0, other.clock.anchor_ns)
+        if other.clock_saved:
+            self._not_as_saved(name, other)
+        other.loaded = other.clock_expected = None
+        other.known = other.received
         self._pair_anew(other, horizon)
         self._changed = True
 
@@ -493,13 +532,13 @@ class OnlineCalibration:
     @staticmethod
     def _moved_enough(other: _Sensor, horizon: int) -> bool:
         """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
-        waited = other.received is not None and horizon - other.received[1] > NO_POSE_AFTER * NANOSECONDS
+        waited = other.received is not None and horizon - other.received.model.anchor_ns > NO_POSE_AFTER * NANOSECONDS
         return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         assert self._anchor is not None
-        own = self._since_anchor(self._track, 0, None, horizon)
-        theirs = self._since_anchor(other.track, other.clock.offset_ns, None, other.clock.to_sensor(horizon))
+        own = self._since_anchor(self._track, ClockModel(), None, horizon)
+        theirs = self._since_anchor(other.track, other.clock, None, other.clock.to_sensor(horizon))
         found = correlate_clocks(own, theirs, 0.0, self.parameters.clock_window)
         if (
             found is None
@@ -507,38 +546,70 @@ class OnlineCalibration:
             or found.margin < self.parameters.clock_margin
         ):
             return
-        other.clock = ClockModel(
-            other.clock.offset_ns + round(found.offset * NANOSECONDS), other.clock.drift_ppm, self._anchor
-        )
+        other.clock_base = replace(other.clock, offset_ns=other.clock.offset_ns + round(found.offset * NANOSECONDS))
+        if other.clock_expected is not None and abs(found.offset) > FINE_RANGE:
+            self._not_as_saved(name, other)
         other.clock_locked = True
         other.movement_since = self._now
-        self.events.append(f"{name}: clock offset {other.clock.offset:+.2f} s found from the motion")
-        self._pair_anew(other, horizon)  # the pairs so far were made with the guess
+        self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
+        if other.clock_expected is None:
+            other.known = replace(other.known, model=other.clock_base)
+            self._pair_anew(other, horizon)  # the pairs so far were made with the guess
         # Windows lie on multiples of their length, whenever the clock was found.
         first = (self._track.stamps[0] - self._anchor) // CLOCK_WINDOW_NS
         other.clock_window_end = self._anchor + first * CLOCK_WINDOW_NS
         self._changed = True
 
     def _since_anchor(
-        self, track: _Track, offset_ns: int, start: int | None, stop: int
+        self, track: _Track, clock: ClockModel, start: int | None, stop: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Stamps (n,) in seconds since the anchor, less an offset, and positions, of the frames in (start, stop]."""
+        """Of the frames in (start, stop] of a clock: reference seconds (n,) since the anchor, and positions."""
         # Stamps since an epoch have no room for microseconds in a float.
         first = 0 if start is None else bisect_right(track.stamps, start)
         last = bisect_right(track.stamps, stop)
         assert self._anchor is not None
-        stamps = np.array([stamp - self._anchor - offset_ns for stamp in track.stamps[first:last]]) / NANOSECONDS
+        since = [clock.to_reference(stamp) - self._anchor for stamp in track.stamps[first:last]]
+        stamps = np.array(since) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
-    def _expected(self, other: _Sensor) -> tuple[float, float] | None:
-        """What the times of receipt say of the offset against the base of the fit, and when; seconds."""
-        if other.received is None:
-            return None
-        offset, at = other.received
+    def _as_estimate(self, known: KnownClock, base: ClockModel) -> ClockEstimate:
+        """A clock against another one, in seconds since the anchor."""
         assert self._anchor is not None
-        return (offset - other.clock_base_ns) / NANOSECONDS, (at - self._anchor) / NANOSECONDS
+        at_ns = known.model.anchor_ns
+        return ClockEstimate(
+            (known.model.to_sensor(at_ns) - base.to_sensor(at_ns)) / NANOSECONDS,
+            1e-6 * (known.model.drift_ppm - base.drift_ppm),
+            (at_ns - self._anchor) / NANOSECONDS,
+            known.stddev,
+            1e-6 * known.drift_stddev_ppm,
+        )
 
-    def _follow_clock(self, other: _Sensor, horizon: int) -> None:
+    def _as_known(self, estimate: ClockEstimate, base: ClockModel) -> KnownClock:
+        """The inverse of :meth:`_as_estimate`."""
+        assert self._anchor is not None
+        at_ns = self._anchor + round(estimate.at * NANOSECONDS)
+        offset_ns = base.anchored_at(at_ns).offset_ns + round(estimate.offset * NANOSECONDS)
+        model = ClockModel(offset_ns, base.drift_ppm + 1e6 * estimate.drift, at_ns)
+        return KnownClock(model, estimate.stddev, 1e6 * estimate.drift_stddev)
+
+    def _not_as_saved(self, name: str, other: _Sensor) -> None:
+        self.events.append(f"{name}: its clock was set since it was calibrated")
+        other.loaded = other.clock_expected = None
+
+    def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockEstimate | None:
+        """The clock by all the motion so far and by what was known before it, unless these contradict each other."""
+        received = None if other.received is None else self._as_estimate(other.received, other.clock_base)
+        found = fit.solve(received)
+        if found is None or other.clock_expected is None:
+            return found
+        expected = self._as_estimate(other.clock_expected, other.clock_base)
+        apart = found.offset_at(found.at) - expected.offset_at(found.at)
+        if abs(apart) > MOVED_SIGMAS * np.hypot(found.stddev, expected.stddev_at(found.at)):
+            self._not_as_saved(name, other)
+            return found
+        return fit.solve(expected)
+
+    def _follow_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
         around = round(2 * FINE_RANGE * NANOSECONDS)
@@ -547,23 +618,25 @@ class OnlineCalibration:
             start, stop = other.clock_window_end, other.clock_window_end + CLOCK_WINDOW_NS
             other.clock_window_end = stop
             if other.clock_fit is None:
-                other.clock_base_ns = other.clock.offset_ns
-                other.clock_fit = ClockFit(0.0, self._expected(other))
+                other.clock_fit = ClockFit(0.0)
             measured |= other.clock_fit.add(
                 (start + CLOCK_WINDOW_NS // 2 - self._anchor) / NANOSECONDS,
-                self._since_anchor(self._track, 0, start, stop),
+                self._since_anchor(self._track, ClockModel(), start, stop),
                 self._since_anchor(
                     other.track,
-                    other.clock_base_ns,
+                    other.clock_base,
                     other.clock.to_sensor(start - around),
                     other.clock.to_sensor(stop + around),
                 ),
             )
-        found = other.clock_fit.solve() if measured and other.clock_fit is not None else None
+        found = self._fitted_clock(name, other, other.clock_fit) if measured and other.clock_fit is not None else None
         if found is None:
             return
-        other.clock = ClockModel(other.clock_base_ns + round(found[0] * NANOSECONDS), 1e6 * found[1], self._anchor)
-        other.clock_stddev = found[2]
+        other.known = self._as_known(found, other.clock_base)
+        gone = other.clock.to_sensor(other.clock_window_end) - other.clock_base.to_sensor(other.clock_window_end)
+        if abs(gone) > REBASE_CLOCK * NANOSECONDS:
+            # What is known by now is what the next fit expects.
+            other.clock_expected, other.clock_base, other.clock_fit = other.known, other.clock, None
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
         if abs(moved) > REPAIR_CLOCK:
@@ -571,7 +644,7 @@ class OnlineCalibration:
                 self._pair_anew(other, other.paired_until)
             else:
                 other.pairs.shift_clock(
-                    (other.clock.offset_ns - other.paired_clock.offset_ns) / NANOSECONDS,
+                    (other.clock.to_sensor(self._anchor) - other.paired_clock.to_sensor(self._anchor)) / NANOSECONDS,
                     1e-6 * (other.clock.drift_ppm - other.paired_clock.drift_ppm),
                 )
                 other.paired_clock = other.clock
@@ -592,9 +665,7 @@ class OnlineCalibration:
                 return
             self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
         other.estimated = True
-        other.quality = SensorQuality(
-            best.residual, best.rotation_stddev, best.translation_stddev, other.clock_stddev, len(pairs)
-        )
+        other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, frames=len(pairs))
         self._aim(other, best.rotation, best.translation, best.centre)
 
     @staticmethod
@@ -664,7 +735,7 @@ class OnlineCalibration:
         base_rotation = self._base.rotation
         poses = {self.reference: self._base}
         clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0)}
-        quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0)}
+        quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0, 0.0)}
         for name, other in self._sensors.items():
             if other.rotation is None or other.target is None:
                 continue
@@ -674,7 +745,12 @@ class OnlineCalibration:
                 base_rotation @ translation + self._base.translation,
                 Rotation.from_matrix(base_rotation @ rotation).as_quat(),
             )
-            clocks[name], quality[name] = other.clock, other.quality
+            clocks[name] = other.clock
+            quality[name] = replace(
+                other.quality,
+                clock_stddev=other.known.stddev,
+                clock_drift_stddev_ppm=other.known.drift_stddev_ppm,
+            )
         stamped = {
             name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
             for name, pose in poses.items()
@@ -698,8 +774,10 @@ class OnlineCalibration:
                 if other.clock_locked and self._track.stamps[0] <= self._anchor:
                     # The recording is still here as a whole: measure every window with what is known now.
                     other.clock_fit, other.clock_window_end = None, self._anchor
+                    other.clock_base = other.clock
+                    other.clock_expected = None if other.loaded is None else self._carried(other.loaded)
                 if other.clock_locked:
-                    self._follow_clock(other, self._now)
+                    self._follow_clock(name, other, self._now)
                     if self._remembers_all(other):
                         self._pair_anew(other, self._now)
                 self._pair(other, self._now)
@@ -726,14 +804,17 @@ class OnlineCalibration:
             translation = base.rotation.T @ (pose.translation - base.translation)
             other.rotation, other.translation = rotation, translation
             other.target = rotation, translation, translation
-            other.clock = result.clocks.get(name, ClockModel())
             other.quality = result.quality.get(name, SensorQuality())
+            drift_stddev_ppm = min(other.quality.clock_drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
+            known = KnownClock(result.clocks.get(name, ClockModel()), other.quality.clock_stddev, drift_stddev_ppm)
+            other.known = other.loaded = known
 
     # --- services
 
     def start(self) -> str:
         """Estimate anew from the next still pose; the calibration so far holds until then."""
         for other in self._sensors.values():
+            other.loaded = None
             other.forget()
             other.quality = SensorQuality()
         return "calibrating: stand still (a T-pose is best) for two seconds, then walk about"
@@ -755,17 +836,18 @@ class OnlineCalibration:
             if other.rotation is None:
                 waiting.append(name)
                 continue
-            quality = other.quality
+            quality, clock = other.quality, other.known
+            at_ns = clock.model.anchor_ns if self._now is None else self._now
             if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
                 unsure.append(name)
             values |= {
                 f"{name} residual_mm": round(1e3 * quality.residual, 1),
                 f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
                 f"{name} translation_stddev_mm": round(1e3 * quality.translation_stddev, 1),
-                f"{name} clock_offset_s": round(other.clock.offset, 4),
-                f"{name} clock_drift_ppm": round(other.clock.drift_ppm, 1),
-                f"{name} clock_stddev_ms": round(1e3 * quality.clock_stddev, 2),
-                f"{name} clock_from": "motion" if other.clock_locked else "receipt",
+                f"{name} clock_offset_s": round(clock.model.anchored_at(at_ns).offset, 4),
+                f"{name} clock_drift_ppm": round(clock.model.drift_ppm, 1),
+                f"{name} clock_stddev_ms": round(1e3 * clock.stddev_at(at_ns), 2),
+                f"{name} clock_from": _clock_from(other),
                 f"{name} pairs": len(other.pairs),
                 f"{name} turned_share": round(other.turned, 3),
                 f"{name} late_frames": other.track.late,

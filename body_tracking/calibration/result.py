@@ -43,6 +43,36 @@ class ClockModel:
         """The offset in seconds."""
         return self.offset_ns / NANOSECONDS
 
+    def anchored_at(self, reference_ns: int) -> ClockModel:
+        """The same clock by its offset at another reference time."""
+        return ClockModel(self.to_sensor(reference_ns) - reference_ns, self.drift_ppm, reference_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownClock:
+    """A clock, and how well it is known.
+
+    Attributes:
+        model: anchored where the errors of offset and drift have nothing to do with each other.
+        stddev: of the offset at the anchor, seconds; infinity while unknown.
+        drift_stddev_ppm: of the drift, parts per million; infinity while unknown.
+    """
+
+    model: ClockModel = ClockModel()
+    stddev: float = float("inf")
+    drift_stddev_ppm: float = float("inf")
+
+    def stddev_at(self, reference_ns: int) -> float:
+        """Standard deviation of the offset at a reference time, seconds."""
+        elapsed = (reference_ns - self.model.anchor_ns) / NANOSECONDS
+        return float(np.hypot(self.stddev, 1e-6 * self.drift_stddev_ppm * elapsed)) if elapsed else self.stddev
+
+    def carried_to(self, reference_ns: int, wander_ppm: float) -> KnownClock:
+        """What it says of another time, if the drift may have changed by so much on the way."""
+        drift_stddev_ppm = float(np.hypot(self.drift_stddev_ppm, wander_ppm))
+        changing = KnownClock(self.model, self.stddev, drift_stddev_ppm)
+        return KnownClock(self.model.anchored_at(reference_ns), changing.stddev_at(reference_ns), drift_stddev_ppm)
+
 
 @dataclass(frozen=True, eq=False)
 class SensorPose:
@@ -99,8 +129,9 @@ class SensorQuality:
         residual: median distance between what both sensors say of the same joint, metres; NaN before any overlap.
         rotation_stddev: radians; infinity while unknown.
         translation_stddev: metres at the place where the person was; infinity while unknown.
-        clock_stddev: seconds; infinity while unknown.
+        clock_stddev: of the clock's offset at its anchor, seconds; infinity while unknown.
         frames: pairs of frames that the estimate stands on.
+        clock_drift_stddev_ppm: of the clock's drift, parts per million; infinity while unknown.
     """
 
     residual: float = float("nan")
@@ -108,6 +139,7 @@ class SensorQuality:
     translation_stddev: float = float("inf")
     clock_stddev: float = float("inf")
     frames: int = 0
+    clock_drift_stddev_ppm: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

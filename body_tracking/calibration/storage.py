@@ -16,8 +16,8 @@ from body_tracking.skeleton import NANOSECONDS
 _HEADER = """\
 # Calibration written by body_tracking: the pose of each <sensor>_optical_frame (x right, y down, z forward) in world,
 # metres and a unit quaternion x y z w; the sensor's clock against the reference sensor's (sensor minus reference,
-# seconds, at the reference time clock_anchor_ns; drift in parts per million); standard deviations and residual as
-# estimated.
+# seconds, at the reference time clock_anchor_ns; drift in parts per million); standard deviations, of the clock's
+# offset at that time, and residual as estimated.
 """
 
 
@@ -41,6 +41,7 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
                 "rotation_stddev_deg": known(result.quality[name].rotation_stddev, 180.0 / np.pi),
                 "translation_stddev_mm": known(result.quality[name].translation_stddev, 1e3),
                 "clock_stddev_ms": known(result.quality[name].clock_stddev, 1e3),
+                "clock_drift_stddev_ppm": known(result.quality[name].clock_drift_stddev_ppm),
                 "frames": result.quality[name].frames,
             }
             for name, pose in result.poses.items()
@@ -93,6 +94,7 @@ def _sensor(name: str, entry: dict[str, Any]) -> tuple[SensorPose, ClockModel, S
             quality("translation_stddev_mm", 1e3, float("inf")),
             quality("clock_stddev_ms", 1e3, float("inf")),
             int(entry.get("frames", 0)),
+            quality("clock_drift_stddev_ppm", 1.0, float("inf")),
         ),
     )
 

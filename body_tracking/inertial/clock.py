@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import fftconvolve, find_peaks
 
-from body_tracking.calibration.clock import DRIFT_PRIOR, FINE_RANGE, PEAK_WIDTH, SAMPLE_TIME, STEP, ClockFit
+from body_tracking.calibration.clock import FINE_RANGE, PEAK_WIDTH, SAMPLE_TIME, STEP, ClockFit
 from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import BoolArray, FloatArray
 
@@ -255,6 +255,8 @@ def _coarse(reference: Turning, other: Turning, guess: float, window: float) -> 
 class _RateFit(ClockFit):
     """The fit of :class:`ClockFit` over angular rates in the place of joints' speeds."""
 
+    LIKE = np.inf  # how fast something turns looks the same from everywhere
+
     def add_rates(self, elapsed: float, reference: Turning, other: Turning) -> None:
         """Take a window of the reference, and of the other series what surrounds it, nearly in the same clock."""
         at = reference.stamps[np.isfinite(reference.rates)]
@@ -279,12 +281,6 @@ class _RateFit(ClockFit):
         sums[3] = seconds * SAMPLE_TIME / independent
         self._elapsed.append(elapsed)
         self._sums.append(sums)
-
-    def spread(self) -> tuple[float, float]:
-        """Mean time of the windows, weighted as by :meth:`solve`, and the variance of their times."""
-        weights = np.array([sums[1, 0] for sums in self._sums])
-        middle = float(np.average(self._elapsed, weights=weights))
-        return middle, float(np.average((np.array(self._elapsed) - middle) ** 2, weights=weights))
 
 
 def _correlation_time(values: FloatArray, step: float) -> float:
@@ -321,17 +317,14 @@ def _fine(
             Turning(near.stamps[of_other], near.rates[of_other]),
         )
     solved = fit.solve()
-    if solved is None or solved[2] > _WORST:
+    if solved is None or solved.stddev > _WORST:
         return None
-    offset, drift, stddev = solved
-    middle, variance = fit.spread()
-    drift_variance = 1.0 / (variance / stddev**2 + 1.0 / DRIFT_PRIOR**2)
     return ClockOffset(
-        lag + offset + drift * middle,
-        drift,
-        anchor + middle,
-        stddev,
-        float(np.sqrt(drift_variance)),
+        lag + solved.offset,
+        solved.drift,
+        anchor + solved.at,
+        solved.stddev,
+        solved.drift_stddev,
         correlation,
         rival,
     )

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import FINE_RANGE, RECEIPT_PRIOR, ClockFit, correlate_clocks
+from body_tracking.calibration.clock import (
+    FINE_RANGE,
+    MIN_STDDEV,
+    RECEIPT_PRIOR,
+    ClockEstimate,
+    ClockFit,
+    correlate_clocks,
+)
 from body_tracking.skeleton import FloatArray
 from walkers import walk
 
@@ -73,54 +80,87 @@ def test_too_little_overlap_is_no_answer() -> None:
     assert correlate_clocks((a[0][:40], a[1][:40]), (b[0][300:], b[1][300:]), 0.0, 0.5) is None
 
 
-def fitted(offset: float, drift: float, seconds: float = 60.0) -> tuple[float, float, float]:
-    own, theirs = seen(0.0, 0.0, seconds, 4), seen(offset, drift, seconds, 5)
+def fitted(
+    offset: float, drift: float, seconds: float = 55.0, expected: ClockEstimate | None = None, repeated: int = 1
+) -> ClockEstimate:
+    """By as many windows as there are, each taken once or as often as it is repeated."""
+    own, theirs = seen(0.0, 0.0, 60.0, 4), seen(offset, drift, 60.0, 5)
     fit = ClockFit(0.0)
-    for start in np.arange(0.0, seconds - 5.0, 5.0):
+    for start in np.repeat(np.arange(0.0, seconds, 5.0), repeated):
         window = (own[0] > start) & (own[0] <= start + 5.0)
         around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
         fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
-    found = fit.solve()
+    found = fit.solve(expected)
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize(("offset", "drift"), [(0.0, 0.0), (0.03, 100e-6), (-0.06, -200e-6)])
 def test_offset_and_drift_are_fitted_within_the_stated_uncertainty(offset: float, drift: float) -> None:
-    found_offset, found_drift, stddev = fitted(offset, drift)
-    assert 0.0 < stddev < 0.01
-    assert found_offset + found_drift * 30.0 == pytest.approx(offset + drift * 30.0, abs=3 * stddev)
+    found = fitted(offset, drift)
+    assert 0.0 < found.stddev < 0.01
+    assert 0.0 < found.drift_stddev < 400e-6
+    assert found.at == pytest.approx(27.5, abs=10.0)
+    for at in (0.0, found.at, 60.0):
+        assert found.offset_at(at) == pytest.approx(offset + drift * at, abs=3 * found.stddev_at(at))
     for at in (0.0, 60.0):  # a third of a frame, half a minute away from the middle
-        assert found_offset + found_drift * at == pytest.approx(offset + drift * at, abs=0.011)
+        assert found.offset_at(at) == pytest.approx(offset + drift * at, abs=0.011)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.005, 0.013, 0.0167, 0.025])
+def test_the_offset_does_not_follow_the_phase_of_the_frames(phase: float) -> None:
+    """Samples half-way between two frames have half the noise, and so correlate better."""
+
+    def seen_from(phase: float) -> tuple[FloatArray, FloatArray]:
+        times = np.arange(0.0, 65.0, 1 / 30) + phase
+        positions = walk(times, still=1.0)
+        return times, positions + rng.normal(scale=0.006, size=positions.shape)
+
+    rng = np.random.default_rng(1)
+    own, theirs = seen_from(0.0), seen_from(phase)
+    fit = ClockFit(0.0)
+    for start in np.arange(0.0, 60.0, 5.0):
+        window = (own[0] > start) & (own[0] <= start + 5.0)
+        around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
+        fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
+    found = fit.solve()
+    assert found is not None
+    assert abs(found.offset) < min(0.005, found.stddev)
 
 
 def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
     plain, shifted = fitted(0.01, 0.0), fitted(0.01 + 0.05, 100e-6)
     for at, within in ((0.0, 0.008), (30.0, 0.005), (60.0, 0.008)):
-        difference = (shifted[0] - plain[0]) + (shifted[1] - plain[1]) * at
-        assert difference == pytest.approx(0.05 + 100e-6 * at, abs=within)
+        assert shifted.offset_at(at) - plain.offset_at(at) == pytest.approx(0.05 + 100e-6 * at, abs=within)
 
 
 def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
     """The estimate is drawn to what they say, the less the more motion there was; to what cannot be, not at all."""
-    own, theirs = seen(0.0, 0.0, 60.0, 4), seen(0.02, 0.0, 60.0, 5)
+    for seconds in (15.0, 55.0):
+        plain, drawn, other = (
+            fitted(0.02, 0.0, seconds, None if expected is None else ClockEstimate(expected, at=2.0))
+            for expected in (None, -0.05, 0.5)
+        )
+        share = (plain.stddev / RECEIPT_PRIOR) ** 2
+        off = plain.offset_at(plain.at) - drawn.offset_at(plain.at)
+        assert 0.0 < off < 2.0 * share * (plain.offset + 0.05)
+        assert other == plain
 
-    def off(expected: float | None, windows: int) -> tuple[float, float]:
-        fit = ClockFit(0.0, None if expected is None else (expected, 2.0))
-        for start in 5.0 * np.arange(windows):
-            window = (own[0] > start) & (own[0] <= start + 5.0)
-            around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
-            fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
-        found = fit.solve()
-        assert found is not None
-        return found[0], found[2]
 
-    for windows in (3, 11):
-        plain, stddev = off(None, windows)
-        drawn, _ = off(-0.05, windows)
-        share = (stddev / RECEIPT_PRIOR) ** 2
-        assert 0.0 < plain - drawn < 2.0 * share * (plain + 0.05)
-        assert off(0.5, windows) == (plain, stddev)
+def test_what_is_known_exactly_is_kept() -> None:
+    expected = ClockEstimate(0.03, 100e-6, 10.0, 1e-5, 1e-8)
+    found = fitted(0.02, 0.0, expected=expected)
+    for at in (0.0, 60.0):
+        assert found.offset_at(at) == pytest.approx(expected.offset_at(at), abs=2e-5)
+    assert found.stddev == pytest.approx(MIN_STDDEV, rel=0.01)
+    assert found.drift_stddev == pytest.approx(1e-8, rel=0.01)
+
+
+def test_the_same_motion_again_says_no_more_of_the_offset_but_of_the_drift() -> None:
+    once, often = fitted(0.02, 0.0), fitted(0.02, 0.0, repeated=10)
+    floor = np.sqrt((once.stddev**2 - MIN_STDDEV**2) / 2.0 + MIN_STDDEV**2)  # after a minute half is common to all
+    assert 0.95 * floor < often.stddev < once.stddev
+    assert often.drift_stddev < 0.5 * once.drift_stddev
 
 
 def test_an_offset_beyond_the_grid_is_no_answer() -> None:

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.offline import WHOLE, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.sensors.csv_recording import CsvRecording
+from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import about_y, frame, walk
@@ -155,6 +156,8 @@ def stream(
     seconds: float,
     offset: float = 0.4,
     start: float = 0.0,
+    *,
+    drift: float = 0.0,
     noise: float = 0.006,
     jitter: float = 0.0,
     still: float = 3.0,
@@ -162,7 +165,7 @@ def stream(
     """Both sensors' frames in the order of their arrival."""
     rng = np.random.default_rng(7)
     frames = []
-    for sensor, phase, clock in (("kinect1", 0.0, 0.0), ("kinect2", 0.013, offset)):
+    for sensor, phase in (("kinect1", 0.0), ("kinect2", 0.013)):
         times = np.arange(0.0, seconds, 1 / 30) + phase
         positions = walk(times, still)
         if sensor == "kinect2":
@@ -170,7 +173,8 @@ def stream(
         positions = positions + rng.normal(scale=noise, size=positions.shape)
         for time, seen in zip(times, positions, strict=True):
             received = start + time + 0.02 + jitter * rng.random()
-            frames.append((sensor, frame(start + time + clock, seen, sensor), round(received * NANOSECONDS)))
+            stamp = start + time + (offset + drift * time if sensor == "kinect2" else 0.0)
+            frames.append((sensor, frame(stamp, seen, sensor), round(received * NANOSECONDS)))
     return tuple(sorted(frames, key=lambda each: each[2]))
 
 
@@ -322,6 +326,76 @@ def test_a_saved_clock_of_another_session_is_not_believed() -> None:
     for sensor, skeleton, received in stream(20.0, offset=-30.0):
         calibration.push(sensor, skeleton, received)
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
+
+
+def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_from_either_side() -> None:
+    """And, as quartz drifts, for no longer than it may be believed."""
+    views = around(np.radians([45.0, -80.0]).tolist())
+    recording = simulate(Setup("torso_twist", views, seconds=30.0, seed=4, standard=True))
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    names, true = tuple(clocks), clocks["kinect2"]
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    last_ns = recording.frames[-1].skeletons[0].stamp_ns
+
+    def off(saved: ClockModel | None, drift_stddev_ppm: float = 5.0) -> tuple[float, float]:
+        """The error of the clock at the end, and what is stated of it."""
+        calibration = OnlineCalibration(names)
+        if saved is not None:
+            quality = SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_stddev_ppm)
+            saved_clocks = {**clocks, "kinect2": saved}
+            calibration.load(CalibrationResult(names[0], poses, saved_clocks, dict.fromkeys(names, quality)))
+        for each in recording.frames:
+            calibration.push(each.sensor, each.skeletons[0], each.received_ns)
+        result = calibration.result()
+        apart = result.clocks["kinect2"].to_sensor(last_ns) - true.to_sensor(last_ns)
+        return apart / NANOSECONDS, result.quality["kinect2"].clock_stddev
+
+    error, stddev = off(None)
+    assert abs(error) > 0.01
+    assert stddev > 0.005
+    kept, kept_stddev = off(true)
+    assert abs(kept) < 0.003
+    assert kept_stddev < 0.004
+    # It was saved two days ago, or after a recording too short to tell the drift: no better than times of receipt.
+    for ago, drift_stddev_ppm in ((2 * 86_400, 5.0), (300, float("inf"))):
+        then_ns = true.anchor_ns - ago * NANOSECONDS
+        assert off(true.anchored_at(then_ns), drift_stddev_ppm) == pytest.approx((error, stddev), abs=1e-3)
+
+
+@pytest.mark.parametrize("offset", [0.46, 0.5, 0.53, 0.545])
+def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) -> None:
+    """Even by less than the times of receipt can tell."""
+    saved = run(stream(30.0))[0].result()
+    saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    calibration.load(saved)
+    for sensor, skeleton, received in stream(40.0, offset=offset):
+        calibration.push(sensor, skeleton, received)
+    assert sum("was set since" in event for event in calibration.events) == 1
+    result = calibration.result()
+    within = 3.0 * result.quality["kinect2"].clock_stddev
+    assert result.clocks["kinect2"].offset == pytest.approx(offset, abs=within)
+
+
+def test_a_bag_that_loops_says_no_more_of_the_clock_the_second_time() -> None:
+    frames = stream(20.0)
+    once = run(frames)[0].result()
+    twice = run((*frames, *frames))[0].result()
+    assert twice.quality["kinect2"].clock_stddev == pytest.approx(once.quality["kinect2"].clock_stddev, rel=0.05)
+    assert twice.clocks["kinect2"].offset == pytest.approx(once.clocks["kinect2"].offset, abs=0.001)
+
+
+def test_a_clock_that_drifts_far_is_followed() -> None:
+    """Farther than windows of motion are compared at, with what was known before."""
+    drift, seconds = 500e-6, 360.0
+    calibration, _ = run(stream(seconds, drift=drift))
+    for result in (calibration.result(), calibration.finish()):
+        clock, quality = result.clocks["kinect2"], result.quality["kinect2"]
+        assert 1e-6 * clock.drift_ppm == pytest.approx(drift, abs=3e-6 * quality.clock_drift_stddev_ppm)
+        assert quality.clock_drift_stddev_ppm < 60.0
+        now_ns = round(seconds * NANOSECONDS)
+        off = clock.to_sensor(now_ns) / NANOSECONDS - (seconds * (1.0 + drift) + 0.4)
+        assert abs(off) < 0.01
 
 
 def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:

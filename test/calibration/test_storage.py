@@ -23,7 +23,7 @@ def example(seed: int = 0) -> CalibrationResult:
         "kinect1",
         {"kinect1": level_pose("kinect1", 0.9), "kinect2": pose},
         {"kinect1": ClockModel(), "kinect2": ClockModel(int(rng.integers(-(10**10), 10**10)), 42.5, 123456789)},
-        {"kinect1": SensorQuality(0, 0, 0, 0, 0), "kinect2": SensorQuality(0.05, 0.01, 0.004, float("inf"), 400)},
+        {"kinect1": SensorQuality(0, 0, 0, 0, 0), "kinect2": SensorQuality(0.05, 0.01, 0.004, float("inf"), 400, 33.5)},
     )
 
 
@@ -41,6 +41,7 @@ def test_a_calibration_survives_the_disk(tmp_path_factory: pytest.TempPathFactor
         assert read.clocks[name].drift_ppm == result.clocks[name].drift_ppm
         assert_allclose(read.quality[name].rotation_stddev, result.quality[name].rotation_stddev)
         assert read.quality[name].clock_stddev == result.quality[name].clock_stddev
+        assert read.quality[name].clock_drift_stddev_ppm == result.quality[name].clock_drift_stddev_ppm
 
 
 @pytest.mark.parametrize(
