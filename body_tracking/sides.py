@@ -36,18 +36,13 @@ HALVES = (np.flatnonzero(_LATERAL & ~_LOWER), np.flatnonzero(_LATERAL & _LOWER))
 """The joints that have a left and a right: of the upper and of the lower body."""
 
 
-def _headings(ends: Sequence[Sequence[float]]) -> list[float]:
-    """The headings of both halves from the (x, y) of their four ends, radians; NaN for an axis without direction."""
-    found = []
-    for (left_x, left_y, *_), (right_x, right_y, *_) in (ends[0:2], ends[2:4]):
+def headings_of(points: FloatArray) -> list[float]:
+    """The headings of the upper and the lower body, radians, of (25, 3) joints in world; NaN where not known."""
+    found, ends = [], points[_ENDS].tolist()
+    for (left_x, left_y, _), (right_x, right_y, _) in (ends[0:2], ends[2:4]):
         x, y = left_x - right_x, left_y - right_y
         found.append(math.atan2(y, x) if math.hypot(x, y) > _SHORTEST else math.nan)
     return found
-
-
-def headings_of(points: FloatArray) -> list[float]:
-    """The headings of the upper and the lower body, radians, of (25, 3) joints in world; NaN where not known."""
-    return _headings(points[_ENDS].tolist())
 
 
 def agree(headings: Sequence[float], believed: Sequence[float]) -> bool:

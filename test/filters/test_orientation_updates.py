@@ -466,6 +466,20 @@ def test_a_filter_that_began_turned_round_does_not_put_right_what_is(seed: int) 
     assert np.degrees(np.abs(errors[:, 5]).max()) < 45.0  # turned round it would be 180
 
 
+def test_a_doubt_about_the_sides_fades_with_time_and_not_with_frames() -> None:
+    """Or it would be forgotten the sooner the more cameras there are."""
+    estimator, person = ExtendedKalmanFilter(), somebody(3, 1.0)
+    followed(estimator, person.skeletons, person)
+    state = estimator._state
+    assert state is not None
+    doubted, after_ns = state.but(doubt=5.0), state.stamp_ns + NANOSECONDS // 4
+    stepped = doubted
+    for stamp_ns in np.linspace(state.stamp_ns, after_ns, 9, dtype=np.int64)[1:]:
+        stepped = estimator._motion.predicted(stepped, int(stamp_ns))
+    assert 1.0 < stepped.doubt < 4.0
+    assert stepped.doubt == pytest.approx(estimator._motion.predicted(doubted, after_ns).doubt)
+
+
 def arm_bent_to_the_wrong_side(seconds: float) -> list[Skeleton]:
     """What a camera shows of a straight right arm, held out to the side."""
     seen = out_to_the_side(elbow=25.0, twist=125.0)

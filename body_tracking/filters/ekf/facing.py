@@ -21,8 +21,6 @@ _SPEAKING_NS = NANOSECONDS // 4
 _LIMBS = {"upper_arm": ("SHOULDER", "ELBOW"), "forearm": ("ELBOW", "WRIST")}
 _DIRECTION_STDDEV = 0.35
 """Radians by which a camera errs in where a limb points."""
-_FADE = 0.95
-"""Share of a doubt that a frame later is left: it lasts for two thirds of a second."""
 _MOST, _DOUBTED = 1.0, 10.0
 """Logarithms of a ratio of likelihoods: what one frame says at most, as the next errs alike, and what decides."""
 
@@ -70,8 +68,8 @@ class Facing:
         expected[self._space.model.joints] = posture.positions
         believed, seen = headings_of(expected), headings_of(skeleton.positions)
         if agree(seen, believed):
-            return (state.but(doubt=_FADE * state.doubt) if state.doubt else state), skeleton
-        doubt = _FADE * state.doubt + self._evidence(posture, state.sources.segments[speaking], skeleton)
+            return state, skeleton
+        doubt = state.doubt + self._evidence(posture, state.sources.segments[speaking], skeleton)
         state = state.but(doubt=max(doubt, 0.0))
         if doubt > _DOUBTED or self._is_improbable(state):
             return state, skeleton

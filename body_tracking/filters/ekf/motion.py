@@ -18,6 +18,8 @@ _OF_SPEED = 16.0
 """1/s: beside orientations the density of a joint's acceleration besides, per square of its speed. Who swings a limb
 twice a second accelerates it by 4 pi times its speed for about a tenth of a second; what a pose is too slow to follow
 is taken for errors of the sources."""
+_DOUBT_TIME = 0.65
+"""Seconds for which frames that contradict the state are remembered: one errs as those shortly before."""
 _UNTOUCHED = 0.02
 _RATIO_BOUND = 8.0
 _DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
@@ -98,6 +100,7 @@ class Motion:
             tracked=state.tracked + dt,
             fresh=False,
             sources=sources,
+            doubt=math.exp(-dt / _DOUBT_TIME) * state.doubt if state.doubt else 0.0,
         )
 
     def _slow_time(self, state: State) -> float:

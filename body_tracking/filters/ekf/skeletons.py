@@ -348,7 +348,7 @@ class SkeletonUpdate:
             state = state.but(seen=None)
         # The lengths' errors are new ones. What is known of the rest where the lengths are given stays as it is.
         before = state.covariance[space.lengths, space.lengths]
-        follows: FloatArray = np.linalg.solve(before, state.covariance[space.lengths]).T.astype(np.float64)
+        follows: FloatArray = np.asarray(np.linalg.solve(before, state.covariance[space.lengths]).T, dtype=np.float64)
         crosses = state.crosses - single(follows) @ state.crosses[space.lengths]
         covariance = state.covariance + follows @ (found.covariance - before) @ follows.T
         moved = space.moved(state.but(settled=False), follows @ (found.lengths - state.lengths))
