@@ -24,9 +24,6 @@ from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 FRESH = 0.1
 """Frames of other sensors count for left and right while they are no further away in time than this, seconds."""
 
-TURNED_HOLD = 1.0
-"""Left and right are held against a body that all sensors see reversed at once for this long, seconds."""
-
 _DIAGONAL = np.arange(3)
 _KEEP = 5 * NANOSECONDS
 """Poses and clocks are kept for frames that are late by no more than this, nanoseconds."""
@@ -80,7 +77,7 @@ class SensorAlignment:
         self.world = world
         self.counters: Counter[str] = Counter()
         self._sensors = {name: _Sensor() for name in sensors}
-        self._sides = Sides(TURNED_HOLD)
+        self._sides = Sides()
 
     def reset(self) -> None:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""

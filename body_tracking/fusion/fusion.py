@@ -20,7 +20,7 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.errors import BodyTrackingError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
 from body_tracking.fusion.rhythm import Rhythm
-from body_tracking.fusion.sides import Sides
+from body_tracking.fusion.sides import HOLD, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
 from body_tracking.measurement import joint_stddev, viewing_angle
 from body_tracking.sides import PAIRS
@@ -113,9 +113,10 @@ class FusionParameters:
         },
     )
     turned_hold: float = field(
-        default=1.0,
+        default=HOLD,
         metadata={
-            "doc": "hold left and right against a body that all sensors see reversed at once, for this long",
+            "doc": "hold left and right against a body that all sensors see reversed at once, for as long as it was "
+            "seen before, but at most for this long",
             "unit": "s",
             "min": 0.0,
             "max": 60.0,

@@ -20,6 +20,12 @@ MORE_FRONTAL = math.pi / 6
 TRUST_AFTER = round(1.0 * NANOSECONDS)
 """... for this long, while it agrees with the one believed so far, nanoseconds."""
 
+HOLD = 10.0
+"""A reversal that all sensors see at once is not believed for this long, seconds ..."""
+
+LEAST_HOLD = 1.0
+"""... or for this long where what it contradicts may be as wrong."""
+
 TURN_RATE = 8.0
 """A person's shoulders turn no faster than this, radians per second (throwing athletes' trunks reach it)."""
 
@@ -31,11 +37,12 @@ class Sides:
     """Decides whom to believe on left and right, and keeps the output from turning faster than a person can.
 
     Args:
-        hold: seconds for which a reversal that all sensors see at once is not believed.
+        hold: seconds for which a reversal that all sensors see at once is not believed at most.
     """
 
-    def __init__(self, hold: float) -> None:
+    def __init__(self, hold: float = HOLD) -> None:
         self._hold_ns = round(hold * NANOSECONDS)
+        self._least_ns = min(round(LEAST_HOLD * NANOSECONDS), self._hold_ns)
         self.reset()
 
     def reset(self) -> None:
@@ -44,6 +51,7 @@ class Sides:
         self._trusted_ns = 0
         self._better_since: int | None = None
         self._axes = [math.nan, math.nan]  # headings taken for true
+        self._known_since = [0, 0]  # without having been reversed
         self._reversed_since: list[int | None] = [None, None]
         self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
 
@@ -104,7 +112,7 @@ class Sides:
             if recent or not known:
                 return self._axes
             trusted = min(known, key=lambda index: angles[index])
-            self._reversed_since = [None, None]
+            self._known_since, self._reversed_since = [self._credited(stamp, angles[trusted])] * 2, [None, None]
         upper = headings[trusted][0]
         agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE]
         better = min(agreeing, key=lambda index: angles[index])
@@ -116,20 +124,29 @@ class Sides:
             trusted, self._better_since = better, None
         others = [headings[index] for index in known if index != trusted]
         self._axes = [
-            self._held(stamp, half, heading, [other[half] for other in others], recent, counters)
+            self._held(stamp, half, heading, [other[half] for other in others], recent, angles[trusted], counters)
             for half, heading in enumerate(headings[trusted])
         ]
         self.trusted, self._trusted_ns = names[trusted], stamp
         return self._axes
 
     def _held(
-        self, stamp: int, half: int, heading: float, others: Sequence[float], recent: bool, counters: Counter[str]
+        self,
+        stamp: int,
+        half: int,
+        heading: float,
+        others: Sequence[float],
+        recent: bool,
+        angle: float,
+        counters: Counter[str],
     ) -> float:
         """The heading; another sensor's, or the opposite, where the believed one turned the body between two frames.
 
         Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
-        another one goes on as before, it errs now, for as long as that one does, unless most sensors are with it; else
-        nobody knows, and for a while the reversal is not believed.
+        another one goes on as before, it errs now, for as long as that one does, unless most sensors are with it. Else
+        nobody knows whether it errs now or has until now. It does so for less time than it does not, so that the
+        reversal is believed when it has lasted as long as what it contradicts; and seldom so that it sees somebody's
+        back, so that who was seen to face it counts as one who was seen for long.
         """
         before = self._axes[half]
         sense = math.cos(before - heading)
@@ -146,10 +163,15 @@ class Sides:
         since = self._reversed_since[half]
         if since is None:
             since = self._reversed_since[half] = stamp
-        if stamp - since <= self._hold_ns:
+        if stamp - since <= min(max(since - self._known_since[half], self._least_ns), self._hold_ns):
             return heading + math.pi
         counters["reversals_accepted"] += 1
+        self._known_since[half] = self._credited(since, angle)
         return heading
+
+    def _credited(self, stamp: int, angle: float) -> int:
+        """Since when a body counts as known that a sensor sees from a time on, under an angle."""
+        return stamp - self._hold_ns if angle < math.pi / 2 else stamp
 
     def turn_gently(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
         """Turn shoulders and hips, with arms and legs, no faster than a person can.

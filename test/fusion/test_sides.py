@@ -6,29 +6,31 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
+import numpy as np
 import pytest
 
-from body_tracking.fusion.sides import Sides
+from body_tracking.fusion.sides import LEAST_HOLD, Sides
 from body_tracking.skeleton import NANOSECONDS
 
 HOLD = 1.0
 ROUND = math.pi
 
 
-def believed(seconds: float, seen: Mapping[str, tuple[float, float]]) -> list[float]:
+def believed(seconds: float, seen: Mapping[str, tuple[float, float]], hold: float = HOLD) -> list[float]:
     """The upper body's heading while sensors see it turned round in a part of the time, relative to what it is.
 
     Args:
         seconds: how long it lasts, 30 times a second.
-        seen: from when to when each sensor sees the body turned round, s.
+        seen: from when to when each sensor, which the body faces, sees it turned round, s.
+        hold: of a reversal, s.
     """
-    sides, counters = Sides(HOLD), Counter[str]()
+    sides, counters = Sides(hold), Counter[str]()
     found = []
     for number in range(round(30 * seconds)):
         time = number / 30.0
         headings = [[ROUND if begin <= time < end else 0.0] * 2 for begin, end in seen.values()]
         stamp = 10 * NANOSECONDS + round(time * NANOSECONDS)
-        heading, _ = sides.believed(stamp, tuple(seen), [0.0] * len(seen), headings, counters)
+        heading, _ = sides.believed(stamp, tuple(seen), [upper for upper, _ in headings], headings, counters)
         found.append(math.remainder(heading, math.tau))
     return found
 
@@ -49,3 +51,26 @@ def test_one_that_still_errs_does_not_keep_the_others_from_being_believed() -> N
 def test_nor_does_one_of_four() -> None:
     seen = {"behind": (0.0, 3.0), "front": (0.0, 0.0), "left": (0.0, 0.0), "also behind": (0.0, 8.0)}
     assert believed(8.0, seen)[-1] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("wrong", [2.5, 4.0])
+def test_who_was_seen_to_face_a_sensor_is_not_turned_round_for_as_long_as_sensors_err(wrong: float) -> None:
+    """Even at the beginning, and where all sensors err at once."""
+    for begin in (0.5, 5.0):
+        seen = {"left": (begin, begin + wrong), "right": (begin, begin + 2.0)}
+        assert believed(12.0, seen, hold=10.0) == pytest.approx([0.0] * 360)
+
+
+@pytest.mark.parametrize(("wrong", "until"), [(0.3, 0.3 + LEAST_HOLD), (3.0, 6.0)])
+def test_who_was_first_seen_from_behind_is_turned_round_after_as_long(wrong: float, until: float) -> None:
+    """A Kinect takes everybody to face it: where it does not it errs more often than where it does."""
+    found = believed(10.0, {"alone": (0.0, wrong)}, hold=10.0)
+    turned = round(30 * until)
+    assert np.abs(found[: turned - 2]) == pytest.approx(ROUND)
+    assert found[turned + 2 :] == pytest.approx([0.0] * (298 - turned))
+
+
+def test_who_is_seen_from_behind_for_long_is_believed_to_be() -> None:
+    found = believed(30.0, {"alone": (5.0, 30.0)}, hold=10.0)
+    assert found[: 30 * 15] == pytest.approx([0.0] * 450)
+    assert np.abs(found[30 * 15 + 2 :]) == pytest.approx(ROUND)
