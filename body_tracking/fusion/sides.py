@@ -51,6 +51,7 @@ class Sides:
         self._trusted_ns = 0
         self._better_since: int | None = None
         self._axes = [math.nan, math.nan]  # headings taken for true
+        self._axes_ns: int | None = None
         self._known_since = [0, 0]  # without having been reversed
         self._reversed_since: list[int | None] = [None, None]
         self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
@@ -95,8 +96,8 @@ class Sides:
         """The headings of both halves that are taken for true, radians.
 
         They are those of the believed sensor; another takes over that sees the body more from the front for a while
-        and agrees with it. While the believed one is missing for a moment, its last headings stand; while it sees the
-        body turned round at once and another does not, that other's.
+        and agrees with it. While the believed one is missing, or sees the body turned round at once and another does
+        not, they are that other's.
 
         Args:
             stamp: reference time, nanoseconds.
@@ -106,29 +107,47 @@ class Sides:
             counters: counts ``reversals_accepted``.
         """
         known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
-        recent = self.trusted is not None and stamp - self._trusted_ns <= TRUST_AFTER
-        trusted = next((index for index in known if names[index] == self.trusted), None)
-        if trusted is None:
-            if recent or not known:
-                return self._axes
-            trusted = min(known, key=lambda index: angles[index])
-            self._known_since, self._reversed_since = [self._credited(stamp, angles[trusted])] * 2, [None, None]
-        upper = headings[trusted][0]
+        if not known:
+            return self._axes
+        leading = next((index for index in known if names[index] == self.trusted), None)
+        if leading is None:
+            leading = min(known, key=lambda index: angles[index])
+            takes_over = self.trusted is None or stamp - self._trusted_ns > TRUST_AFTER
+        else:
+            leading, takes_over = self._most_frontal(stamp, leading, known, angles, headings), True
+        recent = self._axes_ns is not None and stamp - self._axes_ns <= TRUST_AFTER
+        if not recent:
+            self._known_since, self._reversed_since = [self._credited(stamp, angles[leading])] * 2, [None, None]
+        others = [headings[index] for index in known if index != leading]
+        self._axes = [
+            self._held(stamp, half, heading, [other[half] for other in others], recent, angles[leading], counters)
+            for half, heading in enumerate(headings[leading])
+        ]
+        self._axes_ns = stamp
+        if takes_over:
+            self.trusted, self._trusted_ns = names[leading], stamp
+        return self._axes
+
+    def _most_frontal(
+        self,
+        stamp: int,
+        leading: int,
+        known: Sequence[int],
+        angles: Sequence[float],
+        headings: Sequence[Sequence[float]],
+    ) -> int:
+        """The believed sensor, or one that has agreed with it and seen the body more from the front for a while."""
+        upper = headings[leading][0]
         agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE]
         better = min(agreeing, key=lambda index: angles[index])
-        if angles[trusted] - angles[better] <= MORE_FRONTAL:
+        if angles[leading] - angles[better] <= MORE_FRONTAL:
             self._better_since = None
         elif self._better_since is None:
             self._better_since = stamp
         elif stamp - self._better_since > TRUST_AFTER:
-            trusted, self._better_since = better, None
-        others = [headings[index] for index in known if index != trusted]
-        self._axes = [
-            self._held(stamp, half, heading, [other[half] for other in others], recent, angles[trusted], counters)
-            for half, heading in enumerate(headings[trusted])
-        ]
-        self.trusted, self._trusted_ns = names[trusted], stamp
-        return self._axes
+            self._better_since = None
+            return better
+        return leading
 
     def _held(
         self,

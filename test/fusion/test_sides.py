@@ -74,3 +74,16 @@ def test_who_is_seen_from_behind_for_long_is_believed_to_be() -> None:
     found = believed(30.0, {"alone": (5.0, 30.0)}, hold=10.0)
     assert found[: 30 * 15] == pytest.approx([0.0] * 450)
     assert np.abs(found[30 * 15 + 2 :]) == pytest.approx(ROUND)
+
+
+def test_who_takes_over_from_a_sensor_that_vanishes_is_held_to_what_that_saw() -> None:
+    sides, counters, found = Sides(), Counter[str](), []
+    for number in range(240):
+        time = number / 30.0
+        other = ROUND if 2.5 <= time < 5.5 else 0.0
+        headings = [[math.nan if time >= 2.0 else 0.0] * 2, [other] * 2]
+        stamp = 10 * NANOSECONDS + round(time * NANOSECONDS)
+        heading, _ = sides.believed(stamp, ("front", "side"), [0.0, other], headings, counters)
+        found.append(math.remainder(heading, math.tau))
+    assert found == pytest.approx([0.0] * 240)
+    assert sides.trusted == "side"
