@@ -787,6 +787,9 @@ class OnlineCalibration:
     def load(self, result: CalibrationResult) -> None:
         """Take an earlier calibration; it holds until movement shows a better one.
 
+        Its clocks count as known from other motion than this session's: given what the same recording told before,
+        clocks are stated to be known better by up to the square root of two.
+
         Raises:
             CalibrationError: it belongs to another reference sensor.
         """

@@ -84,7 +84,16 @@ def fitted(
     offset: float, drift: float, seconds: float = 55.0, expected: ClockEstimate | None = None, repeated: int = 1
 ) -> ClockEstimate:
     """By as many windows as there are, each taken once or as often as it is repeated."""
-    own, theirs = seen(0.0, 0.0, 60.0, 4), seen(offset, drift, 60.0, 5)
+    return solved(seen(0.0, 0.0, 60.0, 4), seen(offset, drift, 60.0, 5), seconds, expected, repeated)
+
+
+def solved(
+    own: tuple[FloatArray, FloatArray],
+    theirs: tuple[FloatArray, FloatArray],
+    seconds: float,
+    expected: ClockEstimate | None = None,
+    repeated: int = 1,
+) -> ClockEstimate:
     fit = ClockFit(0.0)
     for start in np.repeat(np.arange(0.0, seconds, 5.0), repeated):
         window = (own[0] > start) & (own[0] <= start + 5.0)
@@ -117,14 +126,7 @@ def test_the_offset_does_not_follow_the_phase_of_the_frames(phase: float) -> Non
         return times, positions + rng.normal(scale=0.006, size=positions.shape)
 
     rng = np.random.default_rng(1)
-    own, theirs = seen_from(0.0), seen_from(phase)
-    fit = ClockFit(0.0)
-    for start in np.arange(0.0, 60.0, 5.0):
-        window = (own[0] > start) & (own[0] <= start + 5.0)
-        around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
-        fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
-    found = fit.solve()
-    assert found is not None
+    found = solved(seen_from(0.0), seen_from(phase), 60.0)
     assert abs(found.offset) < min(0.005, found.stddev)
 
 

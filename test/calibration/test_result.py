@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from body_tracking.calibration.result import ClockModel, level_pose
+from body_tracking.calibration.result import ClockModel, KnownClock, level_pose
 from body_tracking.skeleton import NANOSECONDS
 
 STAMPS = st.integers(0, 2_000_000_000 * NANOSECONDS)
@@ -33,6 +33,28 @@ def test_a_fast_clock_runs_ahead() -> None:
     clock = ClockModel(2 * NANOSECONDS, 100.0, 0)
     assert clock.to_sensor(10 * NANOSECONDS) == 12 * NANOSECONDS + 1_000_000
     assert clock.offset == 2.0
+
+
+@given(STAMPS, STAMPS, STAMPS, st.integers(-2_000_000_000, 2_000_000_000), st.floats(-500, 500))
+def test_a_clock_is_the_same_by_its_offset_at_another_time(
+    anchor: int, other: int, at: int, offset: int, drift: float
+) -> None:
+    clock = ClockModel(offset, drift, anchor)
+    moved = clock.anchored_at(other)
+    assert moved.anchor_ns == other
+    # of the product of drift and some decades a float keeps a microsecond
+    assert abs(moved.to_sensor(at) - clock.to_sensor(at)) <= 1000
+
+
+def test_a_clock_is_known_the_worse_the_longer_ago_it_was() -> None:
+    known = KnownClock(ClockModel(10**9, 20.0, 0), 0.003, 4.0)
+    later_ns = 1000 * NANOSECONDS
+    assert known.stddev_at(later_ns) == np.hypot(0.003, 0.004)
+    carried = known.carried_to(later_ns, 3.0)
+    assert carried.model == known.model.anchored_at(later_ns)
+    assert carried.drift_stddev_ppm == 5.0
+    assert carried.stddev == np.hypot(0.003, 0.005)
+    assert KnownClock().stddev_at(later_ns) == np.inf
 
 
 def test_the_reference_sensor_looks_along_x_with_z_up() -> None:
