@@ -20,13 +20,14 @@ soon (adjustable level of the process noise, Bar-Shalom, Li and Kirubarajan 2001
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from scipy.special import chdtri
 
+from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
@@ -47,6 +48,11 @@ ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
 LINEAR_MODELS = (ZERO_VELOCITY, CONSTANT_VELOCITY)
 
+T_POSE = (
+    "learn from a T-pose that is held still for a second where the sensors take the joints' centres to be, and take it "
+    "off: straight arms are straight then; of skeletons that state covariances only"
+)
+"""What the parameter of this name does, in all filters that have it."""
 _MAX_RANGE = 100.0
 """A coordinate beyond this many metres is no measurement of a person but a damaged number."""
 _REFERENCE_DISTANCE = 2.0
@@ -183,6 +189,7 @@ class LinearKalmanParameters:
         0.0,
         10.0,
     )
+    t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 
     def __post_init__(self) -> None:
         check_fields(self, "linear filter", FilterError)
@@ -251,10 +258,16 @@ class LinearKalmanFilter:
             ),
             0,
         )
-        self.reset()
+        self._centres = JointCentres(self.counters)
+        self._restart()
 
     def reset(self) -> None:
-        """Forget every joint; the counters stay."""
+        """Forget the person; the counters stay."""
+        self._centres.reset()
+        self._restart()
+
+    def _restart(self) -> None:
+        """Forget every joint."""
         size = 3 * self._order
         self._kalman = KalmanFilter(dim_x=size, dim_z=3)
         self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))
@@ -284,6 +297,8 @@ class LinearKalmanFilter:
         step = self._step(skeleton)
         if step is None:
             return None
+        if self.parameters.t_pose:
+            self._centres.see(skeleton)
         positions, measured = self._measurement(skeleton)
         noise = self._measurement_noise(skeleton, positions, measured)
         rejected = self._filter(positions, noise, measured & self._alive, step)
@@ -294,7 +309,9 @@ class LinearKalmanFilter:
             self._start(started, positions, noise)
             self.counters["reacquired"] += int((started & rejected).sum())
         used = measured & (~rejected | started)
-        self._slow = np.where(used[:, None, None], (1.0 - self.parameters.white_noise_share) * noise, self._slow)
+        slow = (1.0 - self.parameters.white_noise_share) * noise
+        slow = self._centres.remaining(slow, np.where(measured[:, None], positions, np.nan), skeleton.stamp_ns)
+        self._slow = np.where(used[:, None, None], slow, self._slow)
         return self._output(skeleton, used)
 
     def _step(self, skeleton: Skeleton) -> float | None:
@@ -318,7 +335,10 @@ class LinearKalmanFilter:
                 reason = "gaps"
             if reason is not None:
                 self.counters[reason] += 1
-                self.reset()
+                if reason == "gaps":  # it is still the same person
+                    self._restart()
+                else:
+                    self.reset()
         step = 0.0 if self._frame_id is None else elapsed_ns / NANOSECONDS
         self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
         self.counters["frames"] += 1
@@ -329,7 +349,7 @@ class LinearKalmanFilter:
         # abs() < limit is False for NaN and infinity too
         sane = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
         measured: BoolArray = sane & (skeleton.states > TrackingState.NOT_TRACKED)
-        return np.where(measured[:, None], skeleton.positions, 0.0), measured
+        return np.where(measured[:, None], self._centres.corrected(skeleton), 0.0), measured
 
     def _measurement_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
         """(25, 3, 3) covariance of the measurements, positive definite; the identity where there is none."""

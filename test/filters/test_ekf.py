@@ -824,7 +824,7 @@ def test_a_person_who_is_nowhere_is_never_found() -> None:
 # --- parameters
 
 
-@pytest.mark.parametrize("name", [item.name for item in fields(EkfParameters)])
+@pytest.mark.parametrize("name", [item.name for item in fields(EkfParameters) if "min" in item.metadata])
 def test_parameters_out_of_range_are_refused(name: str) -> None:
     item = next(each for each in fields(EkfParameters) if each.name == name)
     low, high = item.metadata["min"], item.metadata["max"]

@@ -407,4 +407,5 @@ def test_names_and_parameters_are_checked() -> None:
 
 def test_every_parameter_says_what_it_is() -> None:
     for item in fields(LinearKalmanParameters):
-        assert item.metadata["doc"] and item.metadata["min"] <= item.default <= item.metadata["max"]
+        assert item.metadata["doc"]
+        assert isinstance(item.default, bool) or item.metadata["min"] <= item.default <= item.metadata["max"]

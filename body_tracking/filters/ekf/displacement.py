@@ -1,16 +1,17 @@
-"""What a pose is off by because sensors take the centres of joints to be elsewhere, which no filter can know."""
+"""What a pose is off by because sensors take the centres of joints to be elsewhere, as far as no T-pose told where."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SLOW_PERIOD_NS
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.model import Linearisation
-from body_tracking.skeleton import FloatArray, Joint
+from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 _DIMENSIONS = 3
 _BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
@@ -23,17 +24,19 @@ class Displacement:
 
     Args:
         space: of the states.
+        centres: what is known of the joints' centres.
         parameters: of the filter.
 
     Attributes:
         prior_information: (53, 53) on tangent and lengths without any measurement.
     """
 
-    def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
-        self._space, self._parameters = space, parameters
+    def __init__(self, space: StateSpace, centres: JointCentres, parameters: EkfParameters) -> None:
+        self._space, self._centres, self._parameters = space, centres, parameters
         self._of_arms = np.isin(
             space.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
         )
+        self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
         self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
         self._last_displaced: tuple[int, FloatArray] | None = None
 
@@ -72,8 +75,18 @@ class Displacement:
         observation = space.observation(lines)
         weighted = observation.T * weights.repeat(_DIMENSIONS)
         gain = np.linalg.solve(weighted @ observation + information, weighted)
-        displacement = gain * offsets.repeat(_DIMENSIONS)
+        if self._centres.offsets is not None:
+            known: FloatArray = self._parameters.offset_scale**2 * gain @ self._left(state, lines) @ gain.T
+            return known
+        displacement: FloatArray = gain * offsets.repeat(_DIMENSIONS)
         return displacement @ displacement.T
+
+    def _left(self, state: State, lines: Linearisation) -> FloatArray:
+        """(57, 57) covariance of the points' offsets after a T-pose."""
+        positions = np.full((N_JOINTS, _DIMENSIONS), np.nan)
+        positions[self._space.model.joints] = lines.posture.positions
+        spread: FloatArray = self._centres.spread(positions, state.stamp_ns)[np.ix_(self._rows, self._rows)]
+        return spread
 
     def _held(self, state: State, lines: Linearisation) -> FloatArray:
         """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""

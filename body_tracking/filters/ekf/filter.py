@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.facing import Facing
 from body_tracking.filters.ekf.motion import Motion
@@ -19,6 +20,7 @@ from body_tracking.filters.ekf.skeletons import SkeletonUpdate
 from body_tracking.filters.ekf.sources import pose_of
 from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.lengths import SegmentLengths
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import INFERRED_FACTOR
 from body_tracking.orientation import SegmentOrientation
@@ -82,7 +84,8 @@ class ExtendedKalmanFilter:
         self._sensors = SensorErrors(space, p)
         self._priors = Priors(space, p, self.counters)
         self._poses = PoseSearch(space, self._motion, self._sensors, p, self.counters)
-        self._displacement = Displacement(space, p)
+        self._centres = JointCentres(self.counters)
+        self._displacement = Displacement(space, self._centres, p)
         self._orientations = OrientationUpdate(space, self._motion, self._priors, self._displacement, p, self.counters)
         self._skeletons = SkeletonUpdate(
             space,
@@ -113,6 +116,8 @@ class ExtendedKalmanFilter:
         self._newest_of: dict[str, int] = {}
         self._poses.started_by = None
         self._skeletons.forget()
+        self._centres.reset()
+        self._lengths_from_ns: int | None = None
         self._displacement.forget()
         self._output.forget()
 
@@ -170,6 +175,8 @@ class ExtendedKalmanFilter:
             return False
         state = self._last  # a jump of time may have reset it
         self.counters["frames"] += 1
+        if self.parameters.t_pose and self._centres.see(skeleton, sensor):
+            self._lengths_from_ns = skeleton.stamp_ns
         if state is not None and state.unplaced:
             return self._placed(measurement)
         if state is not None and (self._is_awaited(measurement) or self._is_late(measurement, state)):
@@ -269,7 +276,7 @@ class ExtendedKalmanFilter:
     def _measurement(self, skeleton: Skeleton, sensor: str) -> Measurement:
         joints = self.model.joints
         measured = skeleton.valid[joints]
-        positions = np.where(measured[:, None], skeleton.positions[joints], 0.0)
+        positions = np.where(measured[:, None], self._centres.corrected(skeleton)[joints], 0.0)
         states = skeleton.states[joints]
         inferred = np.where(states == _TRACKED, 1.0, INFERRED_FACTOR**2)
         model = self._space.base_variance * inferred
@@ -453,6 +460,10 @@ class ExtendedKalmanFilter:
                 unseen = np.full(self._space.points, np.inf)
                 anew = self._poses.new_state(state.stamp_ns, state.q, state.lengths, unseen, None)
                 return anew.but(sensors=state.sensors, unplaced=state.unplaced)
+        from_ns = self._lengths_from_ns
+        if from_ns is not None and state.stamp_ns < from_ns <= measurement.stamp_ns and state.seen is not None:
+            # lengths between joints that are elsewhere now
+            state = state.but(seen=SegmentLengths(self.parameters.slow_time))
         state = self._motion.predicted(state, measurement.stamp_ns)
         if state.sources.names:
             state, skeleton = self._facing.put_right(state, measurement.skeleton)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from scipy.special import chdtri
 
 from body_tracking.filters.ekf.sources import OrientationParameters
-from body_tracking.filters.linear import FilterError
+from body_tracking.filters.linear import T_POSE, FilterError
 from body_tracking.parameters import check_fields, number_field
 
 
@@ -88,6 +88,8 @@ class EkfParameters(OrientationParameters):
     predict_for: float = number_field(
         2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
     )
+
+    t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 
     def __post_init__(self) -> None:
         check_fields(self, "extended filter", FilterError)

@@ -1,0 +1,472 @@
+"""Where sensors take the centres of a person's joints to be, learnt while the person holds a T-pose.
+
+A skeleton camera places joints some centimetres beside the anatomical ones, and much alike in the body's own axes
+whatever the person does: a real Kinect v2 against Vicon (UI-PRMD, five clips of a stretched right arm) has the elbow
+straighter by 13 to 15 degrees in four of them, +- 4 between hanging and level. Two such sensors are wrong together, so
+that no fusion helps. What helps is a pose that is known: in a T-pose upper arms and forearms point sideways at a right
+angle to the thorax, and left and right are alike, but for what a person who is asked for it does wrongly.
+
+With joints at ``m = p + b + e`` in the axes that they show, ``p`` the anatomical ones, ``b ~ N(0, P)`` what stays and
+``e ~ N(0, T)`` what does not, and a pose that says ``H p = c + w``, ``w ~ N(0, R)``, in the body's own axes, which are
+turned by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the offsets are known by
+(conditional normal distribution; ``G a = -H (a x m)``)
+
+    r = H m - c,  S = H (P + T) H^T + G A G^T + R                                                                  (1)
+    b = P H^T S^-1 r,  Cov(b) = P - P H^T S^-1 H P                                                                 (2)
+
+Only combinations that the pose speaks of become known: where the whole arm is does not. ``r^T S^-1 r`` is chi-square
+with as many degrees of freedom as (1) has rows where it was a T-pose at all.
+
+From then on the offsets are taken off, each in the frame of the segment that ends in the joint
+(:mod:`body_tracking.evaluation.segments` says how these turn).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtri
+
+from body_tracking.calibration.still_pose import is_t_pose
+from body_tracking.measurement import BASE_STDDEV
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
+
+_J = Joint
+_TRUNK = (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER)
+_LEFT = (_J.SHOULDER_LEFT, _J.ELBOW_LEFT, _J.WRIST_LEFT, _J.HAND_LEFT)
+_RIGHT = (_J.SHOULDER_RIGHT, _J.ELBOW_RIGHT, _J.WRIST_RIGHT, _J.HAND_RIGHT)
+_ARMS: Final[IntArray] = np.array([_LEFT, _RIGHT], dtype=np.intp)
+LEARNT: Final[IntArray] = np.array([*_TRUNK, *_LEFT, *_RIGHT], dtype=np.intp)
+"""(11,) joints whose offsets are learnt."""
+_PLACE = {Joint(joint): place for place, joint in enumerate(LEARNT)}
+_NEEDED = np.array([_PLACE[joint] for joint in (*_TRUNK[1:], *_LEFT[:3], *_RIGHT[:3])], dtype=np.intp)
+_FOLLOWERS = {
+    _J.SPINE_BASE: (_J.HIP_LEFT, _J.HIP_RIGHT),
+    _J.SPINE_SHOULDER: (_J.NECK, _J.HEAD),
+    _J.HAND_LEFT: (_J.HAND_TIP_LEFT, _J.THUMB_LEFT),
+    _J.HAND_RIGHT: (_J.HAND_TIP_RIGHT, _J.THUMB_RIGHT),
+}
+"""Joints that are displaced as the one before them."""
+_MOVED = np.array([*LEARNT, *(each for joint in _FOLLOWERS for each in _FOLLOWERS[joint])], dtype=np.intp)
+_MOVED_AS = np.array(
+    [*range(len(LEARNT)), *(_PLACE[joint] for joint in _FOLLOWERS for _ in _FOLLOWERS[joint])], dtype=np.intp
+)
+_CHAINS = len(_TRUNK) + np.arange(8).reshape(2, 4)
+"""(2, 4) places of shoulder, elbow, wrist and hand in them."""
+_NEUTRAL = np.array([[1.0, 1.0, -1.0], [1.0, -1.0, -1.0]]) / math.sqrt(3.0)
+"""(2, 3) forward, left and up: from where an upper arm's frame is turned, as there."""
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+HOLD = 0.7
+"""Seconds for which a pose has to be held."""
+_FEWEST = 10
+"""Frames in it."""
+_STRAY = 0.025
+"""Metres (root mean square) by which elbows and wrists may move meanwhile against the shoulders."""
+_CHECK_NS = NANOSECONDS // 10
+"""How often it is looked for."""
+_EASE = 0.3
+"""Seconds (time constant) in which offsets that were learnt come into force: nothing jumps."""
+_PROBABLE = 0.999
+"""Quantile of chi-square beyond which it was another pose."""
+POSE_STDDEV = math.radians(6.0)
+"""Radians by which a person's joints are off a T-pose, per axis."""
+_STRETCHED = math.radians(4.0)
+"""Radians by which elbows that are meant to be stretched are bent, palms down: forward, on average and by the standard
+deviation. They come to a stop at 0.6 +- 3.1 degrees (Boone and Azen 1979)."""
+_ALIKE = 0.01
+"""Metres by which left and right of a person's bones, and of where these meet, differ."""
+_SLOW = 0.3
+"""Share of a joint's stated variance that comes and goes (``slow_scale`` of the extended filter)."""
+_TOGETHER = 0.8
+"""Correlation of what comes and goes between the joints of an arm. With these two an arm's elevation varies by 6
+degrees and the elbow's flexion by 5; that real Kinect's errors vary by 3 to 8 and by 3 to 6.5 about their means, in
+each of six clips."""
+_AXES_STDDEV = 0.3
+"""Radians by which the axes of the joints are turned against the body's: more than is ever the case."""
+_SHOWN = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
+"""(11, 3) in which of the directions forward, left and up a T-pose shows where a joint is, against its neighbours: not
+along an arm, and of the spine, whose bend differs between people, only to the sides."""
+_UNSEEN = 1.0
+"""Square metres: variance of a joint that is not seen."""
+
+_CORRELATION = np.eye(len(LEARNT))
+for _arm in _CHAINS:
+    _CORRELATION[np.ix_(_arm, _arm)] += _TOGETHER * (1.0 - np.eye(len(_arm)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Offsets:
+    """What a T-pose tells.
+
+    Attributes:
+        local: (11, 3) metres from the anatomical joints to those that are seen, in the frames of the segments.
+        covariance: (33, 33) of these.
+        axes: (11, 3, 3) unit vectors, which in the T-pose pointed forward, left and up, in these frames.
+        share: of the variance of the arms' angles that offsets cause, how much is left: the largest of all.
+        distance: ``r^T S^-1 r``.
+        dimension: its expectation, if it was a T-pose.
+    """
+
+    local: FloatArray
+    covariance: FloatArray
+    axes: FloatArray
+    share: float
+    distance: float
+    dimension: int
+
+
+def body_axes(positions: FloatArray) -> FloatArray:
+    """(3, 3) rotation from forward, left and up of the thorax to the axes of (25, 3) positions; NaN where unknown."""
+    up = positions[_J.SPINE_SHOULDER] - positions[_J.SPINE_MID]
+    across = positions[_J.SHOULDER_LEFT] - positions[_J.SHOULDER_RIGHT]
+    up = up / math.sqrt(float(up @ up) or math.nan)
+    left = across - float(across @ up) * up
+    left = left / math.sqrt(float(left @ left) or math.nan)
+    axes = np.empty((3, 3))
+    axes[:, 0] = left[_NEXT] * up[_AFTER] - left[_AFTER] * up[_NEXT]  # numpy.cross takes ten times as long
+    axes[:, 1], axes[:, 2] = left, up
+    return axes
+
+
+def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
+    """Vectors that stay with the body, in the axes of its positions.
+
+    Args:
+        positions: (25, 3) metres, any frame, NaN where unknown.
+        local: (11, k, 3) vectors in the frame of the segment that ends in each of the joints ``LEARNT``.
+
+    Returns:
+        (11, k, 3) likewise; NaN where the thorax is unknown. For a bone that is unknown the one before it stands.
+    """
+    axes = body_axes(positions)
+    result: FloatArray = local @ axes.T
+    limbs = result[len(_TRUNK) :].reshape(len(_ARMS), -1, *local.shape[1:])  # (2, 4, k, 3), no copy
+    points = positions[_ARMS]
+    bones = points[:, 1:] - points[:, :-1]
+    squared = np.einsum("abi,abi->ab", bones, bones)
+    seen = squared > 1e-12  # False for NaN, too
+    bones /= np.sqrt(np.where(seen, squared, 1.0))[..., None]
+    before = _NEUTRAL @ axes.T
+    for level in range(bones.shape[1]):
+        bone = np.where(seen[:, level, None], bones[:, level], before)
+        limbs[:, level + 1 :] = limbs[:, level + 1 :] @ _bringing(before, bone).swapaxes(1, 2)[:, None]
+        before = bone
+    return result
+
+
+def _bringing(start: FloatArray, end: FloatArray) -> FloatArray:
+    """(n, 3, 3) the smallest rotations that bring (n, 3) unit vectors along others: two reflections."""
+    both = start + end
+    scale = 1.0 / np.maximum(1.0 + np.einsum("ni,ni->n", start, end), 1e-9)
+    result: FloatArray = (
+        np.eye(3) - (scale[:, None] * both)[:, :, None] * both[:, None] + 2.0 * end[:, :, None] * start[:, None]
+    )
+    return result
+
+
+def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
+    """The offsets of joints by how a T-pose looks (eq. 1-2).
+
+    Args:
+        positions: (25, 3) metres, forward, left and up in the axes of the thorax; any value where unknown.
+        transient: (11,) square metres per axis, of what does not stay, of the joints ``LEARNT``.
+    """
+    points = positions[LEARNT]
+    rows, wanted, stddev, angles = _t_pose(points)  # H, c, square root of R
+    prior = np.repeat(BASE_STDDEV[LEARNT] ** 2, 3)
+    residual = rows @ points.reshape(-1) - wanted
+    passing = np.kron(_CORRELATION * np.sqrt(np.outer(transient, transient)), np.eye(3))
+    # h . (a x m) = a . (m x h), summed over the joints
+    turning = np.cross(points, rows.reshape(len(rows), -1, 3)).sum(axis=1)
+    axes = _AXES_STDDEV**2 * turning @ turning.T
+    innovation = (rows * prior + rows @ passing) @ rows.T + axes + np.diag(stddev**2)
+    gain = np.linalg.solve(innovation, rows * prior)  # S^-1 H P
+    offsets = (residual @ gain).reshape(-1, 3)
+    covariance = np.diag(prior) - (rows * prior).T @ gain
+    left = np.einsum("ij,jk,ik->i", angles, covariance, angles) / (angles**2 @ prior)
+    # from the axes of the thorax into those of the segments
+    frames = turned(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
+    local = np.einsum("jab,jb->ja", frames, offsets)
+    blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
+    distance = float(residual @ np.linalg.solve(innovation, residual))
+    shown_along = frames.swapaxes(1, 2)
+    return Offsets(local, blocks.reshape(covariance.shape), shown_along, float(left.max()), distance, len(rows))
+
+
+def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """What a T-pose says of (11, 3) points: rows (n, 33), values and deviations (n,); and rows (8, 33) of angles."""
+    rows: list[FloatArray] = []
+    values: list[float] = []
+    stddev: list[float] = []
+    angles: list[FloatArray] = []
+    forward, left, up = range(3)
+
+    def say(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
+        row = np.zeros(points.shape)
+        for joint, factor in terms:
+            row[_PLACE[joint], axis] += factor
+        rows.append(row)
+        values.append(value)
+        stddev.append(deviation)
+        return row
+
+    def length(start: Joint, end: Joint) -> float:
+        return float(np.linalg.norm(points[_PLACE[end]] - points[_PLACE[start]]))
+
+    base, middle, top = _TRUNK
+    thorax, width = length(middle, top), length(_LEFT[0], _RIGHT[0])
+    for sign, arm, other in ((1.0, _LEFT, _RIGHT), (-1.0, _RIGHT, _LEFT)):
+        shoulder, elbow, wrist, hand = arm
+        upper, fore, palm = length(shoulder, elbow), length(elbow, wrist), length(wrist, hand)
+        # plane of elevation: the upper arm goes on along the line of the shoulders
+        ratio = upper / width
+        terms = (elbow, 1.0), (shoulder, -1.0 - ratio), (other[0], ratio)
+        angles.append(say(forward, 0.0, upper * POSE_STDDEV, *terms))
+        # elevation: at a right angle to the thorax, which leans by how its ends are off sideways
+        row = say(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
+        row[_PLACE[top], left], row[_PLACE[middle], left] = sign * upper / thorax, -sign * upper / thorax
+        angles.append(row)
+        for axis, bend, deviation in ((forward, _STRETCHED, _STRETCHED), (up, 0.0, POSE_STDDEV)):
+            ratio = fore / upper
+            terms = (wrist, 1.0), (elbow, -1.0 - ratio), (shoulder, ratio)
+            angles.append(say(axis, fore * bend, fore * deviation, *terms))
+            ratio = palm / fore
+            say(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
+    for start, end in zip(range(3), range(1, 4), strict=True):
+        terms_of_both = ((arm[end], 1.0) for arm in (_LEFT, _RIGHT)), ((arm[start], -1.0) for arm in (_LEFT, _RIGHT))
+        say(left, 0.0, _ALIKE, *terms_of_both[0], *terms_of_both[1])
+    shoulders = _LEFT[0], _RIGHT[0]
+    for axis in (forward, up):
+        say(axis, 0.0, _ALIKE, (shoulders[0], 1.0), (shoulders[1], -1.0))
+    for joint in (base, middle, top):
+        say(left, 0.0, _ALIKE, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
+    return (
+        np.array(rows).reshape(len(rows), -1),
+        np.array(values),
+        np.array(stddev),
+        np.array(angles).reshape(len(angles), -1),
+    )
+
+
+class _Seen:
+    """What one sensor has seen of the person."""
+
+    def __init__(self) -> None:
+        self.recent: deque[Skeleton] = deque()
+        self.checked_ns = self.taken_ns = -(2**62)
+        self.count = 0
+        self.sum: FloatArray = np.zeros((len(LEARNT), 3))
+        self.counts: FloatArray = np.zeros(len(LEARNT))
+        self.variance: FloatArray = np.zeros(len(LEARNT))
+
+
+class JointCentres:
+    """Learns the offsets of one person's joints, and takes them off.
+
+    Only skeletons that state covariances are learnt from: others say nothing of where they take joints to be.
+
+    Args:
+        counters: of who has it; counts ``t_poses`` that were learnt from, and ``t_poses_refused``, which looked as no
+            T-pose of a person does.
+
+    Attributes:
+        offsets: what is known; None before.
+    """
+
+    def __init__(self, counters: dict[str, int]) -> None:
+        self._counters = counters
+        counters |= {"t_poses": 0, "t_poses_refused": 0}
+        self._gates: dict[int, float] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._sensors: dict[str, _Seen] = {}
+        self.offsets: Offsets | None = None
+        self._before: FloatArray = np.zeros((len(LEARNT), 3))
+        self._since_ns = self._first_ns = 0
+        self._holding = False
+
+    def see(self, skeleton: Skeleton, sensor: str = "") -> bool:
+        """Look for a T-pose.
+
+        Args:
+            skeleton: in a fixed frame, with left and right as they are.
+            sensor: whose it is.
+
+        Returns:
+            Whether offsets came to be known that were not.
+        """
+        if skeleton.covariances is None:
+            return False
+        seen = self._sensors.setdefault(sensor, _Seen())
+        recent, stamp_ns = seen.recent, skeleton.stamp_ns
+        if recent and not 0 < stamp_ns - recent[-1].stamp_ns < _CHECK_NS * 3:
+            if -_CHECK_NS < stamp_ns - recent[-1].stamp_ns <= 0:
+                return False  # late
+            recent.clear()
+            seen.taken_ns = min(seen.taken_ns, stamp_ns - 1)  # time may have jumped back
+        recent.append(skeleton)
+        while len(recent) > 2 and stamp_ns - recent[1].stamp_ns >= HOLD * NANOSECONDS:
+            recent.popleft()
+        if 0 <= stamp_ns - seen.checked_ns < _CHECK_NS:
+            return False
+        seen.checked_ns = stamp_ns
+        if not is_t_pose(_known([skeleton])) or not self._is_held(recent):
+            self._holding = False
+            return False
+        return self._learn(seen, stamp_ns)
+
+    def _is_held(self, recent: deque[Skeleton]) -> bool:
+        """Whether a T-pose is held still over these frames."""
+        if recent[-1].stamp_ns - recent[0].stamp_ns < HOLD * NANOSECONDS or len(recent) < _FEWEST:
+            return False
+        positions = _known(recent)
+        if not is_t_pose(positions):
+            return False
+        arms = positions[:, _ARMS]
+        moving = arms[:, :, 1:3] - arms[:, :, :1]
+        moving = moving[np.isfinite(moving).all(axis=(1, 2, 3))]
+        return len(moving) >= _FEWEST and bool((moving.var(axis=0).sum(axis=-1) < _STRAY**2).all())
+
+    def _learn(self, seen: _Seen, stamp_ns: int) -> bool:
+        """Take what is new, and what all sensors saw together."""
+        new = [each for each in seen.recent if each.stamp_ns > seen.taken_ns]
+        if not new:
+            return False
+        points, variance = _in_body_axes(new)
+        candidate = _Seen()
+        there = np.isfinite(points).all(axis=-1) & np.isfinite(variance)
+        candidate.sum = np.where(there[..., None], points, 0.0).sum(axis=0)
+        candidate.variance = np.where(there, variance, 0.0).sum(axis=0)
+        candidate.counts = there.sum(axis=0).astype(np.float64)
+        own = _offsets([candidate])
+        if own is None or own.distance > self._gate(own.dimension):
+            self._counters["t_poses_refused"] += own is not None and not self._holding
+            self._holding = True
+            return False
+        seen.taken_ns = stamp_ns
+        seen.sum = seen.sum + candidate.sum
+        seen.variance = seen.variance + candidate.variance
+        seen.counts = seen.counts + candidate.counts
+        known = self.offsets is not None
+        if not known:
+            self._first_ns = stamp_ns
+        self._before = self._in_force(stamp_ns)
+        self.offsets, self._since_ns = _offsets(list(self._sensors.values())), stamp_ns
+        self._counters["t_poses"] += not self._holding
+        self._holding = True
+        return not known
+
+    def _gate(self, dimension: int) -> float:
+        if dimension not in self._gates:
+            self._gates[dimension] = float(chdtri(dimension, 1.0 - _PROBABLE))
+        return self._gates[dimension]
+
+    @staticmethod
+    def _progress(since_ns: int, stamp_ns: int) -> float:
+        """From 0 when something was learnt to 1 when it is in force."""
+        return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_EASE * NANOSECONDS)))
+
+    def _in_force(self, stamp_ns: int) -> FloatArray:
+        """(11, 3) metres, in the frames of the segments."""
+        if self.offsets is None:
+            return self._before
+        return self._before + self._progress(self._since_ns, stamp_ns) * (self.offsets.local - self._before)
+
+    def corrected(self, skeleton: Skeleton) -> FloatArray:
+        """(25, 3) positions without the offsets; as they are where none are known, or where the thorax is not seen."""
+        if self.offsets is None:
+            return skeleton.positions
+        known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
+        offsets = turned(known, self._in_force(skeleton.stamp_ns)[:, None])[:, 0]
+        if not np.isfinite(offsets).all():
+            return skeleton.positions
+        positions = skeleton.positions.copy()
+        positions[_MOVED] -= offsets[_MOVED_AS]
+        return positions
+
+    def remaining(self, covariances: FloatArray, positions: FloatArray, stamp_ns: int) -> FloatArray:
+        """Covariances of corrected joints, such that angles between them are known as well as they are.
+
+        What is left of the offsets moves joints together, which covariances of single joints cannot tell: across the
+        arms they are smaller than those of the joints' places by what makes the angles of the T-pose right.
+
+        Args:
+            covariances: (25, 3, 3) square metres, of the joints as they are seen.
+            positions: (25, 3) metres.
+            stamp_ns: of both.
+        """
+        known = self.offsets
+        if known is None:
+            return covariances
+        axes = turned(positions, known.axes)
+        if not np.isfinite(axes).all():
+            return covariances
+        mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
+        gone = (1.0 - _SLOW) * (1.0 - known.share) * self._progress(self._first_ns, stamp_ns)
+        factors = np.sqrt(1.0 - gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean)[:, None] * _SHOWN)
+        scaling = axes.swapaxes(1, 2) @ (factors[:, :, None] * axes)
+        result = covariances.copy()
+        result[LEARNT] = scaling @ covariances[LEARNT] @ scaling
+        return result
+
+    def spread(self, positions: FloatArray, stamp_ns: int) -> FloatArray:
+        """(75, 75) covariance of the offsets that are left, in the axes of (25, 3) positions: as they are, without
+        what does not stay.
+        """
+        result = np.repeat(BASE_STDDEV**2, 3)[:, None] * np.eye(3 * N_JOINTS)
+        if self.offsets is None:
+            return result
+        count = len(LEARNT)
+        frames = turned(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+        if not np.isfinite(frames).all():
+            return result
+        blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)
+        progress = self._progress(self._first_ns, stamp_ns)
+        places = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
+        learnt = np.ix_(places, places)
+        result[learnt] += progress * (blocks.reshape(3 * count, 3 * count) - result[learnt])
+        return result
+
+
+def _known(skeletons: Iterable[Skeleton]) -> FloatArray:
+    """(n, 25, 3) positions, NaN where not valid."""
+    return np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in skeletons])
+
+
+def _in_body_axes(skeletons: list[Skeleton]) -> tuple[FloatArray, FloatArray]:
+    """(n, 11, 3) joints from the middle of the shoulders, forward, left and up; (n, 11) their stated variances."""
+    points, variances = [], []
+    for each in skeletons:
+        assert each.covariances is not None
+        known = np.where(each.valid[:, None], each.positions, np.nan)
+        points.append((known[LEARNT] - known[_J.SPINE_SHOULDER]) @ body_axes(known))
+        variances.append(each.covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0)
+    return np.stack(points), np.stack(variances)
+
+
+def _offsets(sensors: list[_Seen]) -> Offsets | None:
+    """By what sensors saw, each by how much it states; None where a joint is missing that says what the arms do."""
+    precision, total = np.zeros(len(LEARNT)), np.zeros((len(LEARNT), 3))
+    for each in sensors:
+        seen = each.counts > 0.0
+        counts = np.where(seen, each.counts, 1.0)
+        own = np.where(seen, counts / np.maximum(each.variance, 1e-12), 0.0)
+        precision += own
+        total += own[:, None] * each.sum / counts[:, None]
+    if not (precision[_NEEDED] > 0.0).all():
+        return None
+    seen = precision > 0.0
+    points = total / np.where(seen, precision, 1.0)[:, None]
+    transient = np.where(seen, _SLOW / np.where(seen, precision, 1.0), _UNSEEN)
+    positions = np.full((N_JOINTS, 3), np.nan)
+    positions[LEARNT] = points
+    return t_pose_offsets(positions, transient)

@@ -1,0 +1,333 @@
+"""Laws of the offsets of joints that a T-pose tells, on people of whom these are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from body_tracking.calibration.joint_centres import (
+    LEARNT,
+    POSE_STDDEV,
+    JointCentres,
+    body_axes,
+    t_pose_offsets,
+    turned,
+)
+from body_tracking.evaluation.segments import segment_frames
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.measurement import BASE_STDDEV
+from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from walkers import performed
+
+T_POSE = performed("reaching", np.array([1.0]))[0]
+POSES = performed("reaching", np.arange(4.0, 14.0, 0.25))
+"""Arms in many directions, stretched and bent."""
+SIDES = ("left", "right")
+ANGLES = [ANGLE_NAMES.index(f"{name}_{side}") for name in ("shoulder_elevation", "elbow_flexion") for side in SIDES]
+FRAME_NS = NANOSECONDS // 30
+EYE = np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy()
+
+
+def some_offsets(seed: int = 0) -> FloatArray:
+    """(11, 3) metres in the frames of the segments."""
+    return np.random.default_rng(seed).normal(size=(len(LEARNT), 3)) * BASE_STDDEV[LEARNT, None]
+
+
+def seen(positions: FloatArray, local: FloatArray) -> FloatArray:
+    """(25, 3) with joints beside where they are."""
+    result = positions.copy()
+    result[LEARNT] += turned(positions, local[:, None])[:, 0]
+    return result
+
+
+def skeleton(positions: FloatArray, stamp_ns: int = 0, *, stated: bool = True) -> Skeleton:
+    states = np.where(np.isfinite(positions).all(axis=1), TrackingState.TRACKED, 0).astype(np.uint8)
+    covariances = BASE_STDDEV[:, None, None] ** 2 * np.eye(3) if stated else None
+    return Skeleton(stamp_ns, "world", positions, states, covariances=covariances)
+
+
+def angles(positions: FloatArray) -> FloatArray:
+    """Degrees: elevation and flexion of both arms."""
+    return np.degrees(positional_angles(skeleton(positions)).position[ANGLES])
+
+
+def held(centres: JointCentres, positions: FloatArray, *, start: float = 0.0, seconds: float = 2.0) -> int:
+    """Show a still pose with a little noise; the stamp after it."""
+    rng = np.random.default_rng(1)
+    stamps = round(start * NANOSECONDS) + FRAME_NS * np.arange(round(seconds * 30))
+    for stamp_ns in stamps.tolist():
+        centres.see(skeleton(positions + rng.normal(scale=0.002, size=positions.shape), stamp_ns))
+    return int(stamps[-1]) + FRAME_NS
+
+
+def test_offsets_turn_as_the_frames_of_the_segments_do() -> None:
+    frames = segment_frames(POSES)[:, LEARNT]
+    axes = np.stack([turned(each, EYE) for each in POSES])
+    of_thorax = LEARNT != Joint.SPINE_BASE  # a pelvis has its own frame there
+    assert_allclose(axes.swapaxes(-1, -2)[:, of_thorax], frames[:, of_thorax], atol=1e-9)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), st.integers(0, len(POSES) - 1))
+def test_offsets_turn_with_the_body(turn: tuple[float, float, float], pose: int) -> None:
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    moved = POSES[pose] @ rotation.T + [1.0, 2.0, 3.0]
+    local = some_offsets()[:, None]
+    assert_allclose(turned(moved, local), turned(POSES[pose], local) @ rotation.T, atol=1e-9)
+
+
+def test_a_bone_that_is_not_seen_turns_nothing_and_without_a_thorax_nothing_is_told() -> None:
+    hidden = np.where(np.arange(N_JOINTS)[:, None] == Joint.HAND_LEFT, np.nan, POSES[3])
+    assert_allclose(turned(hidden, EYE)[5], turned(POSES[3], EYE)[5])
+    assert np.isfinite(turned(hidden, EYE)).all()
+    hidden[Joint.SPINE_MID] = np.nan
+    assert np.isnan(turned(hidden, EYE)).all()
+
+
+def drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What eq. (1) assumes: a T-pose as people hold it, offsets and what passes; points, offsets, variances."""
+    up, left = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    points = np.full((N_JOINTS, 3), np.nan)
+    spine = (Joint.SPINE_SHOULDER, Joint.SPINE_MID, Joint.SPINE_BASE)
+    for joint, height in zip(spine, (0.0, -0.22, -0.5), strict=True):
+        points[joint] = height * up + rng.normal(scale=0.01) * left
+    lengths = 0.3, 0.25, 0.08
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        at = sign * 0.18 * left - 0.02 * up + rng.normal(scale=0.007, size=3) * [0.0, 1.0, 1.0]
+        points[Joint[f"SHOULDER_{side}"]] = at
+        direction = sign * left
+        stddev = ((POSE_STDDEV,) * 2, (np.radians(4.0), POSE_STDDEV), (2.0 * POSE_STDDEV,) * 2)
+        for joint, length, deviations, bend in zip(
+            ("ELBOW", "WRIST", "HAND"), lengths, stddev, (0.0, np.radians(4.0), 0.0), strict=True
+        ):
+            off = rng.normal(size=2) * deviations + [bend, 0.0]
+            direction = direction + [off[0], 0.0, off[1]]
+            at = at + length * direction / np.linalg.norm(direction) + sign * rng.normal(scale=0.007) * left
+            points[Joint[f"{joint}_{side}"]] = at
+    offsets = rng.normal(size=(len(LEARNT), 3)) * BASE_STDDEV[LEARNT, None]
+    transient = 0.3 * BASE_STDDEV[LEARNT] ** 2
+    together = rng.normal(size=(len(LEARNT), 3))
+    for arm in (slice(3, 7), slice(7, 11)):
+        together[arm] = np.sqrt(0.8) * rng.normal(size=3) + np.sqrt(0.2) * together[arm]
+    points[LEARNT] += offsets + np.sqrt(transient)[:, None] * together
+    axes = body_axes(points)
+    return (points - points[Joint.SPINE_SHOULDER]) @ axes, offsets @ axes, transient
+
+
+def test_what_is_known_of_offsets_is_as_good_as_stated() -> None:
+    rng = np.random.default_rng(3)
+    distances, errors, expected = [], [], 0
+    for _ in range(400):
+        points, offsets, transient = drawn(rng)
+        found = t_pose_offsets(points, transient)
+        distances.append(found.distance)
+        expected = found.dimension
+        local = turned(points, EYE) @ offsets[:, :, None]
+        off = (found.local - local[:, :, 0]).reshape(-1)
+        errors.append(off @ np.linalg.solve(found.covariance, off))
+    # chi-square in the mean; the body's axes are those of joints that are off, which the equations do not know
+    assert 0.85 < np.mean(distances) / expected < 1.15
+    assert 0.85 < np.mean(errors) / (3 * len(LEARNT)) < 1.15
+
+
+def test_left_and_right_are_treated_alike() -> None:
+    positions = seen(T_POSE, some_offsets())
+    flip = np.array([1.0, -1.0, 1.0])
+    axes = body_axes(positions)
+    own = (positions - positions[Joint.SPINE_SHOULDER]) @ axes
+    other = own[MIRROR] * flip
+    transient = 0.3 * BASE_STDDEV[LEARNT] ** 2
+    one, two = t_pose_offsets(own, transient), t_pose_offsets(other, transient)
+    shift_one = (one.local[:, None] @ turned(own, EYE))[:, 0]
+    shift_two = (two.local[:, None] @ turned(other, EYE))[:, 0]
+    exchanged = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6]
+    assert_allclose(shift_two, shift_one[exchanged] * flip, atol=1e-9)
+    assert one.distance == pytest.approx(two.distance)
+    assert one.share == pytest.approx(two.share)
+
+
+def test_angles_are_better_in_all_poses_after_a_t_pose() -> None:
+    before, after = [], []
+    for seed in range(20):
+        local = some_offsets(seed)
+        counters: dict[str, int] = {}
+        centres = JointCentres(counters)
+        stamp_ns = held(centres, seen(T_POSE, local)) + 5 * NANOSECONDS
+        assert counters == {"t_poses": 1, "t_poses_refused": 0}
+        for pose in POSES[::3]:
+            frame = skeleton(seen(pose, local), stamp_ns)
+            before.append(angles(frame.positions) - angles(pose))
+            after.append(angles(centres.corrected(frame)) - angles(pose))
+    rms = [float(np.sqrt(np.mean(np.square(each)))) for each in (before, after)]
+    assert rms[1] < 0.6 * rms[0]
+
+
+def test_offsets_come_into_force_without_a_jump_and_stay() -> None:
+    local = some_offsets()
+    centres = JointCentres({})
+    positions = seen(T_POSE, local)
+    shifts = []
+    for number in range(150):
+        frame = skeleton(positions, number * FRAME_NS)
+        centres.see(frame)
+        shifts.append(centres.corrected(frame) - positions)
+    shift = np.linalg.norm(shifts, axis=-1)
+    assert not shift[:20].any()
+    assert np.abs(np.diff(shift, axis=0)).max() < 0.006
+    assert shift[60].max() > 0.02
+    assert_allclose(shifts[-1], shifts[-20], atol=1e-4)
+    # whatever stamps come, and in whatever order
+    late = skeleton(positions, 10 * FRAME_NS)
+    assert np.linalg.norm(centres.corrected(late) - positions, axis=-1).max() <= shift[-1].max()
+    centres.reset()
+    assert_allclose(centres.corrected(skeleton(positions, 200 * FRAME_NS)), positions)
+
+
+def turned_arms(degrees: float) -> FloatArray:
+    """The T-pose with both arms lower."""
+    positions = T_POSE.copy()
+    axes = body_axes(positions)
+    for side, sign in (("LEFT", 1.0), ("RIGHT", -1.0)):
+        joints = [Joint[f"{name}_{side}"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
+        shoulder = positions[Joint[f"SHOULDER_{side}"]]
+        turn = Rotation.from_rotvec(-sign * np.radians(degrees) * axes[:, 0]).as_matrix()
+        positions[joints] = (positions[joints] - shoulder) @ turn.T + shoulder
+    return positions
+
+
+@pytest.mark.parametrize("degrees", [-60.0, -45.0, 45.0, 60.0, 90.0])
+def test_other_poses_teach_nothing(degrees: float) -> None:
+    counters: dict[str, int] = {}
+    centres = JointCentres(counters)
+    held(centres, turned_arms(degrees))
+    assert counters["t_poses"] == 0
+    assert centres.offsets is None
+
+
+def test_what_looks_like_a_t_pose_of_nobody_is_refused_and_counted_once() -> None:
+    odd = T_POSE.copy()
+    odd[[Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT]] += 0.3 * body_axes(T_POSE)[:, 2]
+    counters: dict[str, int] = {}
+    centres = JointCentres(counters)
+    held(centres, odd)
+    assert centres.offsets is None
+    assert counters == {"t_poses": 0, "t_poses_refused": 1}
+
+
+def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
+    centres = JointCentres({})
+    for number in range(90):
+        wave = 0.08 * np.sin(number / 5.0) * body_axes(T_POSE)[:, 2]
+        moving = T_POSE.copy()
+        moving[[Joint.WRIST_LEFT, Joint.ELBOW_LEFT]] += wave
+        centres.see(skeleton(moving, number * FRAME_NS))
+    assert centres.offsets is None
+    held(centres, T_POSE, start=10.0, seconds=0.6)
+    held(centres, POSES[5], start=10.6, seconds=1.0)
+    held(centres, T_POSE, start=11.6, seconds=0.6)
+    assert centres.offsets is None
+    # two moments with nothing between are not one
+    held(centres, T_POSE, start=20.0, seconds=0.5)
+    held(centres, T_POSE, start=21.0, seconds=0.5)
+    assert centres.offsets is None
+    held(centres, T_POSE, start=30.0)
+    assert centres.offsets is not None
+
+
+@pytest.mark.parametrize("joint", ["SPINE_MID", "SHOULDER_LEFT", "ELBOW_RIGHT", "WRIST_LEFT"])
+def test_without_one_of_the_joints_that_matter_nothing_is_learnt(joint: str) -> None:
+    centres = JointCentres({})
+    hidden = np.where(np.arange(N_JOINTS)[:, None] == Joint[joint], np.nan, T_POSE)
+    held(centres, hidden)
+    assert centres.offsets is None
+    assert_allclose(centres.corrected(skeleton(hidden)), hidden)
+
+
+def test_hands_and_hips_that_are_not_seen_hinder_nothing() -> None:
+    local = some_offsets(2)
+    hidden = seen(T_POSE, local)
+    hidden[[Joint.HAND_LEFT, Joint.HAND_RIGHT, Joint.SPINE_BASE]] = np.nan
+    centres = JointCentres({})
+    stamp_ns = held(centres, hidden)
+    assert centres.offsets is not None
+    assert np.isfinite(centres.offsets.local).all()
+    corrected = centres.corrected(skeleton(hidden, stamp_ns + 5 * NANOSECONDS))
+    assert np.abs(angles(corrected) - angles(T_POSE)).max() < 0.5 * np.abs(angles(hidden) - angles(T_POSE)).max()
+
+
+def test_skeletons_that_state_nothing_teach_nothing() -> None:
+    centres = JointCentres({})
+    for number in range(90):
+        centres.see(skeleton(seen(T_POSE, some_offsets()), number * FRAME_NS, stated=False))
+    assert centres.offsets is None
+
+
+def test_broken_numbers_and_stamps_do_no_harm() -> None:
+    centres = JointCentres({})
+    for number in range(60):
+        broken = T_POSE.copy()
+        broken[number % N_JOINTS] = (np.nan, np.inf, 1e30)[number % 3]
+        frame = skeleton(broken, (number - 2 * (number % 5)) * FRAME_NS)
+        centres.see(frame)
+        centres.corrected(frame)
+    centres.see(replace(skeleton(T_POSE, 70 * FRAME_NS), covariances=np.full((N_JOINTS, 3, 3), np.nan)))
+    held(centres, seen(T_POSE, some_offsets()), start=100.0)
+    assert centres.offsets is not None
+    assert np.isfinite(centres.offsets.local).all()
+    # time runs backwards, as when a bag begins anew
+    held(centres, seen(T_POSE, some_offsets()), start=0.0)
+    assert np.isfinite(centres.offsets.local).all()
+
+
+def test_sensors_are_told_apart_and_what_they_saw_is_put_together() -> None:
+    local = some_offsets(4)
+    both, one = JointCentres({}), JointCentres({})
+    for number in range(60):
+        frame = skeleton(seen(T_POSE, local), number * FRAME_NS)
+        one.see(frame, "kinect1")
+        both.see(frame, "kinect1")
+        both.see(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
+    assert both.offsets is not None
+    assert one.offsets is not None
+    # two that saw the same know it better
+    assert both.offsets.share < one.offsets.share < 1.0
+
+
+def test_what_remains_is_less_across_the_arms_and_a_covariance() -> None:
+    centres = JointCentres({})
+    given_ones = np.stack([np.diag([4e-4, 9e-4, 16e-4])] * N_JOINTS)
+    assert_allclose(centres.remaining(given_ones, T_POSE, 0), given_ones)
+    stamp_ns = held(centres, T_POSE) + 5 * NANOSECONDS
+    for pose in POSES[::5]:
+        left = centres.remaining(given_ones, pose, stamp_ns)
+        assert (np.linalg.det(left) < np.linalg.det(given_ones) * (1.0 + 1e-9)).all()
+        assert (np.linalg.eigvalsh(left) > 1e-5).all()
+        upper = pose[Joint.ELBOW_LEFT] - pose[Joint.SHOULDER_LEFT]
+        upper /= np.linalg.norm(upper)
+        same = np.stack([9e-4 * np.eye(3)] * N_JOINTS)
+        elbow = centres.remaining(same, pose, stamp_ns)[Joint.ELBOW_LEFT]
+        assert upper @ elbow @ upper == pytest.approx(9e-4, rel=0.01)
+        assert 0.3 < np.linalg.eigvalsh(elbow)[0] / 9e-4 < 0.6
+        legs = [joint for joint in Joint if joint.name.startswith(("KNEE", "ANKLE"))]
+        assert_allclose(left[legs], given_ones[legs])
+
+
+def test_the_spread_of_offsets_shrinks_and_turns_with_the_body() -> None:
+    centres = JointCentres({})
+    before = centres.spread(T_POSE, 0)
+    assert_allclose(before, np.diag(np.repeat(BASE_STDDEV**2, 3)))
+    stamp_ns = held(centres, T_POSE) + 5 * NANOSECONDS
+    rotation = Rotation.from_rotvec([0.2, -0.4, 1.1]).as_matrix()
+    all_joints = np.kron(np.eye(N_JOINTS), rotation)
+    for pose in POSES[::7]:
+        after = centres.spread(pose, stamp_ns)
+        assert_allclose(after, after.T, atol=1e-12)
+        assert np.linalg.eigvalsh(after)[0] > -1e-9
+        assert np.linalg.eigvalsh(before - after)[0] > -1e-6
+        assert_allclose(centres.spread(pose @ rotation.T, stamp_ns), all_joints @ after @ all_joints.T, atol=1e-9)

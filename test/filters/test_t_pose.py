@@ -1,0 +1,139 @@
+"""What filters make of sensors that take joints to be elsewhere, after somebody has held a T-pose before them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from body_tracking.calibration.joint_centres import LEARNT, turned
+from body_tracking.filters import SkeletonFilter, make_filter
+from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.measurement import BASE_STDDEV
+from body_tracking.skeleton import FloatArray, Joint, Skeleton
+from walkers import TRACKED, frame, performed
+
+FILTERS = ("lkf_constant_velocity", "ekf")
+ELBOWS, ARMS = (
+    [ANGLE_NAMES.index(f"{angle}_{side}") for side in ("left", "right")]
+    for angle in ("elbow_flexion", "shoulder_elevation")
+)
+RATE = 30.0
+HOLDING, MOVING = range(70, 88), range(150, 480)
+"""Frames in which the pose is held and known, and in which the person is at it."""
+GAP = 1.5
+"""Seconds: longer than a linear filter goes on for, shorter than the other one."""
+
+
+@cache
+def reaching() -> FloatArray:
+    """A T-pose of three seconds, then arms in many directions."""
+    return performed("reaching")[: round(16.0 * RATE)]
+
+
+@cache
+def skeletons() -> tuple[Skeleton, ...]:
+    """The same as a camera sees it that takes elbows to be too low and wrists too high."""
+    local = np.zeros((len(LEARNT), 3))
+    for place, joint in enumerate(LEARNT):
+        if joint in (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT):
+            local[place] = [-0.02, 0.0, -0.03]
+        elif joint in (Joint.WRIST_LEFT, Joint.WRIST_RIGHT):
+            local[place] = [0.02, 0.0, 0.03]
+    t_pose = reaching()[20]
+    # in the frames of the segments, of what is so in the T-pose
+    axes = turned(t_pose, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())
+    local = np.einsum("jab,jb->ja", axes, local)
+    rng = np.random.default_rng(0)
+    covariances = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
+    result = []
+    for number, true in enumerate(reaching()):
+        positions = true + rng.normal(scale=0.001, size=true.shape)
+        positions[LEARNT] += turned(true, local[:, None])[:, 0]
+        each = frame(number / RATE + 1.0, positions)
+        result.append(Skeleton(each.stamp_ns, "world", positions, TRACKED, covariances=covariances))
+    return tuple(result)
+
+
+def run(
+    tested: SkeletonFilter, frames: range = MOVING, left_out: range = range(0), angles: list[int] = ELBOWS
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of angles in degrees in some frames, and their stated deviations."""
+    errors, stddev = [], []
+    for number, (seen, true) in enumerate(zip(skeletons(), reaching(), strict=True)):
+        out = None if number in left_out else tested.update(seen)
+        if out is None or number not in frames:
+            continue
+        found = positional_angles(out)
+        right = positional_angles(Skeleton(out.stamp_ns, "world", true, TRACKED))
+        errors.append((found.position - right.position)[angles])
+        stddev.append(found.position_stddev[angles])
+    return np.degrees(errors), np.degrees(stddev)
+
+
+def rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_elbows_are_bent_as_they_are_after_a_t_pose(name: str) -> None:
+    with_it, without = make_filter(name), make_filter(name, t_pose=False)
+    (errors, stddev), (untold, _) = run(with_it), run(without)
+    assert with_it.counters["t_poses"] == 1
+    assert without.counters["t_poses"] == 0
+    assert rms(untold) > 12.0
+    assert rms(errors) < 0.4 * rms(untold)
+    assert (np.abs(errors) < 1.96 * stddev).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_they_are_surer_of_where_arms_point_and_not_too_sure(name: str) -> None:
+    errors, stddev = run(make_filter(name), HOLDING, angles=ARMS)
+    _, unsure = run(make_filter(name, t_pose=False), HOLDING, angles=ARMS)
+    assert np.median(stddev) < 0.8 * np.median(unsure)
+    assert (np.abs(errors) < 1.96 * stddev).all()
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_who_is_not_seen_for_a_moment_need_not_hold_the_pose_again(name: str) -> None:
+    errors, _ = run(make_filter(name), left_out=range(100, 100 + round(GAP * RATE)))
+    untold, _ = run(make_filter(name, t_pose=False))
+    assert rms(errors) < 0.4 * rms(untold)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_somebody_else_has_other_joints(name: str) -> None:
+    tested = make_filter(name)
+    for each in skeletons()[:120]:
+        tested.update(each)
+    assert tested.counters["t_poses"] == 1
+    tested.reset()
+    errors = []
+    for seen, true in zip(skeletons()[150:], reaching()[150:], strict=True):
+        out = tested.update(seen)
+        if out is not None:
+            found = positional_angles(out).position - positional_angles(Skeleton(0, "world", true, TRACKED)).position
+            errors.append(found[ELBOWS])
+    untold, _ = run(make_filter(name, t_pose=False))
+    assert rms(np.degrees(errors)) > 0.8 * rms(untold)
+
+
+def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
+    ekf = make_filter("ekf")
+    run(ekf)
+    lengths = ekf.estimate.lengths  # type: ignore[attr-defined]
+    true = reaching()[0]
+    for name, start, end in (("upper_arm", "SHOULDER", "ELBOW"), ("forearm", "ELBOW", "WRIST")):
+        for side in ("left", "right"):
+            known = lengths[ekf.model.length_names.index(f"{name}_{side}")]  # type: ignore[attr-defined]
+            real = np.linalg.norm(true[Joint[f"{end}_{side.upper()}"]] - true[Joint[f"{start}_{side.upper()}"]])
+            assert known == pytest.approx(real, abs=0.015)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("bad", [1, "yes", None])
+def test_it_is_on_or_off(name: str, bad: object) -> None:
+    with pytest.raises(FilterError, match="t_pose"):
+        make_filter(name, t_pose=bad)
