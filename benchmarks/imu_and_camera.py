@@ -31,6 +31,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import json
 import multiprocessing
 import sys
 import time
@@ -254,7 +255,7 @@ def main() -> int:
     parser.add_argument("--set", default="", metavar="A=1,B=2", help="other parameters of the filter")
     args = parser.parse_args()
     changes = dict(change.split("=") for change in args.set.split(",") if change)
-    parameters = EkfParameters(**{name: float(value) for name, value in changes.items()})
+    parameters = EkfParameters(**{name: json.loads(value) for name, value in changes.items()})
     runs = [
         Run(motion, _FIRST_SEED + seed, args.azimuth, not args.no_magnetometer, parameters)
         for motion in args.motions.split(",")
