@@ -60,7 +60,8 @@ class EkfParameters(OrientationParameters):
     offset_scale: float = number_field(
         1.0,
         "distance of the joints' centres by a sensor that states covariances from the anatomical ones, in standard "
-        "deviations of body_tracking.measurement; no filter can know it, and it is added to what is handed out",
+        "deviations of body_tracking.measurement; only a T-pose tells of it, and what it leaves is added to what is "
+        "handed out",
         "1",
         0.0,
         10.0,
