@@ -88,6 +88,7 @@ class SkeletonFilterNode(GraphNode):
         self.inputs: list[Subscription] = []
         self.outputs: dict[str, Publisher] = {}
         self.sent_ns: int | None = None
+        self.t_poses = 0
         super().__init__()
 
     def configure(self, values: Mapping[str, Value]) -> None:
@@ -248,7 +249,11 @@ class SkeletonFilterNode(GraphNode):
         """The filter's counters."""
         assert self.stage is not None
         self.tell_tracked()
-        return 0, str(self.values["filter"]), {"tracked": ", ".join(self.tracked), **self.stage.counters}
+        counters = self.stage.counters
+        before, self.t_poses = self.t_poses, counters.get("t_poses", 0)
+        if self.t_poses > before:
+            self.get_logger().info("a T-pose told where sensors take this person's joints to be: angles are better now")
+        return 0, str(self.values["filter"]), {"tracked": ", ".join(self.tracked), **counters}
 
 
 def main() -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from body_tracking.messages.base import RosMessages, to_nanoseconds, to_time  # 
 from body_tracking.messages.calibration import pose_to_transform  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
-from body_tracking.skeleton import Skeleton  # noqa: E402
+from body_tracking.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 
 ROS = RosMessages()
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
@@ -256,6 +257,19 @@ def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Runni
     assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("repeated stamps", 0)) == 1)
     assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("stamps backwards", 0)) >= 2)
     assert all(process.poll() is None for process in nodes.processes.values())
+
+
+def test_a_t_pose_that_is_held_is_told(nodes: Running) -> None:
+    publisher = nodes.node.create_publisher(PointCloud2, "/kinect1/skeleton", RELIABLE)
+    assert nodes.until(lambda: publisher.get_subscription_count() == 2)
+    first, begin = recorded("kinect1")[0].stamp_ns, 2 * 10**12
+    held = [frame for frame in recorded("kinect1") if frame.stamp_ns < first + 2 * NANOSECONDS]
+    for frame in held:
+        publisher.publish(skeletons_to_cloud([replace(frame, stamp_ns=begin + frame.stamp_ns - first)], ROS))
+        nodes.executor.spin_once(timeout_sec=0.005)
+    assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"].get("t_poses") == "1")
+    assert "a T-pose told" in nodes.log("skeleton_filter")
+    nodes.node.destroy_publisher(publisher)
 
 
 def test_the_filter_may_change_while_it_runs_but_not_to_nonsense(nodes: Running) -> None:
