@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from body_tracking.calibration.joint_centres import (
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import BASE_STDDEV
+from body_tracking.sensors.csv_recording import CsvRecording
 from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import performed
 
@@ -331,3 +333,18 @@ def test_the_spread_of_offsets_shrinks_and_turns_with_the_body() -> None:
         assert np.linalg.eigvalsh(after)[0] > -1e-9
         assert np.linalg.eigvalsh(before - after)[0] > -1e-6
         assert_allclose(centres.spread(pose @ rotation.T, stamp_ns), all_joints @ after @ all_joints.T, atol=1e-9)
+
+
+def test_people_who_hold_no_t_pose_are_taken_for_none_who_do(shared_data: Path) -> None:
+    """Thirteen minutes of three people who stand, step, walk, reach and turn, by two real sensors each."""
+    frames = 0
+    for path in sorted((shared_data / "kinect_pairs").glob("[op]*.csv.gz")):
+        counters: dict[str, int] = {}
+        centres = JointCentres(counters)
+        for frame in CsvRecording(path):
+            for each in frame.skeletons:
+                stated = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
+                centres.see(replace(each, covariances=stated), frame.sensor)
+                frames += 1
+        assert counters == {"t_poses": 0, "t_poses_refused": 0}, path.name
+    assert frames > 10000
