@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -255,16 +255,38 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     )
 
 
-class _Seen:
-    """What one sensor has seen of the person."""
+_LONG_AGO_NS = -(2**62)
 
-    def __init__(self) -> None:
-        self.recent: deque[Skeleton] = deque()
-        self.checked_ns = self.taken_ns = -(2**62)
-        self.count = 0
-        self.sum: FloatArray = np.zeros((len(LEARNT), 3))
-        self.counts: FloatArray = np.zeros(len(LEARNT))
-        self.variance: FloatArray = np.zeros(len(LEARNT))
+
+@dataclass(slots=True, eq=False)
+class _Seen:
+    """What one sensor has seen of the person; arrays are never written into."""
+
+    recent: deque[Skeleton] = field(default_factory=deque)
+    checked_ns: int = _LONG_AGO_NS
+    taken_ns: int = _LONG_AGO_NS
+    sum: FloatArray = field(default_factory=lambda: np.zeros((len(LEARNT), 3)))
+    counts: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
+    variance: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
+
+    def copied(self) -> _Seen:
+        return replace(self, recent=self.recent.copy())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """All that is known of a person's joints at some time."""
+
+    sensors: Mapping[str, _Seen]
+    offsets: Offsets | None
+    before: FloatArray
+    since_ns: int
+    first_ns: int
+    holding: bool
+
+    def from_the_beginning(self) -> Memory:
+        """The same, as if it had been known long before."""
+        return replace(self, since_ns=_LONG_AGO_NS, first_ns=_LONG_AGO_NS)
 
 
 class JointCentres:
@@ -288,11 +310,18 @@ class JointCentres:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._sensors: dict[str, _Seen] = {}
-        self.offsets: Offsets | None = None
-        self._before: FloatArray = np.zeros((len(LEARNT), 3))
-        self._since_ns = self._first_ns = 0
-        self._holding = False
+        self.recall(Memory({}, None, np.zeros((len(LEARNT), 3)), 0, 0, holding=False))
+
+    def memory(self) -> Memory:
+        """What is known now, to go back to."""
+        sensors = {name: seen.copied() for name, seen in self._sensors.items()}
+        return Memory(sensors, self.offsets, self._before, self._since_ns, self._first_ns, self._holding)
+
+    def recall(self, memory: Memory) -> None:
+        """Know what was known then, and nothing else."""
+        self._sensors = {name: seen.copied() for name, seen in memory.sensors.items()}
+        self.offsets, self._before = memory.offsets, memory.before
+        self._since_ns, self._first_ns, self._holding = memory.since_ns, memory.first_ns, memory.holding
 
     def see(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """Look for a T-pose.

@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
+from body_tracking.calibration.joint_centres import Memory
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.ekf.state import Measurement, State
 from body_tracking.filters.linear import FilterError
@@ -242,8 +243,15 @@ def smooth(
             progress(done / max(total, 1))
 
     ekf = ExtendedKalmanFilter(parameters, model)
-    learnt = _learnt(ekf, (skeletons[k] for k in order), tell) if learn else None
-    forward = _Forward(ExtendedKalmanFilter(ekf.parameters, ekf.model) if learn else ekf, learnt)
+    if learn:
+        learnt = _learnt(ekf, (skeletons[k] for k in order), tell)
+        # what a T-pose told at any time holds all the time
+        centres = ekf._centres.memory().from_the_beginning()
+        ekf._centres.recall(centres)
+        again = ExtendedKalmanFilter(replace(ekf.parameters, t_pose=False), ekf.model)
+        forward = _Forward(again, learnt, centres)
+    else:
+        forward = _Forward(ekf)
     kept = [(0, forward.place())]
     for number, k in enumerate(order):
         # not while the filter waits for a start, about which the place says nothing
@@ -321,9 +329,11 @@ def _learnt(
 class _Forward:
     """A filter that can be put back to an earlier place, and that never forgets what was learnt before."""
 
-    def __init__(self, ekf: ExtendedKalmanFilter, learnt: State | None) -> None:
+    def __init__(self, ekf: ExtendedKalmanFilter, learnt: State | None = None, centres: Memory | None = None) -> None:
         self._ekf = ekf
-        self._learnt = learnt
+        self._learnt, self._centres = learnt, centres
+        if centres is not None:
+            ekf._centres.recall(centres)
         # as if the person had been out of sight for longer than is predicted
         self._absence_ns = round((ekf.parameters.predict_for + 1.0) * NANOSECONDS)
 
@@ -332,20 +342,23 @@ class _Forward:
         ekf = self._ekf
         if self._learnt is not None and (ekf._state is None or ekf._frame_id != skeleton.frame_id):
             ekf.reset()
+            if self._centres is not None:
+                ekf._centres.recall(self._centres)
             ekf._state = replace(self._learnt, stamp_ns=skeleton.stamp_ns - self._absence_ns)
             ekf._frame_id = skeleton.frame_id
         before = ekf._state
         ekf.update(skeleton, sensor)
         return None if ekf._state is before else ekf._state
 
-    def place(self) -> tuple[State | None, str]:
+    def place(self) -> tuple[State | None, str, Memory]:
         """From where to go on."""
-        return self._ekf._state, self._ekf._frame_id
+        return self._ekf._state, self._ekf._frame_id, self._ekf._centres.memory()
 
-    def go_back(self, place: tuple[State | None, str]) -> None:
+    def go_back(self, place: tuple[State | None, str, Memory]) -> None:
         """Go on from an earlier place."""
         self._ekf.reset()
-        self._ekf._state, self._ekf._frame_id = place
+        self._ekf._state, self._ekf._frame_id, centres = place
+        self._ekf._centres.recall(centres)
 
 
 # --- live

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from body_tracking.calibration.joint_centres import LEARNT, turned
-from body_tracking.filters import SkeletonFilter, make_filter
+from body_tracking.filters import SkeletonFilter, make_filter, smoother
+from body_tracking.filters.ekf import EkfParameters
 from body_tracking.filters.linear import FilterError
+from body_tracking.filters.smoother import Smoothed, smooth
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.skeleton import FloatArray, Joint, Skeleton
@@ -57,6 +59,13 @@ def skeletons() -> tuple[Skeleton, ...]:
     return tuple(result)
 
 
+def off(found: Skeleton, true: FloatArray) -> FloatArray:
+    """(13,) radians by which angles are off."""
+    right = positional_angles(Skeleton(found.stamp_ns, "world", true, TRACKED))
+    error: FloatArray = positional_angles(found).position - right.position
+    return error
+
+
 def run(
     tested: SkeletonFilter, frames: range = MOVING, left_out: range = range(0), angles: list[int] = ELBOWS
 ) -> tuple[FloatArray, FloatArray]:
@@ -66,10 +75,8 @@ def run(
         out = None if number in left_out else tested.update(seen)
         if out is None or number not in frames:
             continue
-        found = positional_angles(out)
-        right = positional_angles(Skeleton(out.stamp_ns, "world", true, TRACKED))
-        errors.append((found.position - right.position)[angles])
-        stddev.append(found.position_stddev[angles])
+        errors.append(off(out, true)[angles])
+        stddev.append(positional_angles(out).position_stddev[angles])
     return np.degrees(errors), np.degrees(stddev)
 
 
@@ -114,8 +121,7 @@ def test_somebody_else_has_other_joints(name: str) -> None:
     for seen, true in zip(skeletons()[150:], reaching()[150:], strict=True):
         out = tested.update(seen)
         if out is not None:
-            found = positional_angles(out).position - positional_angles(Skeleton(0, "world", true, TRACKED)).position
-            errors.append(found[ELBOWS])
+            errors.append(off(out, true)[ELBOWS])
     untold, _ = run(make_filter(name, t_pose=False))
     assert rms(np.degrees(errors)) > 0.8 * rms(untold)
 
@@ -130,6 +136,33 @@ def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
             known = lengths[ekf.model.length_names.index(f"{name}_{side}")]  # type: ignore[attr-defined]
             real = np.linalg.norm(true[Joint[f"{end}_{side.upper()}"]] - true[Joint[f"{start}_{side.upper()}"]])
             assert known == pytest.approx(real, abs=0.015)
+
+
+def elbows_off(smoothed: Smoothed) -> FloatArray:
+    """(n, 2) degrees by which elbows are off in each frame that shows the person."""
+    pairs = zip(smoothed.skeletons, reaching(), strict=False)
+    return np.degrees([off(found, true)[ELBOWS] for found, true in pairs if found is not None])
+
+
+def test_in_a_recording_what_a_t_pose_tells_holds_before_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(smoother, "_SECTION", 60)
+    frames = [("kinect1", each) for each in skeletons()[:240]]
+    off = elbows_off(smooth(frames))
+    # the pose is known after 21 frames; live, all before is as it was seen
+    assert rms(off[:15]) < 6.0
+    assert rms(off[150:]) < 6.0
+    assert rms(elbows_off(smooth(frames, EkfParameters(t_pose=False)))[:15]) > 12.0
+
+
+def test_a_recording_is_smoothed_in_sections_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [("kinect1", each) for each in skeletons()[:120]]
+    whole = smooth(frames, learn=False)
+    monkeypatch.setattr(smoother, "_SECTION", 25)
+    parts = smooth(frames, learn=False)
+    for one, other in zip(whole.skeletons, parts.skeletons, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            np.testing.assert_allclose(one.positions, other.positions, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", FILTERS)
