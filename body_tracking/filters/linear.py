@@ -349,7 +349,8 @@ class LinearKalmanFilter:
         # abs() < limit is False for NaN and infinity too
         sane = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
         measured: BoolArray = sane & (skeleton.states > TrackingState.NOT_TRACKED)
-        return np.where(measured[:, None], self._centres.corrected(skeleton), 0.0), measured
+        corrected = self._centres.corrected(skeleton.positions, measured, skeleton.stamp_ns)
+        return np.where(measured[:, None], corrected, 0.0), measured
 
     def _measurement_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
         """(25, 3, 3) covariance of the measurements, positive definite; the identity where there is none."""

@@ -7,13 +7,14 @@ from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.ekf.sensor_errors import SLOW_PERIOD_NS
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.model import Linearisation
-from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint
 
 _DIMENSIONS = 3
+_PERIOD_NS = NANOSECONDS // 5
+"""How often it is told anew: it changes as the pose does."""
 _BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
 """Joints that show which way an arm is bent, and how many times the usual distance their centres are off for that: a
 Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simulated as calibrated with recordings)."""
@@ -52,8 +53,8 @@ class Displacement:
         without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
         offsets, err by more.
         """
-        period = state.stamp_ns // SLOW_PERIOD_NS
-        if self._last_displaced is None or self._last_displaced[0] != period:  # it changes slowly, as the pose does
+        period = state.stamp_ns // _PERIOD_NS
+        if self._last_displaced is None or self._last_displaced[0] != period:
             lines = self._space.model.linearise(state.q, state.lengths)
             information = self.prior_information
             if state.sources.names:

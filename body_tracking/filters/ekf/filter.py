@@ -275,8 +275,10 @@ class ExtendedKalmanFilter:
 
     def _measurement(self, skeleton: Skeleton, sensor: str) -> Measurement:
         joints = self.model.joints
-        measured = skeleton.valid[joints]
-        positions = np.where(measured[:, None], self._centres.corrected(skeleton)[joints], 0.0)
+        valid = skeleton.valid
+        measured = valid[joints]
+        corrected = self._centres.corrected(skeleton.positions, valid, skeleton.stamp_ns)
+        positions = np.where(measured[:, None], corrected[joints], 0.0)
         states = skeleton.states[joints]
         inferred = np.where(states == _TRACKED, 1.0, INFERRED_FACTOR**2)
         model = self._space.base_variance * inferred

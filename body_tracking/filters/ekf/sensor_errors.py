@@ -36,7 +36,7 @@ _LEAST_ERROR = 0.004
 """Metres: no sensor knows where the centre of a joint is better than this."""
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
-SLOW_PERIOD_NS = NANOSECONDS // 15
+_SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_STEP = 0.02
 """Share by which a scale changes at least: what it did to the state before has to be put right each time."""
 _SLOW_MEMORY = 0.7
@@ -130,7 +130,7 @@ class SensorErrors:
         if oriented and measurement.skeleton.covariances is not None:
             least[0] = max(least[0], self._parameters.slow_beside_orientations)
         # It changes slowly, and takes a while to compute.
-        soon = sensor.stamps and measurement.stamp_ns // SLOW_PERIOD_NS == sensor.stamps[-1] // SLOW_PERIOD_NS
+        soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
         # What is white is not known at first, and would be taken for slow.
         if soon or sensor.weight.max() < 2.0 * _POOL:
             scales = _kept(sensor.slow, np.maximum(sensor.slow, least))
@@ -151,7 +151,7 @@ class SensorErrors:
         squared = gram * gram
         scores = np.array([score[:points].sum(), score[points:].sum()])
         information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
-        passed = SLOW_PERIOD_NS / NANOSECONDS
+        passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
         # the mean of what each frame says, which may be less than nothing
         estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
