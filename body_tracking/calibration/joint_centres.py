@@ -18,7 +18,12 @@ Only combinations that the pose speaks of become known: where the whole arm is d
 with as many degrees of freedom as (1) has rows where it was a T-pose at all.
 
 From then on the offsets are taken off, each in the frame of the segment that ends in the joint
-(:mod:`body_tracking.evaluation.segments` says how these turn).
+(:mod:`body_tracking.evaluation.segments` says how these turn), as far as they stay. How a bone is rotated about itself
+its joints do not show; so the farther it points from where it did in the T-pose, the less is known of its offset there,
+
+    b' = d b + sqrt(1 - d^2) n,  n ~ N(0, P),  d = E[cos(roll)] = exp(-sigma^2 / 2)                                (3)
+
+(the same Kinect, of the same person: the elbow is bent more by 7 degrees, not less by 13, where it is bent by 67).
 """
 
 from __future__ import annotations
@@ -82,6 +87,9 @@ _STRETCHED = math.radians(4.0)
 deviation. They come to a stop at 0.6 +- 3.1 degrees (Boone and Azen 1979)."""
 _ALIKE = 0.01
 """Metres by which left and right of a person's bones, and of where these meet, differ."""
+_ROLL_STDDEV = math.radians(40.0)
+"""Radians by which a bone is rotated about itself that points at a right angle to where it did, or farther: of an even
+distribution over the +-70 degrees that a shoulder allows."""
 _SLOW = 0.3
 """Share of a joint's stated variance that comes and goes (``slow_scale`` of the extended filter)."""
 _TOGETHER = 0.8
@@ -184,6 +192,25 @@ def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
                     a, b = (hx * x + hy * y + hz * z) * scale, 2.0 * (sx * x + sy * y + sz * z)
                     own[number] = x - hx * a + ex * b, y - hy * a + ey * b, z - hz * a + ez * b
             sx, sy, sz = ex, ey, ez
+    return np.array(result)
+
+
+def kept(positions: FloatArray) -> FloatArray:
+    """(11,) ``d`` of eq. (3): 1 of the trunk and of all that points as in a T-pose.
+
+    Args:
+        positions: (25, 3) metres, any frame, NaN where unknown. For a bone that is unknown the one before it stands.
+    """
+    points = positions.take(LEARNT, axis=0).tolist()
+    _, (lx, ly, lz), _ = _axes(points[2], points[1], points[3], points[7])
+    result = [1.0] * len(points)
+    for first, side in ((len(_TRUNK), 1.0), (len(_TRUNK) + 4, -1.0)):
+        for bone in range(first, first + 3):
+            (px, py, pz), (qx, qy, qz) = points[bone], points[bone + 1]
+            ex, ey, ez = _unit(qx - px, qy - py, qz - pz)
+            away = 1.0 - side * (ex * lx + ey * ly + ez * lz)
+            known = away == away
+            result[bone + 1] = math.exp(-0.5 * _ROLL_STDDEV**2 * min(1.0, away)) if known else result[bone]
     return np.array(result)
 
 
@@ -440,7 +467,7 @@ class JointCentres:
         if self.offsets is None:
             return positions
         known = positions if measured.all() else np.where(measured[:, None], positions, np.nan)
-        offsets = turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
+        offsets = kept(known)[:, None] * turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
         if not math.isfinite(offsets.sum()):
             return positions
         result = positions.copy()
@@ -465,8 +492,8 @@ class JointCentres:
         if not np.isfinite(axes).all():
             return covariances
         mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
-        gone = (1.0 - _SLOW) * (1.0 - known.share) * self._progress(self._first_ns, stamp_ns)
-        factors = np.sqrt(1.0 - gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean)[:, None] * _SHOWN)
+        gone = (1.0 - _SLOW) * (1.0 - known.share) * self._progress(self._first_ns, stamp_ns) * kept(positions) ** 2
+        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _SHOWN)
         scaling = axes.swapaxes(1, 2) @ (factors[:, :, None] * axes)
         result = covariances.copy()
         result[LEARNT] = scaling @ covariances[LEARNT] @ scaling
@@ -484,7 +511,8 @@ class JointCentres:
         if not np.isfinite(frames).all():
             return result
         blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)
-        progress = self._progress(self._first_ns, stamp_ns)
+        share = kept(positions).repeat(3)
+        progress = self._progress(self._first_ns, stamp_ns) * share * share[:, None]
         places = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
         learnt = np.ix_(places, places)
         result[learnt] += progress * (blocks.reshape(3 * count, 3 * count) - result[learnt])

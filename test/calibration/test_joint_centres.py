@@ -17,6 +17,7 @@ from body_tracking.calibration.joint_centres import (
     POSE_STDDEV,
     JointCentres,
     body_axes,
+    kept,
     t_pose_offsets,
     turned,
 )
@@ -319,9 +320,23 @@ def test_what_remains_is_less_across_the_arms_and_a_covariance() -> None:
         same = np.stack([9e-4 * np.eye(3)] * N_JOINTS)
         elbow = centres.remaining(same, pose, stamp_ns)[Joint.ELBOW_LEFT]
         assert upper @ elbow @ upper == pytest.approx(9e-4, rel=0.01)
-        assert 0.3 < np.linalg.eigvalsh(elbow)[0] / 9e-4 < 0.6
+        assert 0.4 < np.linalg.eigvalsh(elbow)[0] / 9e-4 < 0.8
         legs = [joint for joint in Joint if joint.name.startswith(("KNEE", "ANKLE"))]
         assert_allclose(left[legs], given_ones[legs])
+
+
+def test_less_is_kept_of_offsets_the_farther_bones_point_from_where_they_did() -> None:
+    shares = np.array([kept(turned_arms(degrees)) for degrees in (0.0, 20.0, 45.0, 80.0)])
+    assert (shares[:, :4] == 1.0).all()  # trunk and shoulders
+    assert (shares[0] > 0.99).all()
+    assert (np.diff(shares[:, 4:7], axis=0) < -0.01).all()
+    assert (np.diff(shares[:, 8:], axis=0) < -0.01).all()
+    assert shares.min() > 0.78
+    rotation = Rotation.from_rotvec([0.3, 1.0, -0.5]).as_matrix()
+    assert_allclose(kept(turned_arms(45.0) @ rotation.T), shares[2])
+    hidden = turned_arms(45.0)
+    hidden[Joint.WRIST_LEFT] = np.nan
+    assert kept(hidden)[5] == kept(hidden)[4] == shares[2, 4]
 
 
 def test_the_spread_of_offsets_shrinks_and_turns_with_the_body() -> None:
