@@ -70,12 +70,16 @@ _LEAST = 1e-6
 
 HOLD = 0.7
 """Seconds for which a pose has to be held."""
-_FEWEST = 10
+_FEWEST = 5
 """Frames in it."""
 _STRAY = 0.025
 """Metres (root mean square) by which elbows and wrists may move meanwhile against the shoulders."""
-_CHECK_NS, _CHECK_AGAIN_NS = NANOSECONDS // 10, 2 * NANOSECONDS
-"""How often it is looked for in what a sensor sees, before one was seen and then."""
+_CHECK_NS, _CHECK_AGAIN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
+"""How long until it is looked for again in what a sensor sees: where there was none, and where one was learnt from."""
+_BREAK_NS, _LATE_NS = NANOSECONDS // 3, NANOSECONDS // 2
+"""Frames farther apart do not show one pose; one that is older than the last by more is of a time that jumped back."""
+_ANOTHER_NS = 2 * _CHECK_AGAIN_NS
+"""A pose that is held so much later than the last one is another."""
 _EASE = 0.3
 """Seconds (time constant) in which offsets that were learnt come into force: nothing jumps."""
 _PROBABLE = 0.999
@@ -306,7 +310,7 @@ class _Seen:
     """What one sensor has seen of the person; arrays are never written into."""
 
     recent: deque[Skeleton] = field(default_factory=deque)
-    checked_ns: int = _LONG_AGO_NS
+    check_ns: int = _LONG_AGO_NS
     taken_ns: int = _LONG_AGO_NS
     sum: FloatArray = field(default_factory=lambda: np.zeros((len(LEARNT), 3)))
     counts: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
@@ -325,7 +329,8 @@ class Memory:
     before: FloatArray
     since_ns: int
     first_ns: int
-    holding: bool
+    held_ns: int
+    refused_ns: int
 
     def from_the_beginning(self) -> Memory:
         """The same, as if it had been known long before."""
@@ -353,18 +358,20 @@ class JointCentres:
 
     def reset(self) -> None:
         """Forget the person."""
-        self.recall(Memory({}, None, np.zeros((len(LEARNT), 3)), 0, 0, holding=False))
+        self.recall(Memory({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
 
     def memory(self) -> Memory:
         """What is known now, to go back to."""
         sensors = {name: seen.copied() for name, seen in self._sensors.items()}
-        return Memory(sensors, self.offsets, self._before, self._since_ns, self._first_ns, self._holding)
+        times = self._since_ns, self._first_ns, self._held_ns, self._refused_ns
+        return Memory(sensors, self.offsets, self._before, *times)
 
     def recall(self, memory: Memory) -> None:
         """Know what was known then, and nothing else."""
         self._sensors = {name: seen.copied() for name, seen in memory.sensors.items()}
         self.offsets, self._before = memory.offsets, memory.before
-        self._since_ns, self._first_ns, self._holding = memory.since_ns, memory.first_ns, memory.holding
+        self._since_ns, self._first_ns = memory.since_ns, memory.first_ns
+        self._held_ns, self._refused_ns = memory.held_ns, memory.refused_ns
 
     def see(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """Look for a T-pose.
@@ -380,19 +387,20 @@ class JointCentres:
             return False
         seen = self._sensors.setdefault(sensor, _Seen())
         recent, stamp_ns = seen.recent, skeleton.stamp_ns
-        if recent and not 0 < stamp_ns - recent[-1].stamp_ns < _CHECK_NS * 3:
-            if -_CHECK_NS < stamp_ns - recent[-1].stamp_ns <= 0:
-                return False  # late
+        after_ns = stamp_ns - recent[-1].stamp_ns if recent else 1
+        if -_LATE_NS < after_ns <= 0:
+            return False
+        if not 0 < after_ns < _BREAK_NS:
             recent.clear()
-            seen.taken_ns = min(seen.taken_ns, stamp_ns - 1)  # time may have jumped back
+        if after_ns <= 0:
+            seen.taken_ns = seen.check_ns = _LONG_AGO_NS
         recent.append(skeleton)
         while len(recent) > 2 and stamp_ns - recent[1].stamp_ns >= HOLD * NANOSECONDS:
             recent.popleft()
-        if 0 <= stamp_ns - seen.checked_ns < (_CHECK_AGAIN_NS if seen.counts.any() else _CHECK_NS):
+        if stamp_ns < seen.check_ns:
             return False
-        seen.checked_ns = stamp_ns
+        seen.check_ns = stamp_ns + _CHECK_NS
         if not is_t_pose(_known([skeleton])) or not self._is_held(recent):
-            self._holding = False
             return False
         return self._learn(seen, stamp_ns)
 
@@ -420,11 +428,15 @@ class JointCentres:
         candidate.variance = np.where(there, variance, 0.0).sum(axis=0)
         candidate.counts = there.sum(axis=0).astype(np.float64)
         own = _offsets([candidate])
-        if own is None or own.distance > self._gate(own.dimension):
-            self._counters["t_poses_refused"] += own is not None and not self._holding
-            self._holding = True
+        if own is None:
             return False
-        seen.taken_ns = stamp_ns
+        if own.distance > self._gate(own.dimension):
+            self._counters["t_poses_refused"] += not 0 <= stamp_ns - self._refused_ns < _ANOTHER_NS
+            self._refused_ns = stamp_ns
+            return False
+        self._counters["t_poses"] += not 0 <= stamp_ns - self._held_ns < _ANOTHER_NS
+        self._held_ns = seen.taken_ns = stamp_ns
+        seen.check_ns = stamp_ns + _CHECK_AGAIN_NS
         seen.sum = seen.sum + candidate.sum
         seen.variance = seen.variance + candidate.variance
         seen.counts = seen.counts + candidate.counts
@@ -433,8 +445,6 @@ class JointCentres:
             self._first_ns = stamp_ns
         self._before = self._in_force(stamp_ns)
         self.offsets, self._since_ns = _offsets(list(self._sensors.values())), stamp_ns
-        self._counters["t_poses"] += not self._holding
-        self._holding = True
         return not known
 
     def _gate(self, dimension: int) -> float:

@@ -306,6 +306,28 @@ def test_sensors_are_told_apart_and_what_they_saw_is_put_together() -> None:
     assert both.offsets.share < one.offsets.share < 1.0
 
 
+def test_one_pose_is_one_however_many_see_it_and_another_is_another() -> None:
+    counters: dict[str, int] = {}
+    centres = JointCentres(counters)
+    aside = seen(T_POSE, some_offsets())
+    aside[[Joint.ELBOW_LEFT, Joint.WRIST_LEFT]] -= 0.3 * body_axes(T_POSE)[:, 2]  # one sensor does not see it
+    for start in (0, 20):
+        for number in range(150):
+            stamp_ns = start * NANOSECONDS + number * FRAME_NS
+            for sensor, positions in (("kinect1", T_POSE), ("kinect2", T_POSE), ("kinect3", aside)):
+                centres.see(skeleton(positions, stamp_ns), sensor)
+        assert counters == {"t_poses": 1 + (start > 0), "t_poses_refused": 0}
+
+
+def test_a_short_second_pose_is_seen_too_and_a_slow_camera_does() -> None:
+    counters: dict[str, int] = {}
+    centres = JointCentres(counters)
+    for start, pose, seconds in ((0.0, T_POSE, 1.0), (1.0, POSES[5], 9.0), (10.0, T_POSE, 1.0)):
+        for number in range(round(8 * seconds)):
+            centres.see(skeleton(pose, round((start + number / 8.0) * NANOSECONDS)))
+    assert counters["t_poses"] == 2
+
+
 def test_what_remains_is_less_across_the_arms_and_a_covariance() -> None:
     centres = JointCentres({})
     given_ones = np.stack([np.diag([4e-4, 9e-4, 16e-4])] * N_JOINTS)
