@@ -237,7 +237,7 @@ def _stream(topic: str, stream: Stream) -> Finding:
             "sensors",
             PROBLEM,
             f"{topic}: {stream.publishers} publishers",
-            "end all but one: ros2 topic info -v {topic}",
+            f"end all but one: ros2 topic info -v {topic}",
         )
     if stream.rate < (SLOW_RATE if camera else IMU_RATE):
         return Finding(

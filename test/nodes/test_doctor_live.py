@@ -63,8 +63,10 @@ def test_what_runs_is_seen_and_judged(playing: Running) -> None:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env=playing.environment)
     assert playing.until(lambda: process.poll() is not None, 2.0 * PATIENCE)
     assert process.stdout is not None
-    found = [(each["check"], each["level"], each["found"]) for each in json.load(process.stdout)["findings"]]
+    findings = json.load(process.stdout)["findings"]
+    found = [(each["check"], each["level"], each["found"]) for each in findings]
     assert process.returncode == 1
+    assert "end all but one: ros2 topic info -v /kinect2/skeleton" in [each["remedy"] for each in findings]
 
     def level(check: str, text: str) -> str:
         [answer] = [level for name, level, found_ in found if name == check and text in found_] or [f"none of {found}"]
