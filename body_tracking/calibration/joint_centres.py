@@ -23,7 +23,12 @@ its joints do not show; so the farther it points from where it did in the T-pose
 
     b' = d b + sqrt(1 - d^2) n,  n ~ N(0, P),  d = E[cos(roll)] = exp(-sigma^2 / 2)                                (3)
 
-(the same Kinect, of the same person: the elbow is bent more by 7 degrees, not less by 13, where it is bent by 67).
+and from the elbow on, ``d`` besides is times, with the elbow bent by ``beta``,
+
+    1 - (1 - cos(beta))^2  up to a right angle, 0 beyond                                                           (4)
+
+as a camera takes a bent elbow to be elsewhere: the same Kinect has the same person's elbow bent more by 7 degrees, not
+less by 13, where it is bent by 67.
 """
 
 from __future__ import annotations
@@ -200,7 +205,7 @@ def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
 
 
 def kept(positions: FloatArray) -> FloatArray:
-    """(11,) ``d`` of eq. (3): 1 of the trunk and of all that points as in a T-pose.
+    """(11,) ``d`` of eq. (3) and (4): 1 of the trunk and of all that points as in a T-pose.
 
     Args:
         positions: (25, 3) metres, any frame, NaN where unknown. For a bone that is unknown the one before it stands.
@@ -209,12 +214,21 @@ def kept(positions: FloatArray) -> FloatArray:
     _, (lx, ly, lz), _ = _axes(points[2], points[1], points[3], points[7])
     result = [1.0] * len(points)
     for first, side in ((len(_TRUNK), 1.0), (len(_TRUNK) + 4, -1.0)):
+        ux, uy, uz = math.nan, math.nan, math.nan
+        stretched = 1.0  # eq. (4)
         for bone in range(first, first + 3):
             (px, py, pz), (qx, qy, qz) = points[bone], points[bone + 1]
             ex, ey, ez = _unit(qx - px, qy - py, qz - pz)
             away = 1.0 - side * (ex * lx + ey * ly + ez * lz)
             known = away == away
             result[bone + 1] = math.exp(-0.5 * _ROLL_STDDEV**2 * min(1.0, away)) if known else result[bone]
+            if bone == first:
+                ux, uy, uz = ex, ey, ez
+            elif bone == first + 1:
+                straight = ux * ex + uy * ey + uz * ez
+                stretched = 1.0 if straight != straight else 1.0 - (1.0 - max(0.0, straight)) ** 2
+        for joint in range(first + 1, first + 4):
+            result[joint] *= stretched
     return np.array(result)
 
 
@@ -477,9 +491,13 @@ class JointCentres:
         if self.offsets is None:
             return positions
         known = positions if measured.all() else np.where(measured[:, None], positions, np.nan)
-        offsets = kept(known)[:, None] * turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
+        offsets = turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
         if not math.isfinite(offsets.sum()):
             return positions
+        # by the pose as it is without them: a stretched arm that is seen bent is stretched
+        without = known.copy()
+        without[LEARNT] -= offsets
+        offsets *= kept(without)[:, None]
         result = positions.copy()
         result[_MOVED] -= offsets[_MOVED_AS]
         return result
