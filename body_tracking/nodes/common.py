@@ -76,6 +76,8 @@ _TICKS = 1000
 sent."""
 _ACKNOWLEDGE_S = 2.0
 """Seconds for those who listen to take a node's last messages."""
+_LEAVE_S = 5.0
+"""Seconds for the middleware to let a node go that is closed."""
 
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
@@ -671,8 +673,12 @@ def run(node_class: type[GraphNode]) -> None:
     finally:
         if node is not None:
             node.close()
+        # Nothing is lost any more: what waits for ever, below Python, is told and ended.
+        faulthandler.dump_traceback_later(_LEAVE_S, exit=True)
+        if node is not None:
             with contextlib.suppress(InvalidHandle):
                 node.destroy_node()
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
     if code:
         sys.exit(code)

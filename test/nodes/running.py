@@ -38,14 +38,14 @@ def environment() -> dict[str, str]:
 
 
 def stop(process: subprocess.Popen[Any]) -> int:
-    """End a process as Ctrl-C does; its exit code."""
+    """End a process as Ctrl-C does; its exit code. One that does not end prints where it is."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:
         return process.wait(15.0)
     except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        process.send_signal(signal.SIGABRT)  # for faulthandler
+        process.wait(15.0)
         raise
 
 
@@ -70,8 +70,12 @@ class Running:
     def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
         for process in self.processes.values():
             process.send_signal(signal.SIGINT)
-        for process in self.processes.values():
-            stop(process)
+        for name, process in self.processes.items():
+            try:
+                stop(process)
+            except subprocess.TimeoutExpired as error:
+                error.add_note(self.log(name))
+                raise
         rclpy.try_shutdown(context=self.context)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

@@ -398,6 +398,40 @@ def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
         assert said in line
 
 
+NEVER_LEAVES = """\
+import threading
+from body_tracking.nodes import common
+
+class Stuck(common.GraphNode):
+    NAME = "stuck"
+    PARAMETERS = (common.RELIABLE,)
+
+    def close(self):
+        print("closed", flush=True)
+
+    def destroy_node(self):
+        threading.Event().wait()
+
+common._LEAVE_S = 1.0
+print("here", flush=True)
+common.run(Stuck)
+"""
+
+
+def test_a_node_that_the_middleware_does_not_let_go_says_where_it_is_and_ends(tmp_path: Path) -> None:
+    file = tmp_path / "stuck.py"
+    file.write_text(NEVER_LEAVES)
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen([sys.executable, file], stdout=log, stderr=log, env=environment())
+    end = time.monotonic() + 30.0
+    while not (tmp_path / "log").read_text() and time.monotonic() < end:
+        time.sleep(0.1)
+    assert stop(process) == 1
+    said = (tmp_path / "log").read_text()
+    assert "closed" in said
+    assert "in destroy_node" in said
+
+
 def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     with Running(tmp_path) as running:
