@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ from body_tracking import dds
 
 ROOT = Path(__file__).resolve().parent.parent
 dds.prepare()  # what tests send is sent again as soon as what nodes send
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # so a shell without job control starts what it runs in the background, and every process would inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 PROCESSES = ("nodes", "test_cli.py", "test_docs.py", "test_package.py", "test_up.py")
 
 
