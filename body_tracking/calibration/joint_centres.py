@@ -413,7 +413,8 @@ class JointCentres:
             recent.popleft()
         if stamp_ns < seen.check_ns:
             return False
-        seen.check_ns = stamp_ns + _CHECK_NS
+        # at times that do not depend on which frames came: where some are lost, no more is different than these
+        seen.check_ns = (stamp_ns // _CHECK_NS + 1) * _CHECK_NS
         if not is_t_pose(_known([skeleton])) or not self._is_held(recent):
             return False
         return self._learn(seen, stamp_ns)

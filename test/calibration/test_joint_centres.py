@@ -333,6 +333,16 @@ def test_one_pose_is_one_however_many_see_it_and_another_is_another() -> None:
         assert counters == {"t_poses": 1 + (start > 0), "t_poses_refused": 0}
 
 
+def test_a_lost_frame_hardly_changes_when_a_pose_is_learnt_from() -> None:
+    def learnt_at(lost: int) -> int:
+        centres = JointCentres({})
+        numbers = (number for number in range(120) if number != lost)
+        return next(n for n in numbers if centres.see(skeleton(T_POSE, 5 * NANOSECONDS + n * FRAME_NS)))
+
+    whole = learnt_at(-1)
+    assert all(abs(learnt_at(lost) - whole) <= 1 for lost in range(1, whole + 1))
+
+
 def test_a_short_second_pose_is_seen_too_and_a_slow_camera_does() -> None:
     counters: dict[str, int] = {}
     centres = JointCentres(counters)
