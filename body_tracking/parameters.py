@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 
 import yaml
 
+from body_tracking import files
 from body_tracking.errors import BodyTrackingError
 
 Value: TypeAlias = bool | int | float | str | tuple[str, ...]
@@ -194,6 +195,13 @@ def unknown_parameter(name: str, known: Collection[str]) -> ParameterError:
 # --- files
 
 
+class _Loader(files.SafeLoader):  # type: ignore[misc]
+    """PyYAML's safe loader, which also reads the tuples that ``ros2 launch`` writes for lists."""
+
+
+yaml.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_yaml_seq, _Loader)
+
+
 def read_file(path: Path) -> dict[str, dict[str, object]]:
     """A ROS parameters file: for each node name or pattern, its parameters by full name.
 
@@ -201,11 +209,9 @@ def read_file(path: Path) -> dict[str, dict[str, object]]:
         ParameterError: no such file, not YAML, or not of the form ``node: {ros__parameters: {name: value}}``.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    except yaml.YAMLError as error:
-        raise ParameterError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
+        content = files.read_yaml(path, _Loader, aliases=False)  # rcl takes none
+    except files.FileError as error:
+        raise ParameterError(f"{path}: {error}") from error
     sections: dict[str, dict[str, object]] = {}
     _collect(path, content if content is not None else {}, "", sections)
     return sections
@@ -219,7 +225,11 @@ def _collect(path: Path, content: object, name: str, sections: dict[str, dict[st
         if key == SECTION:
             if not isinstance(value, dict):
                 raise ParameterError(f"{path}: {name}: {SECTION} holds no names and values")
-            _flatten(value, "", sections.setdefault(name, {}))
+            flat = sections.setdefault(name, {})
+            _flatten(value, "", flat)
+            for parameter, given in flat.items():
+                if isinstance(given, list) and any(isinstance(each, (list, dict)) for each in given):
+                    raise ParameterError(f"{path}: {name}: {parameter}: a list holds no lists or mappings")
         else:
             _collect(path, value, f"{name}/{str(key).strip('/')}" if name else f"/{str(key).strip('/')}", sections)
 

@@ -31,6 +31,14 @@ TABLE = (
 )
 
 
+def test_a_list_as_ros2_launch_writes_it_is_a_list(tmp_path: Path) -> None:
+    """Launch dumps tuples with PyYAML's full dumper."""
+    file = tmp_path / "launch_params"
+    file.write_text(yaml.dump({"/fusion": {"ros__parameters": {"sensors": ("a", "b"), "empty": ()}}}))
+    assert "!!python/tuple" in file.read_text()
+    assert read_file(file) == {"/fusion": {"sensors": ["a", "b"], "empty": []}}
+
+
 def test_what_is_given_is_taken_and_the_rest_is_default() -> None:
     values = check_all(TABLE, {"gain": 2, "names": ["a", "", "b"]})
     assert values == {"gain": 2.0, "count": 3, "mode": "fast", "active": True, "names": ("a", "b")}

@@ -17,7 +17,7 @@ from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import save, to_dict
 from body_tracking.parameters import Value
 from body_tracking.recording.replay import Progress, parameters_for, sensor_topics, skeletons_of
-from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.rig import RigReader
 
 WHOLE = 600.0
 """Raw frames kept, seconds: a recording up to this long is interpolated anew with the final clock."""
@@ -58,7 +58,7 @@ def calibrate(
         CalibrationError: a sensor could not be calibrated.
     """
     counters: Counter[str] = Counter()
-    with BagReader(bag_path) as bag:
+    with RigReader(bag_path) as bag:
         topics = sensor_topics(bag, sensors)
         names = tuple(topics.values())
         calibration = OnlineCalibration(names, replace(parameters, history=WHOLE), reference or None)
@@ -86,7 +86,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking calibrate``."""
     command = subparsers.add_parser(
         "calibrate",
-        help="the poses and clocks of a bag's sensors",
         description="Finds where each sensor of a recording stood and how its clock ran, from the person they saw.",
     )
     command.add_argument(

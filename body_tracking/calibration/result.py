@@ -9,6 +9,9 @@ import numpy as np
 
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
+MAX_DRIFT_PPM = 10_000.0
+"""A clock that is a hundredth faster than another is no drift but a damaged number; NTP slews by 500 ppm at most."""
+
 
 @dataclass(frozen=True, slots=True)
 class ClockModel:

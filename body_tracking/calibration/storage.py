@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking import files
+from body_tracking.calibration.result import MAX_DRIFT_PPM, CalibrationResult, ClockModel, SensorPose, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 
 _HEADER = """\
 # Calibration written by body_tracking: the pose of each <sensor>_optical_frame (x right, y down, z forward) in world,
@@ -78,15 +79,25 @@ def _sensor(name: str, entry: dict[str, Any]) -> tuple[SensorPose, ClockModel, S
     if abs(norm - 1.0) > 1e-3:
         raise ValueError(f"quat_xyzw has length {norm:.3g}, not 1")
 
+    translation = _numbers(entry, "translation", 3)
+    if (np.abs(translation) > MAX_RANGE).any():
+        raise ValueError(f"translation {translation}, expected at most {MAX_RANGE:g} m")
+
     def quality(key: str, scale: float, unknown: float) -> float:
         return unknown if entry.get(key) is None else float(entry[key]) / scale
 
+    def bounded(key: str, limit: float) -> float:
+        value = float(entry.get(key, 0.0))
+        if not abs(value) <= limit:
+            raise ValueError(f"{key} is {value:g}, expected at most {limit:g} either way")
+        return value
+
     return (
-        SensorPose(name, _numbers(entry, "translation", 3), quaternion / norm),
+        SensorPose(name, translation, quaternion / norm),
         ClockModel(
-            round(float(entry.get("clock_offset_s", 0.0)) * NANOSECONDS),
-            float(entry.get("clock_drift_ppm", 0.0)),
-            int(entry.get("clock_anchor_ns", 0)),
+            round(bounded("clock_offset_s", MAX_STAMP_NS / NANOSECONDS) * NANOSECONDS),
+            bounded("clock_drift_ppm", MAX_DRIFT_PPM),
+            int(bounded("clock_anchor_ns", MAX_STAMP_NS) and entry["clock_anchor_ns"]),
         ),
         SensorQuality(
             quality("residual_mm", 1e3, float("nan")),
@@ -106,11 +117,9 @@ def load(path: Path) -> CalibrationResult:
         CalibrationError: the file is missing, is not YAML, or lacks or misstates a value; the text names it.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
+        data = files.read_yaml(path)
+    except files.FileError as error:
+        raise CalibrationError(f"{path}: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("sensors"), dict) or "reference" not in data:
         raise CalibrationError(f"{path}: expected the keys reference and sensors")
     poses, clocks, quality = {}, {}, {}

@@ -165,7 +165,7 @@ def _print(info: BagInfo) -> None:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``bag info`` and ``bag recover`` to the ``body_tracking`` command."""
-    parser = subparsers.add_parser("bag", help="look into recordings, close one that was cut off")
+    parser = subparsers.add_parser("bag")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     info = verbs.add_parser("info", help="what is in a bag, and what is missing")
     info.add_argument("bag", type=Path, metavar="BAG", help="a folder, or a single mcap file")

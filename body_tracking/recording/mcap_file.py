@@ -30,6 +30,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, Footer, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.skeleton import NANOSECONDS
 
 MAGIC: bytes = MCAP0_MAGIC
@@ -40,6 +41,7 @@ HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK_TIMES = struct.Struct("<QQ")
 _FOOTER_BYTES = HEAD.size + 20
+_PIECE_BYTES = 1 << 20
 _LOOSE_BYTES = 1 << 20  # messages outside of chunks are read in runs of about this size
 
 # Everything that reading a broken record can raise.
@@ -58,6 +60,13 @@ _BROKEN = (
 
 _OTHER_CHUNK = re.compile(rb"\x06.{36}(?:\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)", re.DOTALL)
 """Where a chunk record may begin, for finding the thread again after damage."""
+
+
+MAX_CHUNK_BYTES = 64 << 20
+"""Decompressed bytes of a chunk that is read: recorders close theirs after some megabytes."""
+
+MAX_RECORDS = 500_000
+"""Records of a chunk that is read; they take a second."""
 
 
 class BagError(BodyTrackingError):
@@ -117,9 +126,12 @@ def parse(record: type[Any], content: bytes) -> Any:
 def _contents(data: bytes) -> _Content:
     """The whole records at the beginning of ``data``; whatever is cut off at its end is left out."""
     found = _Content()
-    position, end = 0, len(data)
+    position, end, left = 0, len(data), MAX_RECORDS
     while end - position >= HEAD.size:
         opcode, length = HEAD.unpack_from(data, position)
+        left -= 1
+        if opcode == 0 or left < 0:
+            raise Damaged("records of no kind" if opcode == 0 else f"more than {MAX_RECORDS} records")
         first = position + HEAD.size
         stop = first + length
         if stop > end:
@@ -144,16 +156,18 @@ def decompress(chunk: Chunk) -> bytes:
 
     Raises:
         Damaged: anything does not fit.
+        BagError: it fits, and is larger than any that is read.
     """
     size = chunk.uncompressed_size
+    # Before a size is believed: a damaged one must not allocate gigabytes.
+    _refuse_bomb(size, _announced(chunk))
     try:
         if chunk.compression == "zstd":
-            # Before it is believed: a damaged size must not allocate gigabytes.
             if zstandard.frame_content_size(chunk.data) not in (-1, size):
                 raise Damaged("its size does not fit")
             data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
         elif chunk.compression == "lz4":
-            data = lz4.frame.decompress(chunk.data)
+            data = _whole_lz4(chunk.data, size)
         elif chunk.compression == "":
             data = chunk.data
         else:
@@ -165,6 +179,52 @@ def decompress(chunk: Chunk) -> bytes:
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise Damaged("its checksum does not fit")
     return bytes(data)
+
+
+def _whole_lz4(data: bytes, size: int) -> bytes:
+    """As much as decompresses, and a byte more than it should be where it is more.
+
+    Raises:
+        BagError: it is larger than any that is read.
+    """
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    found: bytes = decompressor.decompress(data, max_length=size + 1)
+    length = len(found)
+    while length > size and not (decompressor.eof or decompressor.needs_input):
+        length += len(decompressor.decompress(b"", max_length=_PIECE_BYTES))
+        _refuse_bomb(length, None)
+    return found
+
+
+def _announced(chunk: Chunk) -> int | None:
+    """The size that the compressed data says of itself; None where it says nothing."""
+    try:
+        if chunk.compression == "zstd":
+            size = int(zstandard.frame_content_size(chunk.data))
+            return None if size < 0 else size
+        if chunk.compression == "lz4":
+            size = int(lz4.frame.get_frame_info(chunk.data)["content_size"])  # under a checksum
+            if size > MAX_CHUNK_BYTES:
+                _refuse_bomb(size, size)
+            return size or None
+    except _BROKEN:
+        return None
+    return len(chunk.data) if chunk.compression == "" else None
+
+
+def _refuse_bomb(size: int, announced: int | None) -> None:
+    """Of two sizes of a chunk, that in its record and that in its data.
+
+    Raises:
+        BagError: the chunk is larger than any that is read.
+        Damaged: only one of the two sizes says so.
+    """
+    most = max(size, announced or 0)
+    if most <= MAX_CHUNK_BYTES:
+        return
+    if min(size, size if announced is None else announced) <= MAX_CHUNK_BYTES:
+        raise Damaged("its size does not fit")
+    raise BagError(f"a chunk of {most >> 20} MB when decompressed; at most {MAX_CHUNK_BYTES >> 20} MB are read")
 
 
 def _chunk_contents(content: bytes) -> _Content:
@@ -187,14 +247,22 @@ def _cut_chunk_contents(content: bytes) -> _Content:
         name = content[32 : 32 + name_length]
         data = content[40 + name_length :]
         if name == b"zstd":
-            data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+            data = _beginning_of_zstd(data)
         elif name == b"lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=MAX_CHUNK_BYTES)
         elif name != b"":
             return _Content()
         return _contents(data)
     except (*_BROKEN, Damaged):
         return _Content()
+
+
+def _beginning_of_zstd(data: bytes) -> bytes:
+    """As much as decompresses, and no more than is read of a chunk."""
+    reader, found = zstandard.ZstdDecompressor().stream_reader(BytesIO(data)), bytearray()
+    while len(found) < MAX_CHUNK_BYTES and (piece := reader.read(_PIECE_BYTES)):
+        found += piece
+    return bytes(found)
 
 
 def _seconds(nanoseconds: int) -> str:
@@ -235,7 +303,7 @@ class McapFile:
         self._unknown_channels: Counter[int] = Counter()
         self.sound_end = 0
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file: BinaryIO = open_regular(path)
         except OSError as error:
             raise BagError(f"{path}: {error.strerror}") from error
         try:
@@ -271,6 +339,8 @@ class McapFile:
         except Damaged as damage:
             self._skip(block, damage)
             return []
+        except BagError as error:
+            raise BagError(f"{self.path}: {error}") from None
         known = [message for message in content.messages if message.channel in self.channels]
         if len(known) < len(content.messages) and block.offset not in self.damaged_at:
             self.damaged_at.add(block.offset)
@@ -297,6 +367,8 @@ class McapFile:
             f"damaged chunk at byte {block.offset} skipped ({damage}){messages},"
             f" {_seconds(block.start_ns)} to {_seconds(block.end_ns)}"
         )
+        if self.whole and all(each.offset in self.damaged_at for each in self.blocks):
+            raise BagError(f"{self.path}: none of its chunks can be read ({damage})")
 
     def _open(self) -> None:
         size = os.fstat(self._file.fileno()).st_size
@@ -499,6 +571,8 @@ class _Scan:
             except Damaged as error:
                 damage = error
                 continue
+            except BagError as error:
+                raise BagError(f"{self.file.path}: {error}") from None
             sound = candidate == stop
             if self.file.sound_end == position and sound:
                 self.file.sound_end = stop

@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from body_tracking.files import FileError, load_yaml
 from body_tracking.skeleton import NANOSECONDS
 
 INFINITE_NS = 2**63 - 1
@@ -119,17 +120,7 @@ def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
 
 
 # libyaml, where PyYAML was built with it, is ten times as fast; a short replay notices.
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-
-def load_yaml(text: str) -> Any:
-    """``yaml.safe_load``, as fast as the installation allows.
-
-    Raises:
-        yaml.YAMLError: not YAML.
-    """
-    return yaml.load(text, Loader=_Loader)
 
 
 def dump_yaml(content: Any) -> str:
@@ -152,7 +143,7 @@ def load(value: object) -> tuple[Qos, ...]:
     if isinstance(value, str):
         try:
             value = load_yaml(value)
-        except yaml.YAMLError:
+        except FileError:
             return ()
     return tuple(_profile(item) for item in value if isinstance(item, dict)) if isinstance(value, list) else ()
 

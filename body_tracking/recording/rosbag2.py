@@ -20,10 +20,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
 from body_tracking.messages.base import BagMessages
 from body_tracking.recording import qos as quality
 from body_tracking.recording.mcap_file import LIBRARY, BagError, Block, McapFile, StoredMessage
@@ -40,10 +40,13 @@ __all__ = [
     "deserialize",
     "is_known",
     "recover",
+    "remove_file",
     "serialize",
 ]
 
 METADATA = "metadata.yaml"
+MAX_WAITING_BYTES = 1 << 28
+"""Bytes of messages that wait for older ones of chunks that overlap in time."""
 METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
 MAX_TIME_NS = 2**63 - 1
@@ -203,7 +206,7 @@ class BagReader:
         # Blocks overlap in time where messages were written late: a block is opened before anything later than its
         # beginning leaves the heap.
         heap: list[tuple[int, int, int, int, RawMessage]] = []
-        position = 0
+        position = waiting = 0
         while position < len(blocks) or heap:
             while position < len(blocks) and (not heap or blocks[position][0] <= heap[0][0]):
                 _, index, offset, block = blocks[position]
@@ -212,9 +215,14 @@ class BagReader:
                 for number, stored in enumerate(self.files[index].read(block)):
                     if stored.channel in names and (start_ns is None or stored.log_time_ns >= start_ns):
                         message = _raw(names[stored.channel], stored)
+                        waiting += len(message.cdr)
                         heapq.heappush(heap, (stored.log_time_ns, index, offset, number, message))
+                if waiting > MAX_WAITING_BYTES:
+                    raise BagError(f"{self.path}: more than {MAX_WAITING_BYTES >> 20} MB of chunks are of one time")
             if heap:
-                yield heapq.heappop(heap)[-1]
+                message = heapq.heappop(heap)[-1]
+                waiting -= len(message.cdr)
+                yield message
 
     def verify(self) -> None:
         """Read everything once, so that :attr:`warnings` is complete."""
@@ -241,17 +249,19 @@ class BagReader:
     def _listed(self) -> list[Path] | None:
         """The files that ``metadata.yaml`` lists; None where it is missing or unreadable."""
         path = self.path / METADATA
+        if not path.exists():
+            self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
+            return None
+        if not path.is_file():
+            raise BagError(f"{path}: not a regular file")
         try:
-            information = quality.load_yaml(path.read_text("utf-8"))["rosbag2_bagfile_information"]
+            information = load_yaml(read_text(path))["rosbag2_bagfile_information"]
             storage = str(information["storage_identifier"])
             compression = str(information.get("compression_mode") or "").lower()
             names = [Path(str(name)).name for name in information["relative_file_paths"]]
-        except FileNotFoundError:
-            self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
-            return None
-        except OSError as error:
-            raise BagError(f"{path}: {error.strerror}") from error
-        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+        except FileLimitError as error:
+            raise BagError(f"{path}: {error}") from error
+        except (FileError, KeyError, TypeError, AttributeError):
             self._notes.append(f"{METADATA}: damaged; the mcap files were read without it")
             return None
         if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
@@ -515,9 +525,7 @@ class BagWriter:
     def discard(self) -> None:
         """Stop, and delete the file that this writer made, and the folder if nothing else is in it."""
         self._shut()
-        with contextlib.suppress(OSError):
-            self.path.unlink(missing_ok=True)
-            self.folder.rmdir()
+        remove_file(self.path)
 
     # --- inside
 
@@ -677,9 +685,16 @@ def _write_metadata(folder: Path, information: dict[str, Any]) -> None:
     draft.replace(folder / METADATA)
 
 
+def remove_file(path: Path) -> None:
+    """Delete a file of a bag, and the folder if nothing else is in it."""
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
+        path.parent.rmdir()
+
+
 def _refuse_if_in_use(path: Path) -> None:
     """A writer holds a lock on its file for as long as its process lives."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.sensors import NOT_FINITE, RecordedFrame, SensorNameError, check_sensor_name, optical_frame
 from body_tracking.sensors.kinect import camera_space_to_optical
 from body_tracking.skeleton import JOINT_NAMES, N_JOINTS, NANOSECONDS, FloatArray, IntArray, Skeleton, TrackingState
@@ -139,7 +140,7 @@ class CsvRecording:
         number = 1
         block: list[str] = []
         try:
-            with self.path.open("rb") as file:
+            with open_regular(self.path) as file:
                 self._size = max(1, os.fstat(file.fileno()).st_size)
                 source = cast(BinaryIO, gzip.GzipFile(fileobj=file)) if self.path.suffix == ".gz" else file
                 with TextIOWrapper(source, encoding="utf-8-sig") as text:
@@ -264,7 +265,7 @@ class CsvRecording:
             seconds = Decimal(text.strip())
         except InvalidOperation:
             raise self._error(line, f"{name}: {text!r} is not a number") from None
-        if not seconds.is_finite() or abs(seconds) >= _MAX_SECONDS:
+        if not seconds.is_finite() or not 0 <= seconds < _MAX_SECONDS:  # as a ROS message holds it
             raise self._error(line, f"{name}: {text!r} is not a time in seconds")
         return int((seconds * NANOSECONDS).to_integral_value())
 

@@ -34,6 +34,7 @@ from typing import BinaryIO, Final, cast
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.sensors import SensorNameError, check_sensor_name
 from body_tracking.sensors.imu import STANDARD_GRAVITY, ImuSample, ImuSampleError, RecordedImu, imu_frame
 from body_tracking.skeleton import NANOSECONDS, FloatArray
@@ -352,7 +353,7 @@ class ImuCsvRecording:
             seconds = Decimal(text.strip())
         except InvalidOperation:
             raise self._error(number, f"{text!r} is not a time") from None
-        if not seconds.is_finite() or abs(seconds) >= _MAX_SECONDS:
+        if not seconds.is_finite() or not 0 <= seconds < _MAX_SECONDS:  # as a ROS message holds it
             raise self._error(number, f"{text!r} is not a time in seconds")
         return int((seconds * NANOSECONDS).to_integral_value())
 
@@ -366,7 +367,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str, float]]:
     number = 0
     try:
         size = max(1, path.stat().st_size)
-        with path.open("rb") as raw:
+        with open_regular(path) as raw:
             source = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if path.suffix == ".gz" else raw
             with TextIOWrapper(source, encoding="utf-8-sig") as file:
                 for line in file:

@@ -24,6 +24,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.sensors.imu import (
     STANDARD_GRAVITY,
     ImuSample,
@@ -170,7 +171,7 @@ class MvnxRecording:
         count = 0
         try:
             size = max(1, self.path.stat().st_size)
-            with self.path.open("rb") as raw:
+            with open_regular(self.path) as raw:
                 source = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if self.path.suffix == ".gz" else raw
                 for frame in self._parse(source):
                     count += 1

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.sensors import NOT_FINITE, RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.sensors.kinect import camera_space_to_optical
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
@@ -81,7 +82,8 @@ class NtuRecording:
         counts: Counter[str] = Counter()
         numbers: dict[str, int] = {}
         try:
-            text = self.path.read_text("ascii")
+            with open_regular(self.path) as file:
+                text = file.read().decode("ascii")
         except OSError as error:
             raise NtuError(f"{self.path}: {error.strerror}") from error
         except UnicodeDecodeError as error:

@@ -53,6 +53,11 @@ def test_a_calibration_survives_the_disk(tmp_path_factory: pytest.TempPathFactor
         ("translation:\n    - ", "translation:\n    - x", "kinect1"),
         ("translation:", "place:", "translation"),
         ("sensors:", "sensors: [", "YAML"),
+        ("clock_drift_ppm: ", "clock_drift_ppm: -1000000 #", "clock_drift_ppm is -1e[+]06"),
+        ("clock_drift_ppm: ", "clock_drift_ppm: .nan #", "clock_drift_ppm is nan"),
+        ("clock_offset_s: ", "clock_offset_s: 1.0e+300 #", "clock_offset_s"),
+        ("clock_anchor_ns: ", "clock_anchor_ns: .inf #", "clock_anchor_ns"),
+        ("translation:\n    - ", "translation:\n    - 1.0e+30 #", "expected at most 100 m"),
     ],
 )
 def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -44,7 +44,11 @@ def mapping(made: dict[str, Any] | None = None) -> RobotMapping:
 
 
 def seen(
-    stamp_ns: int, position: list[float], velocity: list[float] | None = None, stddev: list[float] | None = None
+    stamp_ns: int,
+    position: list[float],
+    velocity: list[float] | None = None,
+    stddev: list[float] | None = None,
+    velocity_stddev: float = 0.2,
 ) -> JointAngles:
     """What is said of the three angles."""
     n = len(ANGLES["positional"])
@@ -54,5 +58,5 @@ def seen(
         np.array(position),
         np.array(velocity if velocity is not None else [0.0] * n),
         np.array(stddev if stddev is not None else [0.1] * n),
-        np.full(n, 0.2),
+        np.full(n, velocity_stddev),
     )

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from body_tracking.sensors import NOT_FINITE, SensorNameError
 from body_tracking.sensors.csv_recording import BACKWARDS, IGNORED, REPEATED, CsvError, CsvRecording
 from body_tracking.skeleton import JOINT_NAMES, TrackingState
+from draws import some
 
 COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
 STATES = [f"{joint}_state" for joint in JOINT_NAMES]
@@ -266,7 +267,7 @@ def test_a_damaged_gzip_is_refused(tmp_path, partial):
 
 
 def test_real_recordings_come_out_as_they_are(shared_data):
-    for path in sorted((shared_data / "kinect_pairs").glob("*.csv.gz")):
+    for path in some(sorted((shared_data / "kinect_pairs").glob("*.csv.gz")), 3):
         with gzip.open(path, "rt") as file:
             rows = list(csv.DictReader(file))
         frames = list(CsvRecording(path))
