@@ -38,6 +38,8 @@ from __future__ import annotations
 import hashlib
 import hmac
 import math
+import os
+import stat
 import struct
 from collections import OrderedDict
 from pathlib import Path
@@ -281,9 +283,16 @@ def read_key(path: str) -> bytes:
     """The key in a file: its bytes without white space around them.
 
     Raises:
-        ProtocolError: no such file, or too short a key; the text never holds the key.
+        ProtocolError: no such file, one that others may read, or too short a key; the text never holds the key.
     """
     try:
+        mode = Path(path).stat().st_mode
+        if not stat.S_ISREG(mode):
+            raise ProtocolError("key", f"{path}: no regular file")
+        if os.name == "posix" and mode & 0o077:
+            raise ProtocolError(
+                "key", f"{path}: others may read or write it (chmod 600 {path}); make a new key if they did"
+            )
         with Path(path).open("rb") as file:
             key = file.read(4096).strip()
     except OSError as error:
@@ -339,6 +348,11 @@ class SequenceWindow:
         self._first = 0
         self._seen = 0
 
+    def has(self, sequence: int) -> bool:
+        """Whether a number came before, as far as that is known."""
+        age = self.newest - sequence
+        return age >= 0 and (age >= self.SIZE or bool(self._seen >> age & 1))
+
     def take(self, sequence: int) -> str:
         """``new`` for one beyond all others, ``late`` for one that was missing, else ``replayed``."""
         if sequence > self.newest:
@@ -348,9 +362,8 @@ class SequenceWindow:
             self._seen = ((self._seen << step) | 1) & ((1 << self.SIZE) - 1) if step < self.SIZE else 1
             self.newest = sequence
             return "new"
-        age = self.newest - sequence
-        if age >= self.SIZE or self._seen >> age & 1:
+        if self.has(sequence):
             return "replayed"
-        self._seen |= 1 << age
+        self._seen |= 1 << self.newest - sequence
         self.lost -= sequence > self._first
         return "late"

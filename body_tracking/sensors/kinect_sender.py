@@ -22,6 +22,7 @@ import socket
 import sys
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -250,7 +251,8 @@ class Sender:
                 self._failed(error)
 
     def _answer(self) -> None:
-        """In a thread of its own: answer clock requests as soon as they come."""
+        """In a thread of its own: answer clock requests as soon as they come, each once."""
+        answered: deque[int] = deque(maxlen=256)  # a receiver asks four times a second
         while not self._closed.is_set():
             with self._lock:
                 current = self._socket
@@ -267,9 +269,12 @@ class Sender:
                     protocol.CLOCK_REQUEST,
                     self._sensor,
                     self._session,
-                ) or not self._limit.allows(source, received_ns):
+                ):
                     continue
-                protocol.check_signature(packet, self._key)
+                protocol.check_signature(packet, self._key)  # before anything is counted against the source
+                if header.sequence in answered or not self._limit.allows(source, received_ns):
+                    continue
+                answered.append(header.sequence)
                 asked_ns = protocol.read_clock(packet).asked_ns
                 reply = header._replace(kind=protocol.CLOCK_ANSWER)
                 times = protocol.ClockTimes(asked_ns, received_ns, now_ns())
@@ -364,32 +369,41 @@ def stream(sender: Sender, source: Any) -> None:
 
 def main() -> int:
     """The command: 0 at the end of a recording or on Ctrl-C, 2 with one line when it cannot start."""
-    args = parser().parse_args()
     try:
-        if args.make_key:
-            make_key(args.make_key)
-            return 0
-        host, colon, port = args.to.rpartition(":")
-        if not colon or not port.isdigit() or not 0 < int(port) < 1 << 16:
-            raise SenderError(f"--to {args.to}: expected HOST:PORT")
-        protocol.sensor_bytes(args.sensor)
-        key = protocol.read_key(args.key_file) if args.key_file else protocol.NO_KEY
-        source = Replay(args) if args.replay else Kinect()
-        sender = Sender(args.sensor, host.strip("[]"), int(port), key)
+        run()
     except (SenderError, protocol.ProtocolError) as error:
-        print(f"kinect_sender: {error}", file=sys.stderr)
-        return 2
-    try:
-        stream(sender, source)
-    except SenderError as error:
         print(f"kinect_sender: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         pass
-    finally:
-        sender.close()
-        source.close()
     return 0
+
+
+def run() -> None:
+    """Do what the command line says.
+
+    Raises:
+        SenderError, ProtocolError: it cannot.
+        KeyboardInterrupt: on Ctrl-C, also while a sensor's library or a recording is loaded.
+    """
+    args = parser().parse_args()
+    if args.make_key:
+        make_key(args.make_key)
+        return
+    host, colon, port = args.to.rpartition(":")
+    if not colon or not port.isdigit() or not 0 < int(port) < 1 << 16:
+        raise SenderError(f"--to {args.to}: expected HOST:PORT")
+    protocol.sensor_bytes(args.sensor)
+    key = protocol.read_key(args.key_file) if args.key_file else protocol.NO_KEY
+    source = Replay(args) if args.replay else Kinect()
+    try:
+        sender = Sender(args.sensor, host.strip("[]"), int(port), key)
+        try:
+            stream(sender, source)
+        finally:
+            sender.close()
+    finally:
+        source.close()
 
 
 if __name__ == "__main__":

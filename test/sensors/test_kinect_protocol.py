@@ -161,6 +161,7 @@ def test_what_cannot_be_written() -> None:
 def test_a_key_is_read_without_its_line_end_and_never_shown(tmp_path: Path) -> None:
     file = tmp_path / "key"
     file.write_bytes(KEY + b"\r\n")
+    file.chmod(0o600)
     assert protocol.read_key(str(file)) == KEY
     file.write_bytes(b"short secret")
     with pytest.raises(ProtocolError, match="12 bytes, expected 16") as caught:
@@ -239,3 +240,15 @@ def test_six_people_fit_into_one_datagram_all_of_which_is_signed() -> None:
         changed[at] ^= os.urandom(1)[0] or 1
         with pytest.raises(ProtocolError):
             protocol.check_signature(bytes(changed), KEY)
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "kinect.key"
+    file.write_bytes(KEY)
+    for mode in (0o640, 0o604, 0o620, 0o610):
+        file.chmod(mode)
+        with pytest.raises(ProtocolError, match="others may read or write it"):
+            protocol.read_key(str(file))
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(ProtocolError, match="no regular file"):
+        protocol.read_key(str(tmp_path / "pipe"))

@@ -83,6 +83,7 @@ def test_a_recording_or_receiver_that_cannot_be_is_said_in_one_line(arguments: l
 def test_a_recording_comes_through_as_it_is_and_the_sender_survives_the_receiver(tmp_path: Path) -> None:
     file = tmp_path / "key"
     file.write_bytes(KEY)
+    file.chmod(0o600)
     settings = SourceSettings("left", device="kinect1", port=0, key_file=str(file))
     source = NetworkSource(settings)
     host, port = source.address
