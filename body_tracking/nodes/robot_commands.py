@@ -3,7 +3,8 @@
 A node of its own, and no part of ``joint_angles``: one job per node, and who holds the robot must not die with what it
 watches. It holds within ``silence`` of the last word however the rest of the graph ends, and by the wall clock, also
 where the time on ``/clock`` stands still. If it ends itself, there are no more commands, and what the robot then does
-is its controller's to decide. No safety-rated function: docs/robots.md.
+is its controller's to decide. It publishes no command while anybody else publishes them. No safety-rated function:
+docs/robots.md.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -11,8 +12,9 @@ is its controller's to decide. No safety-rated function: docs/robots.md.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -23,12 +25,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from body_tracking import graph
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.messages.angles import joint_states_to_angles
-from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
@@ -38,8 +41,9 @@ from body_tracking.parameters import Parameter, Value
 from body_tracking.recording.qos import LATCHED
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.robot.calibration import CalibrationQuality
-from body_tracking.robot.follower import AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK, Command, Follower, State
-from body_tracking.robot.mapping import TRAJECTORY, load
+from body_tracking.robot.clock import AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK
+from body_tracking.robot.follower import Command, Follower, FollowerError, State
+from body_tracking.robot.mapping import TRAJECTORY, MappingError, load
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import Skeleton
 
@@ -52,7 +56,8 @@ PARAMETERS = (
         "clock",
         AUTO_CLOCK,
         "by which angles are stamped: ros, or a sensor's own that need not show the time of day, as a Kinect's; auto: "
-        "ros unless they are 10 s apart",
+        "decided once, by the first angles: a sensor's where stamps count from a start (less than a year) and ROS time "
+        "does not, else ros",
         choices=(AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK),
     ),
     Parameter(
@@ -68,6 +73,8 @@ PARAMETERS = (
 
 _UNPAIRED = 16
 """Angles and standard deviations that may wait for each other."""
+_LOOK_AROUND_NS = 4_000_000_000
+"""A node that has been there for so long has found the other publishers: DDS announces them every 3 s at the latest."""
 _LEVELS = {State.FOLLOWING: 0, State.APPROACHING: 0, State.HOLDING: 1, State.STOPPED: 2}
 
 
@@ -80,6 +87,8 @@ class RobotCommands(GraphNode):
     def configure(self, values: Mapping[str, Value]) -> None:
         """Read the mapping; what is wrong with it ends the node."""
         given: dict[str, Any] = dict(values)
+        if not given["mapping"]:
+            raise MappingError("parameter 'mapping': no mapping file of a robot; see docs/robots.md")
         self.body = graph.check_body(given["body"])
         self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         self.mapping = load(Path(given["mapping"]).expanduser(), {name: angle_names(name) for name in ALL_CONVENTIONS})
@@ -90,22 +99,33 @@ class RobotCommands(GraphNode):
         """Connect."""
         self.waiting: OrderedDict[int, dict[str, JointState]] = OrderedDict()
         self.command: Command | None = None
+        self.switched: Counter[str] = Counter()
+        self.started_ns = time.monotonic_ns()
         output = self.mapping.output
         kind = JointTrajectory if output.kind == TRAJECTORY else Float64MultiArray
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
         angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
         for topic in angles:
-            self.listen(topic, JointState, self.result_qos(), partial(self.on_angles, topic))
+            self.listen(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
         for sensor in self.sensors:
             self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
         self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
         self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
         if output.state_topic:
-            self.listen(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot)
+            self.listen(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot, absolute=True)
+        enable = self.create_service(Trigger, "~/enable", self.on_enable)
+        if not self.follower.enabled:
+            self.get_logger().warning(
+                f"waits for a person: without a state_topic nobody says where {self.mapping.robot} stands. Once it "
+                f"stands at home: ros2 service call {enable.service_name} std_srvs/srv/Trigger"
+            )
         self.create_timer(1.0 / float(str(self.values["rate"])), self.tell_robot, clock=STEADY)
 
     def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
         """Angles, or their standard deviations; both of one stamp go on."""
+        if self.sequences.switched[topic] != self.switched[topic]:
+            self.switched[topic] = self.sequences.switched[topic]
+            self.follower.refuse_angles(f"{topic}: angles of two publishers in turn")
         stamp_ns = to_nanoseconds(message.header.stamp)
         self.monitor.message_in(topic, stamp_ns)
         pair = self.waiting.setdefault(stamp_ns, {})
@@ -114,8 +134,13 @@ class RobotCommands(GraphNode):
             while self.waiting.popitem(last=False)[0] != stamp_ns:
                 self.monitor.totals["unpaired"] += 1
             values, deviations = (pair[name] for name in sorted(pair))
-            angles = joint_states_to_angles(values, deviations, self.body)
-            if self.follower.hear_angles(angles, self.now_ns(), time.monotonic_ns()):
+            try:
+                angles = joint_states_to_angles(values, deviations, self.body)
+            except MessageError as error:
+                self.follower.refuse_angles(str(error))
+                raise
+            convention = str(values.header.frame_id)
+            if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
                 self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
@@ -128,11 +153,12 @@ class RobotCommands(GraphNode):
     def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:
         """Since when a sensor's pose holds."""
         pose = transform_to_pose(message)
-        self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
+        if pose.sensor in self.sensors:
+            self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
 
     def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
         """How well the sensors are calibrated, if that is what it says."""
-        for status in statuses(message):
+        for status in statuses(message, namespace=self.get_namespace()):
             if status.node == "calibration":
                 quality = CalibrationQuality.from_diagnostics(status.values, self.sensors)
                 self.follower.calibration.heard(quality, time.monotonic_ns())
@@ -142,6 +168,27 @@ class RobotCommands(GraphNode):
         position = np.array(message.position, dtype=np.float64)
         self.follower.hear_robot(tuple(message.name), position, time.monotonic_ns())
 
+    def on_enable(self, _: Any, response: Any) -> Any:
+        """A person says that the robot may move."""
+        try:
+            self.follower.enable()
+            response.success, response.message = True, "enabled"
+        except FollowerError as error:
+            response.message = str(error)
+        return response
+
+    def others(self) -> str:
+        """Who else publishes this robot's commands, or that there was no time yet to find out; empty for nobody."""
+        topic = self.output.topic_name
+        if time.monotonic_ns() - self.started_ns < _LOOK_AROUND_NS:
+            return f"looking for other publishers of {topic}"
+        if self.count_publishers(topic) <= 1:
+            return ""
+        found = self.publishers_of(topic)
+        with contextlib.suppress(ValueError):
+            found.remove(self.get_fully_qualified_name())
+        return f"another publisher of {topic}: {', '.join(found)}"
+
     def time_jumped_back(self, topic: str) -> None:
         """Hold, and wait for angles of the new time."""
         self.waiting.clear()
@@ -150,6 +197,7 @@ class RobotCommands(GraphNode):
     def tell_robot(self) -> None:
         """One command, or none."""
         now_ns = self.now_ns()
+        self.follower.hear_publishers(self.others())
         self.command = command = self.follower.step(now_ns, time.monotonic_ns())
         if command.position is not None:
             output = self.mapping.output

@@ -7,15 +7,19 @@ States and what leads from one to the next (times by the mapping's ``SafetyLimit
        │                 good for recover_after                      v     v
        └───────────a fault after stop_after of holding───────────── holding
 
-- *stopped*: no commands. So it begins, too.
-- *approaching*: follows; the rates grow from nothing to their limits, so that there is no jump to where the person is.
+- *stopped*: no commands. So it begins, too; where the robot does not say how it stands, until a person enables it.
+- *approaching*: follows, from where the robot stands; the rates grow from nothing to their limits, so that there is no
+  jump to where the person is.
 - *following*: each command is where the person is expected to be now, within the limits.
-- *holding*: the same command again and again; joints with a limit of acceleration come to rest first.
+- *holding*: the same command again and again; joints with a limit of acceleration come to rest first. Where the robot
+  did not go where it was sent, the command is where the robot stands.
 
 A fault is any of: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although
-somebody goes on saying what is to be expected; angles older than ``max_age`` or stamped in the future; an angle that is
-missing, not finite or less certain than allowed; no good calibration; a robot that is silent, beyond its limits, or not
-where it was sent; commands that came to a standstill themselves. Each is told by name.
+somebody goes on saying what is to be expected; angles older than ``max_age``, stamped in the future or by another clock
+than at the start; angles of another convention than the mapping's, or with other names; angles of two publishers; an
+angle that is not finite, that no body has, or that is less certain than allowed; no good calibration; a robot that is
+silent or not where it was sent; commands that came to a standstill themselves. Each is told by name. These stop at
+once, without holding: another publisher of the commands, a robot beyond its limits, a standstill of ``STANDSTILL``.
 
 Nothing in here looks at a clock. Two times are given: ``now_ns`` in the clock of the stamps (which may stand still or
 jump), and ``steady_ns``, which never does. This is no safety-rated function.
@@ -32,6 +36,7 @@ import numpy as np
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.robot.calibration import CalibrationWatch
+from body_tracking.robot.clock import ANOTHER_CLOCK_NS, AUTO_CLOCK, StampClock
 from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
@@ -42,13 +47,23 @@ JUMP_BACK_NS = NANOSECONDS
 ROBOT_SILENCE = 0.5
 """Seconds without a word of the robot's own state after which it is taken to be away."""
 
-AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK = "auto", "ros", "sensor"
-
-_OTHER_CLOCK_NS = 10 * NANOSECONDS
-"""Stamps further than this from now are by another clock."""
+STANDSTILL = 2.0
+"""Seconds after which commands that stood still have ended: they do not go on with the one before."""
 
 _AHEAD = 0.05
 """Seconds by which stamps may be in the future: clocks that are kept together differ by less."""
+
+_SETTLING_NS = NANOSECONDS
+"""After ROS time jumped back, angles are not used for so long: some are still of the time before."""
+
+_AT_REST = 0.25
+"""Share of ``max_tracking_error`` that a robot may be off at rest. The rest of it is lag, which grows with the rate."""
+
+_MAX_ANGLE = 4.0 * math.pi
+"""Radians: no joint of a body turns further."""
+
+_MAX_RATE = 50.0
+"""rad/s: faster is an error. The elbow of a pitcher reaches 40 (Fleisig et al. 1995)."""
 
 
 class FollowerError(BodyTrackingError):
@@ -140,13 +155,11 @@ class Follower:
     Args:
         mapping: of the robot.
         period: seconds between two commands. A fault that would be one by the next command is one now.
-        clock: by which angles are stamped: ``ROS_CLOCK`` for that of ``now_ns``; ``SENSOR_CLOCK`` for another one, as a
-            Kinect's own that counts from its start; ``AUTO_CLOCK`` for the former unless they are 10 s apart.
-        delay: seconds from capture to here of the quickest angles, where the clock is another one, and nobody can tell:
-            the least difference between the clocks in the last 10 to 20 s stands for this delay.
+        clock, delay: by which clock angles are stamped; see :class:`StampClock`.
 
     Attributes:
         state: what it does now.
+        enabled: whether a person has said that the robot stands where commands begin; true where it says so itself.
         transitions: those that nobody has taken away yet, the oldest first.
 
     Raises:
@@ -164,20 +177,23 @@ class Follower:
         self.mapping = mapping
         self.calibration = CalibrationWatch()
         self.state = State.STOPPED
+        self.enabled = bool(mapping.output.state_topic)
         self.transitions: list[Transition] = []
         self._limits = mapping.safety
-        self._period, self._clock, self._delay = period, clock, delay
+        self._period = period
         self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
-        self._offsets = _LeastOffset()
+        self._clock = StampClock(clock, delay)
+        self._ros_ns = self._settled_ns = 0
         self._angles: _Angles | None = None
         self._wrong = "no angles yet"
-        self._names: tuple[str, ...] = ()
-        self._places: IntArray | None = None
+        self._refused = ""
+        self._places: IntArray = np.array([mapping.names.index(name) for name in mapping.angles], dtype=np.intp)
         self._watched: tuple[str, ...] = ()
         self._sensors: dict[str, tuple[int, int]] = {}
+        self._others = ""
         self._robot: FloatArray | None = None
         self._robot_ns = 0
-        self._robot_wrong = ""
+        self._robot_wrong = self._astray = ""
         self._stepped_ns: int | None = None
         self._since_ns = self._approached_ns = 0
         self._good_since_ns: int | None = None
@@ -188,28 +204,27 @@ class Follower:
 
     # --- what is heard
 
-    def hear_angles(self, angles: JointAngles, now_ns: int, steady_ns: int) -> bool:
-        """Take note of angles; of a message that came late, nothing.
+    def hear_angles(self, angles: JointAngles, convention: str, now_ns: int, steady_ns: int) -> bool:
+        """Take note of angles and of the convention that they name; of a message that came late, nothing.
 
         Returns:
             Whether time jumped back, which forgets what was heard before.
         """
+        jumped = self._ros_time(now_ns, steady_ns)
+        if steady_ns < self._settled_ns:
+            return jumped
+        foreign = self._foreign(angles.names, convention)
+        if foreign:
+            self.refuse_angles(foreign)
+            return jumped
         last_ns = self._angles.stamp_ns if self._angles is not None else None
-        jumped = last_ns is not None and angles.stamp_ns < last_ns - JUMP_BACK_NS
-        if jumped:
+        if last_ns is not None and angles.stamp_ns < last_ns - JUMP_BACK_NS:
+            jumped = True
             self.time_jumped_back()
         elif last_ns is not None and angles.stamp_ns <= last_ns:
-            return False  # late, or the same again: no news
-        if angles.names != self._names:
-            self._names = angles.names
-            missing = [name for name in self.mapping.angles if name not in angles.names]
-            self._wrong = f"angle {missing[0]} is not among the joint states" if missing else ""
-            places = [angles.names.index(name) for name in self.mapping.angles if name in angles.names]
-            self._places = None if missing else np.array(places, dtype=np.intp)
-        if self._places is None:
-            return jumped
+            return jumped  # late, or the same again: no news
         self._wrong = ""
-        self._offsets.add(now_ns - angles.stamp_ns, steady_ns)
+        self._clock.note(angles.stamp_ns, now_ns, steady_ns)
         self._angles = _Angles(
             angles.stamp_ns,
             steady_ns,
@@ -220,6 +235,25 @@ class Follower:
         )
         return jumped
 
+    def refuse_angles(self, reason: str) -> None:
+        """Angles came that must not be followed: a fault until others come, and for one command at least."""
+        self._wrong = self._refused = reason
+
+    def _foreign(self, names: tuple[str, ...], convention: str) -> str:
+        """Why these are not the angles that the mapping is about; empty if they are."""
+        mapping = self.mapping
+        if convention != mapping.convention:
+            said = f"the convention {convention!r}" if convention else "no convention (an empty frame_id)"
+            return f"angles are of {said}, the mapping is about {mapping.convention!r}"
+        if names == mapping.names:
+            return ""
+        missing = [name for name in mapping.names if name not in names]
+        unknown = [name for name in names if name not in mapping.names]
+        if not missing and not unknown:
+            return f"angles of {mapping.convention} in another order or twice"
+        what = f"{missing[0]} is missing" if missing else f"{unknown[0]} is none of them"
+        return f"these are not the angles of {mapping.convention}: {what}"
+
     def hear_sensor(self, sensor: str, stamp_ns: int, steady_ns: int) -> None:
         """Take note of a sensor's frame; a stamp that stands still is none."""
         if sensor not in self._sensors or self._sensors[sensor][0] != stamp_ns:
@@ -228,6 +262,23 @@ class Follower:
     def watch_sensors(self, sensors: tuple[str, ...]) -> None:
         """Hold where none of these is heard of; of none at all, that does not matter."""
         self._watched = sensors
+
+    def hear_publishers(self, problem: str) -> None:
+        """Take note of who else publishes commands for this robot, or that this is not known yet; empty for nobody."""
+        self._others = problem
+
+    def enable(self) -> None:
+        """A person says that the robot may move: it stands at ``home``, or where it was left, and clocks are right.
+
+        By which clock angles are stamped is decided anew.
+
+        Raises:
+            FollowerError: the robot is not stopped.
+        """
+        if self.state != State.STOPPED:
+            raise FollowerError(f"the robot is not stopped: {self.state}")
+        self.enabled = True
+        self._clock.reset()
 
     def hear_robot(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
         """Take note of how the robot stands.
@@ -257,10 +308,18 @@ class Follower:
     def time_jumped_back(self) -> None:
         """The stamps jumped back: what was heard before is of another time."""
         self._angles, self._wrong = None, "time jumped back"
-        self._names, self._places = (), None
         self._good_since_ns = None
         self._known_since_ns[:] = -1
-        self._offsets.clear()
+
+    def _ros_time(self, now_ns: int, steady_ns: int) -> bool:
+        """Whether ROS time jumped back, as where a recording begins again: the clock of the stamps is decided anew."""
+        jumped = now_ns < self._ros_ns - JUMP_BACK_NS
+        self._ros_ns = now_ns
+        if jumped:
+            self.time_jumped_back()
+            self._clock.reset()
+            self._settled_ns = steady_ns + _SETTLING_NS
+        return jumped
 
     # --- what follows from it
 
@@ -270,16 +329,20 @@ class Follower:
         # Never more than two periods at once: after a standstill the robot must not make up for it.
         dt = min(max(elapsed, 0.0), 2.0 * self._period)
         self._stepped_ns = steady_ns
+        self._ros_time(now_ns, steady_ns)
         expected = self._expected(now_ns)
         known = expected.known
-        fault = self._fault(steady_ns, elapsed, expected)
+        fault = self._fatal(elapsed, steady_ns)
+        fatal = bool(fault)
+        fault = fault or self._fault(steady_ns, elapsed, expected)
+        self._refused = ""
         if fault:
             self._good_since_ns = None
         elif self._good_since_ns is None:
             self._good_since_ns = steady_ns
         self._known_since_ns[~known] = -1
         self._known_since_ns[known & (self._known_since_ns < 0)] = steady_ns
-        self._next_state(fault, steady_ns)
+        self._next_state(fault, fatal, steady_ns)
         kept: tuple[str, ...] = ()
         if self.state in (State.APPROACHING, State.FOLLOWING):
             share = self._shares(steady_ns)
@@ -307,19 +370,17 @@ class Follower:
         if angles is None:
             unknown = np.full(len(mapping.angles), np.inf)
             return _Expected(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
-        behind = now_ns - angles.stamp_ns
-        apart = self._clock == AUTO_CLOCK and abs(self._offsets.least) > _OTHER_CLOCK_NS
-        if apart or self._clock == SENSOR_CLOCK:
-            behind -= self._offsets.least - round(self._delay * NANOSECONDS)
-        age = behind / NANOSECONDS
+        age = self._clock.age_ns(angles.stamp_ns, now_ns) / NANOSECONDS
         wait = max(age, 0.0)
         ahead = min(wait, self._limits.prediction)
         with np.errstate(invalid="ignore"):  # infinite and NaN say that something is not known
-            predicted = angles.position + ahead * angles.velocity
+            possible = (np.abs(angles.position) <= _MAX_ANGLE) & (np.abs(angles.velocity) <= _MAX_RATE)
+            predicted = np.where(possible, angles.position + ahead * angles.velocity, np.nan)
             # How errors of angle and velocity go together is not told; this is the most that any correlation makes of
             # them. Beyond the horizon the velocity itself is the error.
             stddev = angles.stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
-            sound = np.isfinite(predicted) & np.isfinite(stddev)
+            stddev[~((angles.stddev >= 0.0) & (angles.velocity_stddev >= 0.0))] = np.nan
+            sound = possible & np.isfinite(stddev)
         most = np.where(self._used, mapping.max_stddev[:, None], np.inf)
         known = (~self._used | (sound & (stddev <= most))).all(axis=1)
         turned = np.remainder(np.where(sound, predicted, 0.0) + np.pi, 2.0 * np.pi) - np.pi
@@ -328,12 +389,22 @@ class Follower:
         turns = np.divide(self._limiter.position - target, mapping.period, out=np.zeros(n), where=mapping.period > 0.0)
         return _Expected(age, predicted, stddev, target + np.round(turns) * mapping.period, known)
 
+    def _fatal(self, elapsed: float, steady_ns: int) -> str:
+        """What is so wrong that not even the same command may be repeated; empty for nothing."""
+        if self._others:
+            return self._others
+        if elapsed > STANDSTILL:
+            return f"the commands themselves stood still for {elapsed:.2f} s"
+        return self._check_tracking(steady_ns)
+
     def _fault(self, steady_ns: int, elapsed: float, expected: _Expected) -> str:
         """What is wrong now, or would be by the next command; empty for nothing."""
         limits, angles, age = self._limits, self._angles, expected.age
         allowed_ns = round((limits.silence - self._period) * NANOSECONDS)
-        if self._wrong or angles is None:
-            return self._wrong or "no angles yet"
+        if not self.enabled:
+            return "waits for a person: call its service enable once the robot stands at home"
+        if self._refused or self._wrong or angles is None:
+            return self._refused or self._wrong or "no angles yet"
         if steady_ns - angles.steady_ns >= allowed_ns:
             return f"no new angles for {(steady_ns - angles.steady_ns) / NANOSECONDS:.2f} s"
         if self._watched:
@@ -345,21 +416,26 @@ class Follower:
                 return f"no frame of {listed} for {(steady_ns - max(heard)) / NANOSECONDS:.2f} s"
         if elapsed > limits.silence:
             return f"the commands themselves stood still for {elapsed:.2f} s"
-        if age > limits.max_age:
-            return f"angles are {age:.2f} s old, limit {limits.max_age:g} s"
-        if age < -_AHEAD:
-            return f"angles are stamped {-age:.2f} s in the future"
+        if age > limits.max_age or age < -_AHEAD:
+            said = (
+                f"{age:.2f} s old, limit {limits.max_age:g} s" if age > 0.0 else f"stamped {-age:.2f} s in the future"
+            )
+            other = abs(age) * NANOSECONDS > ANOTHER_CLOCK_NS
+            return f"angles are {said}" + (", or by another clock than at the start" if other else "")
         needed = ~expected.known & ~self.mapping.alone
         if needed.any():
-            return self._unknown(int(needed.argmax()), expected)
+            return self._unknown(int(needed.argmax()), angles, expected)
         return self.calibration.fault(limits, angles.stamp_ns, steady_ns) or self._robot_fault(steady_ns)
 
-    def _unknown(self, joint: int, expected: _Expected) -> str:
+    def _unknown(self, joint: int, angles: _Angles, expected: _Expected) -> str:
         """What is wrong with the angles of a joint."""
         for place in np.flatnonzero(self._used[joint]):
             name, most = self.mapping.angles[place], self.mapping.max_stddev[joint]
-            if not np.isfinite(expected.angle[place]):
+            angle, rate = angles.position[place], angles.velocity[place]
+            if not np.isfinite([angle, rate]).all():
                 return f"{name} is not finite, or its velocity is not known"
+            if not np.isfinite(expected.angle[place]):
+                return f"{name} is {angle:.3g} rad at {rate:.3g} rad/s, which no body does"
             if not expected.stddev[place] <= most:
                 return f"standard deviation of {name} is {expected.stddev[place]:.2f} rad, limit {most:g}"
         raise AssertionError(f"nothing is wrong with {self.mapping.joints[joint]}")
@@ -370,35 +446,60 @@ class Follower:
             return ""
         if self._robot_wrong:
             return self._robot_wrong
-        if self._robot is None or steady_ns - self._robot_ns > ROBOT_SILENCE * NANOSECONDS:
+        if self._robot_now(steady_ns) is None:
             return "the robot does not say how it stands"
-        beyond = (self._robot < self.mapping.lower) | (self._robot > self.mapping.upper)
-        if self.state == State.STOPPED:  # where it stands is where commands would begin
-            if beyond.any():
-                joint = int(beyond.argmax())
-                return f"the robot's {self.mapping.joints[joint]} is at {self._robot[joint]:.3f} rad, beyond its limits"
-            return ""
-        errors = np.abs(self._robot - self._limiter.position)
-        worst = int(errors.argmax())
-        if errors[worst] > self._limits.max_tracking_error:
-            return f"the robot's {self.mapping.joints[worst]} is {errors[worst]:.2f} rad from its command"
-        return ""
+        return self._astray or (self._beyond() if self.state == State.STOPPED else "")
 
-    def _next_state(self, fault: str, steady_ns: int) -> None:
+    def _robot_now(self, steady_ns: int) -> FloatArray | None:
+        """(n,) how the robot stands; None where it has not said so lately."""
+        return self._robot if steady_ns - self._robot_ns <= ROBOT_SILENCE * NANOSECONDS else None
+
+    def _beyond(self) -> str:
+        """Which of the robot's joints stands beyond its limits; empty for none."""
+        robot, mapping = self._robot, self.mapping
+        if robot is None or not (beyond := (robot < mapping.lower) | (robot > mapping.upper)).any():
+            return ""
+        joint = int(beyond.argmax())
+        return f"the robot's {mapping.joints[joint]} is at {robot[joint]:.3f} rad, beyond its limits"
+
+    def _check_tracking(self, steady_ns: int) -> str:
+        """Take the command back to where the robot stands, where it did not go where it was sent.
+
+        So it does not jump when what keeps it (an emergency stop, a hand) lets it go.
+
+        Returns:
+            Why no command can say so: the robot stands too far beyond its limits. Empty where one can.
+        """
+        robot = self._robot_now(steady_ns)
+        if self.state == State.STOPPED or robot is None:
+            return ""
+        share = np.ones(len(robot)) if self.state == State.HOLDING else np.abs(self._shares(steady_ns))
+        allowed = self._limits.max_tracking_error * (_AT_REST + (1.0 - _AT_REST) * share)
+        errors = np.abs(robot - self._limiter.position)
+        if (errors <= allowed).all():
+            return ""
+        worst = int((errors - allowed).argmax())
+        self._astray = f"the robot's {self.mapping.joints[worst]} is {errors[worst]:.2f} rad from its command"
+        self._limiter.reset(robot)
+        return self._beyond() if (np.abs(robot - self._limiter.position) > allowed).any() else ""
+
+    def _next_state(self, fault: str, fatal: bool, steady_ns: int) -> None:
         limits = self._limits
         good = -1.0 if self._good_since_ns is None else (steady_ns - self._good_since_ns) / NANOSECONDS
+        if fault and self.state in (State.APPROACHING, State.FOLLOWING):
+            self._enter(State.HOLDING, fault, steady_ns)
         since = (steady_ns - self._since_ns) / NANOSECONDS
         if self.state in (State.STOPPED, State.HOLDING):
             if good >= limits.recover_after:
-                if self.state == State.STOPPED and self._robot is not None:
-                    self._limiter.reset(self._robot)
+                robot = self._robot_now(steady_ns)
+                if robot is not None:
+                    self._limiter.reset(robot)
                 self._enter(State.APPROACHING, f"everything was good for {good:.2f} s", steady_ns)
-            elif fault and self.state == State.HOLDING and since >= limits.stop_after:
+            elif fault and self.state == State.HOLDING and (fatal or since >= limits.stop_after):
                 self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
+                self._astray = ""
             else:
                 self._reason = fault or f"everything is good for {good:.2f} s, {limits.recover_after:g} s are needed"
-        elif fault:
-            self._enter(State.HOLDING, fault, steady_ns)
         elif self.state == State.APPROACHING and since >= limits.approach:
             self._enter(State.FOLLOWING, "the rates have reached their limits", steady_ns)
 
@@ -417,28 +518,3 @@ class Follower:
         grown = (steady_ns - np.where(self.mapping.alone, begun_ns, self._approached_ns)) / NANOSECONDS
         share = np.minimum(grown / limits.approach, 1.0) if limits.approach > 0.0 else np.ones(len(ready_ns))
         return np.where(waiting, -1.0, share)
-
-
-class _LeastOffset:
-    """The least of some differences in the last 10 to 20 s: two buckets, of which the older one is dropped."""
-
-    _BUCKET_NS = 10 * NANOSECONDS
-
-    def __init__(self) -> None:
-        self._older = self._newer = 0
-        self._since_ns: int | None = None
-
-    @property
-    def least(self) -> int:
-        return min(self._older, self._newer)
-
-    def add(self, offset_ns: int, steady_ns: int) -> None:
-        if self._since_ns is not None and abs(offset_ns - self.least) > _OTHER_CLOCK_NS:
-            self._since_ns = None  # one of the clocks was set, or there was no /clock yet
-        if self._since_ns is None or steady_ns - self._since_ns > self._BUCKET_NS:
-            self._older = offset_ns if self._since_ns is None else self._newer
-            self._newer, self._since_ns = offset_ns, steady_ns
-        self._newer = min(self._newer, offset_ns)
-
-    def clear(self) -> None:
-        self._since_ns = None

@@ -35,8 +35,8 @@ class Limiter:
         self.reset(position)
 
     def reset(self, position: FloatArray) -> None:
-        """Stand at (n,) radians."""
-        self.position: FloatArray = position.copy()
+        """Stand at (n,) radians, or at the limit that they are beyond."""
+        self.position: FloatArray = np.clip(position, self._lower, self._upper)
         self.velocity: FloatArray = np.zeros_like(position)
 
     def step(self, target: FloatArray, dt: float, share: FloatArray | float = 1.0) -> FloatArray:

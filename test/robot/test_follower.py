@@ -20,6 +20,7 @@ PERIOD = 0.01
 START_NS = 1_000 * NANOSECONDS
 EPOCH_NS = 1_750_000_000 * NANOSECONDS
 LATENCY_NS = 30_000_000
+CONVENTION = "positional"
 SOUND = CalibrationQuality((), 0.01, 0.01)
 LEGAL = {
     (State.STOPPED, State.APPROACHING),
@@ -36,12 +37,15 @@ class Bench:
 
     def __init__(self, follower: Follower | None = None, **safety: Any) -> None:
         self.follower = follower or Follower(mapping(content(**safety)), PERIOD)
+        self.follower.enable()
+        self.convention = CONVENTION
         self.elapsed_ns = 0
         self.seen_ns = -NANOSECONDS
         self.silent = False
         self.pose = [1.0, 0.0, 0.8]
         self.velocity = [0.0, 0.0, 0.0]
         self.stddev = [0.1, 0.1, 0.1]
+        self.velocity_stddev = 0.2
         self.commands: list[Command] = []
 
     @property
@@ -58,8 +62,9 @@ class Bench:
             self.elapsed_ns += round(PERIOD * NANOSECONDS)
             if not self.silent and self.elapsed_ns - self.seen_ns >= NANOSECONDS // 30:
                 self.seen_ns = self.elapsed_ns
-                angles = seen(self.now_ns - LATENCY_NS, self.pose, self.velocity, self.stddev)
-                self.follower.hear_angles(angles, self.now_ns, self.steady_ns)
+                stamp_ns = self.now_ns - LATENCY_NS
+                angles = seen(stamp_ns, self.pose, self.velocity, self.stddev, self.velocity_stddev)
+                self.follower.hear_angles(angles, self.convention, self.now_ns, self.steady_ns)
             self.commands.append(self.follower.step(self.now_ns, self.steady_ns))
         return self.commands[-1]
 
@@ -85,13 +90,16 @@ def test_it_begins_stopped_approaches_and_follows() -> None:
 
 def test_a_moving_angle_is_predicted_to_now_but_not_beyond_the_horizon() -> None:
     follower = Follower(mapping(content(prediction=0.1, max_age=0.5, approach=0.0, recover_after=0.0)), PERIOD)
-    follower.hear_angles(seen(EPOCH_NS, [0.5, 0.0, 0.5], [1.0, 0.0, -1.0]), EPOCH_NS, START_NS)
+    follower.enable()
+    follower.hear_angles(seen(EPOCH_NS, [0.5, 0.0, 0.5], [1.0, 0.0, -1.0]), CONVENTION, EPOCH_NS, START_NS)
     for age, moved in ((0.05, 0.05), (0.1, 0.1), (0.3, 0.1)):
         steady_ns, now_ns = START_NS, EPOCH_NS + round(age * NANOSECONDS)
         for step in range(200):
             # the same angles, new each time, always of the same age: the joints come to where they are expected
             steady_ns += 10_000_000
-            follower.hear_angles(seen(EPOCH_NS + step + 1, [0.5, 0.0, 0.5], [1.0, 0.0, -1.0]), now_ns, steady_ns)
+            follower.hear_angles(
+                seen(EPOCH_NS + step + 1, [0.5, 0.0, 0.5], [1.0, 0.0, -1.0]), CONVENTION, now_ns, steady_ns
+            )
             command = follower.step(now_ns + step + 1, steady_ns)
         np.testing.assert_allclose(command.position, [0.5 + moved, 0.5 - moved], atol=1e-3)
 
@@ -155,6 +163,15 @@ FAULTS = {
     "velocity unknown": ({"velocity": [math.nan] * 3}, "shoulder_elevation_left is not finite, or its velocity"),
     "not observed": ({"stddev": [0.1, 0.1, math.inf]}, "standard deviation of elbow_flexion_left is inf rad"),
     "uncertain": ({"stddev": [0.5, 0.1, 0.1]}, "standard deviation of shoulder_elevation_left is 0.5"),
+    "negative deviation": ({"stddev": [-0.1, 0.1, 0.1]}, "standard deviation of shoulder_elevation_left is nan rad"),
+    "no deviation": ({"stddev": [0.1, 0.1, math.nan]}, "standard deviation of elbow_flexion_left is nan rad"),
+    "negative deviation of the rate": (
+        {"velocity_stddev": -0.2},
+        "standard deviation of shoulder_elevation_left is nan",
+    ),
+    "no deviation of the rate": ({"velocity_stddev": math.nan}, "standard deviation of shoulder_elevation_left is nan"),
+    "a rate that no body has": ({"velocity": [0.0, 0.0, -60.0]}, "elbow_flexion_left is 0.8 rad at -60 rad/s"),
+    "an angle that no body has": ({"pose": [1e300, 0.0, 0.0]}, "shoulder_elevation_left is 1e+300 rad"),
 }
 
 
@@ -246,7 +263,7 @@ def test_a_calibration_must_go_on_being_heard_of_and_may_get_too_old() -> None:
 
 def test_angles_that_came_before_the_clock_do_not_count_for_long() -> None:
     bench = Bench()
-    bench.follower.hear_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), 0, bench.steady_ns)
+    bench.follower.hear_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), CONVENTION, 0, bench.steady_ns)
     assert bench.run(3.0).state == State.FOLLOWING
 
 
@@ -257,7 +274,7 @@ def test_old_angles_and_angles_of_the_future_are_not_followed(clock: str) -> Non
         for _ in range(100):
             bench.elapsed_ns += 10_000_000
             stamp_ns = bench.now_ns + round(shift * NANOSECONDS)
-            bench.follower.hear_angles(seen(stamp_ns, bench.pose), bench.now_ns, bench.steady_ns)
+            bench.follower.hear_angles(seen(stamp_ns, bench.pose), CONVENTION, bench.now_ns, bench.steady_ns)
             command = bench.follower.step(bench.now_ns, bench.steady_ns)
         assert command.state == State.STOPPED
         assert said in command.reason
@@ -270,9 +287,9 @@ def test_another_clock_is_taken_for_what_its_least_difference_says(clock: str, s
         bench.elapsed_ns += 10_000_000
         late_ns = 5_000_000 if step % 3 else 0
         stamp_ns = round(start * NANOSECONDS) + bench.elapsed_ns - late_ns
-        bench.follower.hear_angles(seen(stamp_ns, bench.pose), bench.now_ns, bench.steady_ns)
+        bench.follower.hear_angles(seen(stamp_ns, bench.pose), CONVENTION, bench.now_ns, bench.steady_ns)
         command = bench.follower.step(bench.now_ns, bench.steady_ns)
-        assert command.age == pytest.approx(0.05 + late_ns / NANOSECONDS)
+        assert command.age == pytest.approx(0.05 + late_ns / NANOSECONDS, abs=1e-3)
     assert command.state == State.FOLLOWING
 
 
@@ -291,11 +308,10 @@ def test_a_standstill_of_the_commands_themselves_holds_and_is_not_made_up_for() 
 
 def test_a_backward_jump_of_time_is_told_and_holds() -> None:
     bench = following()
-    jumped = bench.follower.hear_angles(
-        seen(bench.now_ns - 10 * NANOSECONDS, bench.pose), bench.now_ns - 10 * NANOSECONDS, bench.steady_ns
-    )
-    assert jumped
-    assert not bench.follower.hear_angles(seen(bench.now_ns - 11 * NANOSECONDS + 5, bench.pose), 0, bench.steady_ns)
+    now_ns = bench.now_ns - 10 * NANOSECONDS
+    for behind_ns, jumps in ((0, True), (NANOSECONDS - 5, False)):
+        angles = seen(now_ns - behind_ns, bench.pose)
+        assert bench.follower.hear_angles(angles, CONVENTION, now_ns, bench.steady_ns) == jumps
     bench = following()
     bench.follower.time_jumped_back()
     bench.silent = True
@@ -308,11 +324,109 @@ def test_a_missing_angle_is_named() -> None:
     angles = seen(bench.now_ns, bench.pose)
     fewer = type(angles)(angles.stamp_ns, angles.names[:2], *(getattr(angles, name)[:2] for name in (
         "position", "velocity", "position_stddev", "velocity_stddev")))  # fmt: skip
-    bench.follower.hear_angles(fewer, bench.now_ns, bench.steady_ns)
+    bench.follower.hear_angles(fewer, CONVENTION, bench.now_ns, bench.steady_ns)
     bench.silent = True
-    assert "angle elbow_flexion_left is not among the joint states" in bench.run(PERIOD).reason
+    assert "not the angles of positional: elbow_flexion_left is missing" in bench.run(PERIOD).reason
     bench.silent = False
     assert bench.run(3.0).state == State.FOLLOWING
+
+
+# --- foreign angles
+
+
+def test_angles_of_another_convention_hold_at_once_and_stop() -> None:
+    bench = following(stop_after=1.0)
+    before = bench.commands[-1].position
+    bench.convention, bench.pose = "isb", [-1.0, 0.0, 0.8]
+    held = bench.run(0.05)
+    assert held.state == State.HOLDING
+    assert held.reason == "angles are of the convention 'isb', the mapping is about 'positional'"
+    assert held.position is not None and before is not None
+    np.testing.assert_allclose(held.position, before, atol=2.0**2 / (2 * 20.0))
+    assert bench.run(1.2).state == State.STOPPED
+    bench.convention = ""
+    assert "no convention (an empty frame_id)" in bench.run(0.05).reason
+    bench.convention = CONVENTION
+    assert bench.run(3.0).state == State.FOLLOWING
+
+
+def test_foreign_angles_between_the_right_ones_are_not_overlooked() -> None:
+    bench = following()
+    for _ in range(100):
+        bench.run(PERIOD)
+        # the right ones come between this and the next command
+        angles = seen(bench.now_ns, bench.pose)
+        bench.follower.hear_angles(angles, "isb", bench.now_ns, bench.steady_ns)
+        bench.follower.hear_angles(angles, CONVENTION, bench.now_ns, bench.steady_ns)
+    assert all(each.state == State.HOLDING for each in bench.commands[-99:])
+
+
+@pytest.mark.parametrize("order", [(2, 1, 0), (0, 1, 2, 2), (0, 0, 1, 2)])
+def test_names_in_another_order_or_twice_are_not_those_of_the_convention(order: tuple[int, ...]) -> None:
+    bench = following()
+    angles = seen(bench.now_ns, bench.pose)
+    other = type(angles)(angles.stamp_ns, tuple(angles.names[k] for k in order), *(getattr(angles, name)[list(order)]
+        for name in ("position", "velocity", "position_stddev", "velocity_stddev")))  # fmt: skip
+    bench.follower.hear_angles(other, CONVENTION, bench.now_ns, bench.steady_ns)
+    bench.silent = True
+    assert "angles of positional in another order or twice" in bench.run(PERIOD).reason
+
+
+# --- who else commands, and who may
+
+
+def test_beside_another_publisher_of_its_commands_it_is_silent_at_once() -> None:
+    bench = following()
+    bench.follower.hear_publishers("another publisher of /arm: /other")
+    stopped = bench.run(PERIOD)
+    assert (stopped.state, stopped.position) == (State.STOPPED, None)
+    assert [(each.before, each.after) for each in bench.follower.transitions[-2:]] == [
+        (State.FOLLOWING, State.HOLDING),
+        (State.HOLDING, State.STOPPED),
+    ]
+    assert bench.run(1.0).reason == "another publisher of /arm: /other"
+    bench.follower.hear_publishers("")
+    assert bench.run(0.45).state == State.STOPPED
+    assert bench.run(0.2).state == State.APPROACHING
+
+
+def test_after_a_long_standstill_not_even_the_last_command_is_repeated() -> None:
+    bench = following(stop_after=60.0)
+    bench.elapsed_ns += round(2.1 * NANOSECONDS)
+    stopped = bench.run(PERIOD)
+    assert (stopped.state, stopped.position) == (State.STOPPED, None)
+    assert "the commands themselves stood still for 2.11 s" in stopped.reason
+
+
+def test_a_robot_that_does_not_say_how_it_stands_waits_for_a_person() -> None:
+    bench = Bench()
+    bench.follower = Follower(mapping(content()), PERIOD)
+    last = bench.run(3.0)
+    assert last.state == State.STOPPED and "waits for a person" in last.reason
+    bench.follower.enable()
+    assert bench.run(3.0).state == State.FOLLOWING
+    with pytest.raises(FollowerError, match="not stopped: following"):
+        bench.follower.enable()
+
+
+def test_a_sensor_that_counts_anew_is_followed_once_a_person_says_so() -> None:
+    bench = Bench(Follower(mapping(content(stop_after=0.5)), PERIOD, "auto"))
+
+    def run(start_ns: int, seconds: float) -> Command:
+        for _ in range(round(seconds / PERIOD)):
+            bench.elapsed_ns += round(PERIOD * NANOSECONDS)
+            angles = seen(start_ns + bench.elapsed_ns, bench.pose)
+            bench.follower.hear_angles(angles, CONVENTION, bench.now_ns, bench.steady_ns)
+            command = bench.follower.step(bench.now_ns, bench.steady_ns)
+        return command
+
+    assert run(5000 * NANOSECONDS, 3.0).state == State.FOLLOWING
+    stopped = run(0, 60.0)
+    assert stopped.state == State.STOPPED
+    assert "angles are 5000.0" in stopped.reason
+    assert "or by another clock than at the start" in stopped.reason
+    bench.follower.enable()
+    assert run(0, 3.0).state == State.FOLLOWING
 
 
 # --- the robot's own word
@@ -363,6 +477,69 @@ def test_a_robot_that_is_not_where_it_was_sent_is_held_and_then_taken_from_where
     for before, after in zip(bench.commands, bench.commands[1:], strict=False):
         if before.position is None and after.position is not None:
             np.testing.assert_allclose(after.position, [0.0, 0.1], atol=1e-9)
+
+
+def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> None:
+    """Kept by an emergency stop and moved by hand, whatever the person does; and then let go."""
+    bench = with_robot()
+    allowed = bench.follower.mapping.safety.max_tracking_error
+    assert allowed < 0.5
+    stands, rate = np.array([1.0, 0.8]), bench.follower.mapping.rate
+    rng = np.random.default_rng(1)
+    begun = 0
+    for step in range(6000):
+        bench.follower.hear_robot(("shoulder", "elbow"), stands, bench.steady_ns)
+        before = bench.follower.state
+        command = bench.run(PERIOD)
+        if step % 100 == 0:
+            bench.pose = [rng.uniform(-1.0, 2.5), 0.0, rng.uniform(0.0, 2.0)]
+        if command.position is not None:
+            lead = np.abs(command.position - stands)
+            assert (lead <= allowed + rate * PERIOD).all()
+            if before in (State.STOPPED, State.HOLDING) and command.state == State.APPROACHING:
+                begun += 1
+                assert (lead <= rate * PERIOD).all()
+            if step >= 4000:  # let go: a robot that is 0.05 s late
+                stands = stands + (command.position - stands) * PERIOD / 0.05
+        if 2000 < step < 3000:
+            stands = np.clip(stands + rng.normal(0.0, 0.02, 2), [-1.0, 0.0], [2.5, 2.0])
+    assert begun > 5
+    assert command.state == State.FOLLOWING
+
+
+def test_where_the_robot_was_moved_while_it_held_it_goes_on_from_there() -> None:
+    bench = with_robot(stop_after=60.0)
+    stands = np.array([1.0, 0.8])
+    for step in range(900):
+        if step == 400:
+            bench.silent = True
+        if step == 500:
+            stands = np.array([1.2, 0.6])  # within the tracking error: nobody notices
+        if step == 600:
+            bench.silent = False
+        bench.follower.hear_robot(("shoulder", "elbow"), stands, bench.steady_ns)
+        command = bench.run(PERIOD)
+        if step > 600 and command.state != State.HOLDING and command.position is not None:
+            stands = command.position
+    places = [each.state for each in bench.commands]
+    held = bench.commands[590]
+    assert (held.state, places[-1]) == (State.HOLDING, State.FOLLOWING) and held.position is not None
+    np.testing.assert_allclose(held.position, [1.0, 0.8], atol=1e-2)
+    first = bench.commands[600 + places[600:].index(State.APPROACHING)]
+    assert first.position is not None
+    np.testing.assert_allclose(first.position, [1.2, 0.6], atol=1e-3)
+
+
+def test_a_robot_that_was_moved_beyond_its_limits_is_told_nothing() -> None:
+    bench = with_robot()
+    for step in range(1200):
+        stands = np.array([1.0, 0.8 if step < 400 or step > 800 else 2.6])
+        bench.follower.hear_robot(("shoulder", "elbow"), stands, bench.steady_ns)
+        last = bench.run(PERIOD)
+        if 400 <= step <= 800:
+            assert last.state == State.STOPPED
+            assert "the robot's elbow is at 2.600 rad, beyond its limits" in last.reason
+    assert last.state == State.FOLLOWING
 
 
 def test_a_period_that_cannot_keep_the_promises_is_refused() -> None:
@@ -427,7 +604,7 @@ def test_whatever_is_heard_the_robot_is_never_told_what_it_must_not(events: list
             if event.position is not None:
                 heard_ns = steady_ns
                 angles = seen(now_ns - event.age_ns, event.position, event.velocity, event.stddev)
-                follower.hear_angles(angles, now_ns, steady_ns)
+                follower.hear_angles(angles, CONVENTION, now_ns, steady_ns)
             command = follower.step(now_ns, steady_ns)
             silent = heard_ns is None or steady_ns - heard_ns >= 90_000_000
             if silent:

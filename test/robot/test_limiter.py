@@ -69,3 +69,11 @@ def test_it_comes_to_rest_within_the_rate_over_the_acceleration(
 def test_no_time_no_motion() -> None:
     joints = limiter()
     np.testing.assert_array_equal(joints.step(UPPER, 0.0), HOME)
+
+
+def test_what_stands_beyond_a_limit_begins_at_the_limit() -> None:
+    joints = limiter()
+    joints.step(UPPER, 0.01)
+    joints.reset(UPPER + 0.2)
+    np.testing.assert_array_equal(joints.position, UPPER)
+    np.testing.assert_array_equal(joints.velocity, 0.0)
