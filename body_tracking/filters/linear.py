@@ -23,8 +23,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from filterpy.common import Q_continuous_white_noise
-from filterpy.kalman import KalmanFilter
 from scipy.special import chdtri
 
 from body_tracking.calibration.joint_centres import JointCentres
@@ -222,6 +220,8 @@ class LinearKalmanFilter:
         Raises:
             FilterError: an unknown model.
         """
+        from filterpy.common import Q_continuous_white_noise  # takes 0.8 s, which only who filters need pay
+
         if model not in LINEAR_MODELS:
             raise FilterError(f"unknown linear filter {model!r}, expected one of {', '.join(LINEAR_MODELS)}")
         self.model = model
@@ -268,6 +268,8 @@ class LinearKalmanFilter:
 
     def _restart(self) -> None:
         """Forget every joint."""
+        from filterpy.kalman import KalmanFilter
+
         size = 3 * self._order
         self._kalman = KalmanFilter(dim_x=size, dim_z=3)
         self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))

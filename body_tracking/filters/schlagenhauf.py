@@ -17,7 +17,6 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
@@ -172,6 +171,8 @@ class SchlagenhaufKalmanFilter:
 
     def _start(self) -> None:
         """s(0|0) is the T-pose at rest."""
+        from filterpy.kalman import ExtendedKalmanFilter  # takes 0.8 s, which only who filters need pay
+
         p, n = self.parameters, self.model.nq
         kalman = ExtendedKalmanFilter(dim_x=2 * n, dim_z=3 * len(self.model.joints))
         kalman.x = np.zeros(2 * n)

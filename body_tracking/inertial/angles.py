@@ -11,14 +11,14 @@ import numpy as np
 
 from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.conventions import KNOWN_SHARE, convention
+from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import BoolArray, FloatArray
 
 _UNTOLD = {"elbow": "elbow_carrying", "wrist": "wrist_twist", "clavicle": "clavicle_axial", "neck": "neck_axial"}
 """What the convention does not tell of a joint, by the first word of the angles that it does tell."""
-_UNKNOWN = np.pi / 6.0
-"""Radians of deviation of an angle of which nothing is known, as in ``conventions``."""
+_KNOWN = np.pi / 10.0
+"""Radians of deviation up to which an angle of two sensors is handed out."""
 
 
 class SegmentAngles:
@@ -82,7 +82,7 @@ class SegmentAngles:
         angles = split.angles.reshape(-1).copy()
         variance = np.einsum("cij,cjk,cik->ci", split.gradients, spread, split.gradients).reshape(-1)
         stddev = np.sqrt(np.maximum(variance, 0.0))
-        stddev[stddev > KNOWN_SHARE * _UNKNOWN] = np.inf
+        stddev[stddev > _KNOWN] = np.inf
         if covariances is None:
             stddev[:] = np.inf
         missing = np.repeat(~(known[self._parents] & known[self._children]), 3)

@@ -16,7 +16,7 @@ class JointAngles:
         names: n names, without the body's id.
         position: (n,) radians; NaN where the angle cannot be computed at all.
         velocity: (n,) radians per second.
-        position_stddev: (n,) radians; infinity where nothing observes the angle.
+        position_stddev: (n,) radians; infinity where there is no estimate.
         velocity_stddev: (n,) radians per second.
     """
 

@@ -19,8 +19,8 @@ dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematic
 ====== ================================================================================================================
 
 Uncertainty is carried through by the analytic Jacobian. Near a singular pose it grows as 1 / sin, the angles are held
-continuous (``kinematics.euler``), and an angle of which nothing more is known than that it has a range is given an
-infinite standard deviation: see :data:`KNOWN_SHARE`. For any pose, :func:`segment_quaternions` has none of this.
+continuous (``kinematics.euler``); beside one it grows to that of an angle that may be anything. An angle that nothing
+observes has the deviation of its prior. For any pose, :func:`segment_quaternions` has none of this.
 """
 
 from __future__ import annotations
@@ -37,22 +37,14 @@ from body_tracking.kinematics import so3
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
-from body_tracking.kinematics.ranges import RANGES, Ranges
+from body_tracking.kinematics.ranges import RANGES
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
 from body_tracking.skeleton import FloatArray, IntArray
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
 
-KNOWN_SHARE = 0.6
-"""An angle counts as observed while its standard deviation is below this share of what its range of motion alone says.
-
-A filter that uses ranges as weak measurements never says much more than the range of an angle that nothing else
-observes. This share of the deviation is a third of the variance: two thirds of what is known then come from elsewhere.
-"""
-GREATEST_STDDEV = np.pi / 6.0
-"""Radians: of half a turn with the limits at three deviations; what the range of a split angle says is never more.
-"""
-
+ANYWHERE = np.pi / np.sqrt(3.0)
+"""Radians: the standard deviation of an angle that may be anything, near a singular pose."""
 _ROUNDING = 1e-9
 _X, _Y, _Z = np.eye(3)
 _FULL = (-180.0, 180.0)
@@ -123,7 +115,6 @@ class Convention:
         """
         self.names = tuple(names)
         self._model = model
-        self._prior = Ranges(model).stddev ** 2
         self._frames = [
             (segment, frame.chain, frame.count)
             for frame in frames
@@ -143,7 +134,6 @@ class Convention:
             rows |= dict.fromkeys(chain.redundant, zero)
         self.rows: IntArray = np.array([rows[name] for name in names], dtype=np.intp)
         self._redundant = self.rows == zero
-        self._greatest = np.where(self.rows < count, np.inf, GREATEST_STDDEV)
         self.stages = []
         start = count
         for stage in (chains, later):
@@ -197,15 +187,14 @@ class Convention:
 
         gradient, rate_gradient = gradients[self.rows], rates[self.rows]
         stddev = _stddev(gradient, covariance, unknown)
-        by_range = np.sqrt((gradient * gradient) @ self._prior)
-        lost_angle = self._redundant | (stddev > KNOWN_SHARE * np.minimum(by_range, self._greatest))
+        lost_angle = self._redundant | np.isinf(stddev)
         velocity_stddev = _stddev(gradient, velocity_covariance, unknown_rate)
         return JointAngles(
             stamp_ns=estimate.stamp_ns,
             names=self.names,
             position=values[self.rows],
             velocity=_times(rate_gradient, estimate.velocity[joint]),
-            position_stddev=np.where(lost_angle, np.inf, stddev),
+            position_stddev=np.where(lost_angle, np.inf, np.minimum(stddev, ANYWHERE)),
             # what says nothing of an angle says nothing of its rate
             velocity_stddev=np.where(lost_angle, np.inf, velocity_stddev),
         )

@@ -19,6 +19,7 @@ import numpy as np
 
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import ModelError
+from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.skeleton import BoolArray, FloatArray, Joint
@@ -84,6 +85,7 @@ class InverseKinematics:
     def __init__(self, model: UpperBody, ranges: Ranges | None = None) -> None:
         self.model = model
         self.ranges = ranges or Ranges(model)
+        self.prior = PosturePrior(model, self.ranges)
         self._point = {Joint(joint): number for number, joint in enumerate(model.joints)}
         names = model.coordinate_names
         self._column = {name: number for number, name in enumerate(names)}
@@ -191,8 +193,11 @@ class InverseKinematics:
         measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
         weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
         target = np.where(measured[:, None], positions, 0.0)
-        size = _sizes((target - self.model.forward(q, lengths).positions) * weights[:, None])
-        return self._costs(size, self.ranges.soft_coordinates(q).values)
+        posture = self.model.forward(q, lengths)
+        size = _sizes((target - posture.positions) * weights[:, None])
+        return self._costs(
+            size, self.ranges.soft_coordinates(q).values, self.prior.tilt_of(posture.rotations[..., 0, :, :])
+        )
 
     def turned_about(
         self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray
@@ -288,13 +293,14 @@ class InverseKinematics:
                     break
         return _Descent(q, normal, cost, iterations)
 
-    def _costs(self, size: FloatArray, soft: FloatArray) -> FloatArray:
-        """(...,) of normalised residuals (..., 19) and of the quantities (..., 26) that ranges are about."""
+    def _costs(self, size: FloatArray, soft: FloatArray, tilt: FloatArray) -> FloatArray:
+        """(...,) of normalised residuals (..., 19), the quantities (..., 26) of ranges and the tilt (..., 2)."""
         points = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=-1)
-        off = (soft - self.ranges.centre) / self.ranges.stddev
+        off = (soft - self.prior.mean) / self.prior.stddev
+        leans = tilt / self.prior.tilt_stddev
         over = self.ranges.excess_of(soft) / _LIMIT_STDDEV
         twist = soft @ self.ranges.twist / _TWIST_STDDEV
-        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + twist**2)
+        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + (leans**2).sum(axis=-1) + twist**2)
         return result
 
     def _normal_equations(
@@ -311,9 +317,9 @@ class InverseKinematics:
         gradient = jacobian.T @ error
 
         soft = self.ranges.soft_coordinates(q)
-        off = soft.values - self.ranges.centre
+        off = soft.values - self.prior.mean
         over = self.ranges.excess_of(soft.values)
-        prior = 1.0 / self.ranges.stddev**2
+        prior = 1.0 / self.prior.stddev**2
         limit = np.where(over != 0.0, 1.0 / _LIMIT_STDDEV**2, 0.0)
         inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)
         normal[6:, 6:] += inner
@@ -322,9 +328,13 @@ class InverseKinematics:
         sharing = 1.0 / _TWIST_STDDEV**2
         normal[6:, 6:] += sharing * np.outer(self.ranges.twist, self.ranges.twist)
         gradient[6:] -= sharing * twist * self.ranges.twist
+        tilt = self.prior.tilt(lines)
+        upright = tilt.gradients / self.prior.tilt_stddev[:, None]
+        normal += upright.T @ upright
+        gradient -= upright.T @ (tilt.values / self.prior.tilt_stddev)
         # the base is anywhere; with too few points it still must be somewhere
         normal[np.arange(6), np.arange(6)] += 1e-4
-        return normal, gradient, float(self._costs(size, soft.values))
+        return normal, gradient, float(self._costs(size, soft.values, tilt.values))
 
     def _set_trunk(self, q: FloatArray, part: str, rotation: FloatArray) -> None:
         """Flexion, lateral and axial angle of an intrinsic y-x-z rotation."""

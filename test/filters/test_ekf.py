@@ -14,6 +14,7 @@ from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.measurement import BASE_STDDEV
@@ -41,6 +42,7 @@ from body_tracking.skeleton import (
     Skeleton,
     TrackingState,
 )
+from draws import draws
 
 POINTS = MODEL.joints
 OBSERVED = np.array([number for number, name in enumerate(MODEL.coordinate_names) if name not in UNOBSERVED])
@@ -138,7 +140,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
     # of forearms and hands it is true to first order only
     near = np.array([k for k in OBSERVED if not MODEL.coordinate_names[k].startswith(("forearm", "wrist"))])
     told, hidden = [], []
-    for seed in range(25):
+    for seed in range(draws(8, 25)):
         truth = somebody(100 + seed, 1.0)
         offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
         frames = [
@@ -146,7 +148,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
             for frame in measured(truth, 0.004, seed).skeletons
         ]
         estimates = []
-        for parameters in (EkfParameters(), EkfParameters(offset_scale=0.0)):
+        for parameters in (EkfParameters(posture=False), EkfParameters(posture=False, offset_scale=0.0)):
             estimator = ExtendedKalmanFilter(parameters)
             run(estimator, frames)
             estimates.append(known(estimator))
@@ -162,7 +164,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
 def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
     """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
     rng = np.random.default_rng(3)
-    truth = somebody(3, 10.0)
+    truth = somebody(3, 5.0)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
     offsets = {name: 0.04 * rng.normal(size=(N_JOINTS, 3)) for name in "abcd"}
     estimator = ExtendedKalmanFilter()
@@ -171,15 +173,15 @@ def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again(
             stamp_ns = frame.stamp_ns + place * 8_000_000
             moved = replace(frame, stamp_ns=stamp_ns, positions=frame.positions + offset, covariances=stated)
             estimator.update(moved, name)
-    assert estimator.counters["restarts"] <= 4  # looked for every quarter of a second it was 24
+    assert estimator.counters["restarts"] <= 2  # looked for every quarter of a second it was 12
 
 
 def test_its_uncertainty_is_true() -> None:
     """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees."""
     for_angles, for_points, for_lengths = [], [], []
-    for seed in range(5):
+    for seed in range(draws(3, 10)):
         truth = somebody(20 + seed, 6.0)
-        observation = measured(truth, 0.01 + 0.005 * seed, seed)
+        observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
         estimator = ExtendedKalmanFilter()
         for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
             output = estimator.update(skeleton)
@@ -322,7 +324,7 @@ def test_it_knows_no_left_and_right() -> None:
 def test_two_sensors_are_better_than_either_and_the_better_one_counts_more() -> None:
     """At 20 and 40 mm the plain mean of both would be worse than the better one alone."""
     results = []
-    for seed in range(4):
+    for seed in range(draws(2, 4)):
         rng = np.random.default_rng(40 + seed)
         person, motion = RandomPerson.draw(rng), RandomMotion(rng, 5.0)
         times = capture_times(5.0, rng, 25.0)
@@ -630,7 +632,7 @@ def test_frames_without_anybody_are_predicted() -> None:
 # --- bad data
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(draws(3, 12)))
 def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) -> None:
     truth = somebody(50 + seed, 1.5)
     rng = np.random.default_rng(seed)
@@ -689,7 +691,7 @@ def pose(estimator: ExtendedKalmanFilter) -> FloatArray:
 
 @pytest.mark.parametrize("noise", [0.006, 0.013, 0.025])
 def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: float) -> None:
-    for seed, truth, side in bent_hands(10, 1.2):
+    for seed, truth, side in bent_hands(draws(4, 10), 1.2):
         estimator = ExtendedKalmanFilter()
         estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
         hands = []
@@ -703,7 +705,7 @@ def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: flo
 @pytest.mark.parametrize("noise", [0.006, 0.02])
 def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
     """As if a movement that nobody saw had ended in the wrong pose: at the latest after a second and a half."""
-    for seed, truth, side in bent_hands(6, 2.5, 0.7):
+    for seed, truth, side in bent_hands(draws(3, 6), 2.5, 0.7):
         estimator = ExtendedKalmanFilter()
         hands = []
         for skeleton, time in zip(measured(truth, noise).skeletons, truth.times, strict=True):
@@ -719,7 +721,7 @@ def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
     """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
-    for seed in range(320, 326):
+    for seed in range(320, 320 + draws(3, 12)):
         truth = somebody(seed, 2.4, tempo=1.6)
         for arm in ARMS.values():
             estimator = ExtendedKalmanFilter()
@@ -858,7 +860,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
     positions = MODEL.forward(q, lengths).positions
     truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
-    ranges = Ranges(MODEL)
+    prior = PosturePrior(MODEL, Ranges(MODEL))
     estimator = ExtendedKalmanFilter()
     angles, learnt = [], []
     for skeleton in measured(truth, seed=seed).skeletons:
@@ -869,10 +871,10 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
         columns = [told.names.index(name) for name in UNOBSERVED]
         angles.append(told.position[columns])
         learnt.append(estimate.lengths)
-        assert np.isinf(told.position_stddev[columns]).all()
         tangents = np.array([MODEL.coordinate_names.index(name) for name in UNOBSERVED])
-        stated = np.sqrt(estimate.covariance.diagonal()[tangents])
-        assert (stated > 0.6 * ranges.stddev[tangents - 6]).all()
+        # what nothing observes is nearly as unsure as it is before anything is seen, and never more
+        share = told.position_stddev[columns] / prior.stddev[tangents - 6]
+        assert (share > 0.3).all() and (share < 1.05).all()
     # averages over a second: the noise of one frame is no drift
     averages = np.stack(angles)[: len(angles) // 30 * 30].reshape(-1, 30, len(UNOBSERVED)).mean(axis=1)
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0

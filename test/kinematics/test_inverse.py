@@ -134,7 +134,7 @@ def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
     ],
 )
 def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unknown: tuple[str, ...]) -> None:
-    """And of an angle that no seen point depends on, only its range of motion is known."""
+    """And of an angle that no seen point depends on, only what is known of it before is known."""
     _, lengths, points = people(30, 4)
     gone = of(*missing)
     for length, point in zip(lengths, points, strict=True):
@@ -144,7 +144,7 @@ def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unkn
         stddev = np.sqrt(fit.covariance.diagonal())
         for name in unknown:
             column = NAMES.index(name)
-            assert_allclose(stddev[column], RANGES.stddev[column - 6], rtol=0.01)
+            assert_allclose(stddev[column], INVERSE.prior.stddev[column - 6], rtol=0.01)
 
 
 def test_the_covariance_is_that_of_many_noisy_fits() -> None:
@@ -280,14 +280,15 @@ def test_costs_of_many_poses_are_those_of_each() -> None:
     assert_allclose(together, [INVERSE.cost(each, missing, stddev, lengths[0]) for each in q])
 
 
-def test_an_arm_is_turned_only_where_its_hand_is_seen() -> None:
+def test_elbow_branch_flips_only_with_a_visible_hand() -> None:
     q, lengths, points = people(10, 14)
     stddev = np.full(points.shape[1], 0.02)
     for one, length, point in zip(q, lengths, points, strict=True):
         seen = np.where(of(Joint.THUMB_LEFT)[:, None], np.nan, point)
         for other in INVERSE.turned_about(one, seen, stddev, length):
             assert_allclose(other[:7], one[:7])
-            moved = MODEL.difference(one, other) != 0.0
+            # what stays goes through quaternions and back: rounding, and nothing that anybody would call a turn
+            moved = np.abs(MODEL.difference(one, other)) > 1e-9
             assert INVERSE.is_turned(one, other)
             assert not any(moved[k] for k, name in enumerate(NAMES) if not name.endswith("_right"))
             assert np.abs(RANGES.excess(other))[columns_of("right") - 6].max() < 1e-9

@@ -10,11 +10,9 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.model import Linearisation
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint
+from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 _DIMENSIONS = 3
-_PERIOD_NS = NANOSECONDS // 5
-"""How often it is told anew: it changes as the pose does."""
 _BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
 """Joints that show which way an arm is bent, and how many times the usual distance their centres are off for that: a
 Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simulated as calibrated with recordings)."""
@@ -39,11 +37,6 @@ class Displacement:
         )
         self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
         self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
-        self._last_displaced: tuple[int, FloatArray] | None = None
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._last_displaced = None
 
     def displaced(self, state: State) -> FloatArray:
         """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
@@ -53,14 +46,11 @@ class Displacement:
         without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
         offsets, err by more.
         """
-        period = state.stamp_ns // _PERIOD_NS
-        if self._last_displaced is None or self._last_displaced[0] != period:
-            lines = self._space.model.linearise(state.q, state.lengths)
-            information = self.prior_information
-            if state.sources.names:
-                information = information + self._held(state, lines)
-            self._last_displaced = period, self.covariance(state, lines, information)
-        return self._last_displaced[1]
+        lines = self._space.model.linearise(state.q, state.lengths)
+        information = self.prior_information
+        if state.sources.names:
+            information = information + self._held(state, lines)
+        return self.covariance(state, lines, information)
 
     def covariance(self, state: State, lines: Linearisation, information: FloatArray) -> FloatArray:
         """The same, where (53, 53) information is what is known without any point."""

@@ -118,7 +118,6 @@ class ExtendedKalmanFilter:
         self._skeletons.forget()
         self._centres.reset()
         self._lengths_from_ns: int | None = None
-        self._displacement.forget()
         self._output.forget()
 
     @property

@@ -9,9 +9,11 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import VAGUE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
 from body_tracking.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
 
 _INFERRED = np.uint8(TrackingState.INFERRED)
+_UPDATES = 2
 _UNKNOWN = np.zeros((N_JOINTS, 3, 3))
 _UNKNOWN[:] = np.diag([np.inf] * 3)
 
@@ -30,23 +32,53 @@ class Output:
         self._displacement, self._parameters = displacement, parameters
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
-        self._last_handed_out: tuple[State, FloatArray, FloatArray | None] | None = None
+        self._postural = np.append(space.prior.postural, [True] * 3)
+        stddev = np.concatenate([space.prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], space.prior.tilt_stddev])
+        self._posture_variance = stddev[self._postural] ** 2
+        self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
         """Begin anew."""
         self._last_handed_out = None
 
-    def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray | None]:
-        """The configuration to hand out, and what is added (53, 53) to the covariance: what the filter cannot know."""
+    def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """The configuration to hand out, and its covariance (85, 85) with lengths and velocities.
+
+        The filter follows the joints where sensors take them to be. What it cannot know, how far these are from the
+        anatomical ones, is added here; and of both together posture decides (``kinematics.posture``): an iterated
+        update by the prior, once for each output and never fed back.
+        """
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
-            q, displaced = state.q, None
+            q, covariance = state.q, state.covariance[: space.size, : space.size].copy()
             if self._parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
-                displaced = self._displacement.displaced(state)
+                covariance[: space.observed, : space.observed] += self._displacement.displaced(state)
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
-            self._last_handed_out = state, q, displaced
+            elif self._parameters.posture:
+                q = self._upright(q, state.lengths, covariance)
+            self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
+
+    def _upright(self, q: FloatArray, lengths: FloatArray, covariance: FloatArray) -> FloatArray:
+        """A configuration after the posture prior; changes its covariance in place, velocities are only considered."""
+        space, prior = self._space, self._space.prior
+        known = covariance[: space.observed, : space.observed]
+        start, moved = q, np.zeros(space.nv)
+        for _ in range(_UPDATES):
+            at = prior.rows(q, self._model.linearise(q, lengths))
+            off = at.residuals[self._postural]
+            rows = np.zeros((len(off), space.observed))
+            rows[:, : space.nv] = at.gradients[self._postural]
+            cross = known @ rows.T
+            gain = np.linalg.solve(rows @ cross + np.diag(self._posture_variance), cross.T)
+            moved = (rows[:, : space.nv] @ moved - off) @ gain[:, : space.nv]
+            q = self._model.integrate(start, moved)
+        velocities = covariance[: space.observed, space.velocities]
+        velocities -= gain.T @ (rows @ velocities)
+        covariance[space.velocities, : space.observed] = velocities.T
+        known -= cross @ gain
+        return q
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
         """(35,) a configuration of covariance (32, 32) told the middle of the ranges once, where it is vague."""
@@ -70,35 +102,25 @@ class Output:
             body: whose it is.
         """
         space = self._space
-        q, displaced = self._handed_out(state)
-        known, length_variance = state.covariance, state.covariance.diagonal()[space.lengths]
-        covariance = np.empty((2 * space.nv, 2 * space.nv))
-        for row, rows in enumerate((space.tangent, space.velocities)):
-            for column, columns in enumerate((space.tangent, space.velocities)):
-                block = slice(row * space.nv, (row + 1) * space.nv), slice(column * space.nv, (column + 1) * space.nv)
-                covariance[block] = known[rows, columns]
-        if displaced is not None:
-            covariance[: space.nv, : space.nv] += displaced[space.tangent, space.tangent]
-            length_variance = length_variance + displaced.diagonal()[space.lengths]
+        q, known = self._handed_out(state)
+        own = np.r_[space.tangent, space.velocities]
         return ModelEstimate(
             state.stamp_ns,
             frame_id,
             body,
             q,
             state.velocity,
-            covariance,
+            known[np.ix_(own, own)],
             state.lengths,
-            np.sqrt(length_variance),
+            np.sqrt(known.diagonal()[space.lengths]),
         )
 
     def skeleton(self, state: State, skeleton: Skeleton) -> Skeleton:
         """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
         space = self._space
-        q, displaced = self._handed_out(state)
+        q, covariance = self._handed_out(state)
         lines = self._model.linearise(q, state.lengths)
-        told = state.covariance[: space.observed, : space.observed]
-        if displaced is not None:
-            told = told + displaced
+        told = covariance[: space.observed, : space.observed]
         joints = self._model.joints
         observation = space.observation(lines)
         spread = observation @ told @ observation.T

@@ -90,6 +90,10 @@ class EkfParameters(OrientationParameters):
         2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
     )
 
+    posture: bool = field(
+        default=True,
+        metadata={"doc": "how people hold themselves decides what points cannot tell, as how the spine shares a bend"},
+    )
     t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 
     def __post_init__(self) -> None:

@@ -13,9 +13,10 @@ from body_tracking.skeleton import NANOSECONDS, FloatArray, SingleArray
 
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""
-_POSTURE_TIME = 10.0
-"""Seconds for which people hold a trunk alike: to sources of orientations the middle of its ranges is news once in
-twice that time, however often it is told."""
+
+_POSTURE_TIME, _POSTURE_TIME_MEASURED = 1.0, 10.0
+"""Seconds for which people hold themselves alike: posture is news once in twice that time, however often it is brought
+in. The second where orientations are measured, which say more of it than points do."""
 VAGUE = 0.5
 """Share of the range's deviation from which an angle is drawn to the middle of its range."""
 _SPURIOUS = 0.7
@@ -46,25 +47,30 @@ class Priors:
     def __init__(self, space: StateSpace, parameters: EkfParameters, counters: dict[str, int]) -> None:
         self._space, self._model, self._ranges = space, space.model, space.ranges
         self._parameters, self._counters = parameters, counters
+        self._prior = space.prior
+        # the quantities that are brought in: coordinates, how a twist is shared, and the lean of the pelvis
+        self._stddev = np.concatenate([self._prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], self._prior.tilt_stddev])
+        self._range_stddev = np.append(self._ranges.stddev, self._stddev[-3:])
+        self._postural = np.append(self._prior.postural, [True] * 3)
+        # what points show of the pelvis and the neck says nothing of how sensors are put on
         trunk = [name.startswith(("lumbar", "thoracic", "clavicle")) for name in space.model.coordinate_names[6:]]
-        self._posture = np.append(trunk, True)
+        self._trunk = np.append(trunk, [True, False, False])
 
     def bounded(self, state: State) -> State:
         """Bring in the ranges of motion: softly push back what left them, and bound what nothing observes."""
         space = self._space
         if state.since_prior < _PRIOR_PERIOD:
             return state
-        soft = self._ranges.soft_coordinates(state.q)
-        excess = self._ranges.excess_of(soft.values)
-        gradients = np.zeros((space.nv - 5, space.nv))
-        gradients[:-1, 6:] = soft.gradients
-        gradients[-1, 6:] = self._ranges.twist @ soft.gradients
-        values = np.append(soft.values - self._ranges.centre, self._ranges.twist @ soft.values)
-        stddev = np.append(self._ranges.stddev, np.radians(TWIST_SHARING_STDDEV))
+        prior = self._prior.rows(state.q, self._model.linearise(state.q, state.lengths))
+        values, gradients, stddev = prior.residuals, prior.gradients, self._stddev
+        excess = self._ranges.excess_of(prior.coordinates)
+        if state.sources.names:  # the posture prior is not validated beside sensors whose mounting is being estimated
+            values[:-3], stddev = prior.coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
-        # What is less sure than its range is told the middle of the range, just so surely that it is as sure as that:
-        # as far as no orientation holds it, for what is told again and again is wrong by the same each time.
+        # A coordinate whose variance exceeds that of its prior gets a pseudo-measurement at the prior's mean, with the
+        # variance that brings it down to the prior's. It moves no segment whose orientation is measured, since the
+        # pseudo-measurement has the same error every time.
         limit = stddev**2
         unknown = variance > limit
         noise = variance * limit / np.maximum(variance - limit, 1e-12)
@@ -77,16 +83,18 @@ class Priors:
         state = self._unsure(state)
         if unknown.any():
             state = self._told(state, gradients[unknown], -values[unknown], noise[unknown], self._free(state))
-        if state.sources.names:
-            rows, repeated = self._posture, 2.0 * _POSTURE_TIME / _PRIOR_PERIOD
-            whole = state.covariance, state.crosses
-            state = self._told(state, gradients[rows], -values[rows], repeated * limit[rows], whole)
-        vague = variance > (VAGUE * stddev) ** 2
+        if state.sources.names or self._parameters.posture:
+            time, rows = (
+                (_POSTURE_TIME_MEASURED, self._trunk) if state.sources.names else (_POSTURE_TIME, self._postural)
+            )
+            noise = 2.0 * time / _PRIOR_PERIOD * limit[rows]
+            state = self._told(state, gradients[rows], -values[rows], noise, (state.covariance, state.crosses))
+        vague = (variance > (VAGUE * stddev) ** 2) & ~self._postural
         if vague.any() and not state.sources.names:
             state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
         beyond = excess != 0.0
         if beyond.any():
-            state = self._pushed_back(state, gradients[:-1][beyond], excess[beyond])
+            state = self._pushed_back(state, gradients[:-3][beyond], excess[beyond])
         return state
 
     def _turned(self, state: State, q: FloatArray, signs: FloatArray) -> State:

@@ -10,6 +10,7 @@ import numpy as np
 from body_tracking.filters.ekf.sources import Sources
 from body_tracking.kinematics.lengths import SegmentLengths, proportions
 from body_tracking.kinematics.model import Linearisation
+from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import BASE_STDDEV
@@ -185,6 +186,7 @@ class StateSpace:
     Attributes:
         model: as given.
         ranges: of its motion.
+        prior: how people hold themselves.
         points: how many of its joints are observed (19).
         nv: dimension of the tangent space (32).
         nl: how many lengths it has (21).
@@ -201,6 +203,7 @@ class StateSpace:
     def __init__(self, model: UpperBody) -> None:
         self.model = model
         self.ranges = Ranges(model)
+        self.prior = PosturePrior(model, self.ranges)
         self.points = len(model.joints)
         self.nv, self.nl = model.nv, len(model.length_names)
         self.observed = self.nv + self.nl
@@ -212,7 +215,8 @@ class StateSpace:
         self.own: IntArray = (3 * self.points * first[:, :, None] + first[:, None, :]).astype(np.intp)
         self.base_variance = BASE_STDDEV[model.joints] ** 2
         self.rest_information = np.full(self.nv, 1e-4)
-        self.rest_information[6:] = 1.0 / self.ranges.stddev**2
+        self.rest_information[3:5] = 1.0 / self.prior.tilt_stddev.max() ** 2
+        self.rest_information[6:] = 1.0 / self.prior.stddev**2
         self.lengths_covariance = proportions()
         self.thumbs = np.zeros((len(model.segment_names), self.points), dtype=np.bool_)
         for number, name in enumerate(model.segment_names):

@@ -1,0 +1,145 @@
+"""How people hold themselves: what is known of a pose before anything is measured.
+
+Points cannot tell how a bend divides between pelvis, lumbar and thoracic joints: the base of the spine and the hips lie
+on one line, and the middle of the spine is seen through clothes. Posture tells it. An upright person is upright in all
+of these joints, and who bends forward does so in all of them, in proportion to their variances.
+
+Zero is the neutral standing pose of ``upper_body``. The deviations are of moving people, and are rounded: publications
+give their order of magnitude, and those marked * were then adjusted (by at most a factor of 1.5) on the three shipped
+recordings, which are simulated. So no figure over these recordings is evidence for them; people nobody tuned on are.
+
+- pelvic tilt*, lumbar and thoracic flexion*: between standing people pelvic tilt has a deviation of 7 deg (Mac-Thiong
+  et al., Eur. Spine J. 20 Suppl. 5 (2011) 572, 709 people); who bends forward bends the lumbar spine twice as much
+  as the hips at first, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
+- the others: a share of the range to one side in :mod:`body_tracking.kinematics.ranges`, whose sources stand there; a
+  third for lateral bending* and the neck, half for axial rotation, a quarter for the clavicle
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.kinematics import so3
+from body_tracking.kinematics.model import Linearisation
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.skeleton import BoolArray, FloatArray
+
+STDDEV: dict[str, float] = {
+    "lumbar_flexion": 10.0,
+    "lumbar_lateral": 10.0,
+    "lumbar_axial": 8.0,
+    "thoracic_flexion": 8.0,
+    "thoracic_lateral": 10.0,
+    "thoracic_axial": 20.0,
+    "neck_flexion": 20.0,
+    "neck_lateral": 15.0,
+    "clavicle_protraction": 8.0,
+    "clavicle_elevation": 8.0,
+}
+"""Degrees about zero."""
+
+TILT_STDDEV = (10.0, 6.0)
+"""Degrees by which the pelvis leans forward or back, and to a side, against gravity."""
+
+_VERTICAL = 1e-9
+"""Horizontal part of the left-right axis of a pelvis that lies on its side."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tilt:
+    """How far the pelvis leans.
+
+    Attributes:
+        values: (2,) sines of the lean forward and to the left.
+        gradients: (2, 32) by the tangent.
+    """
+
+    values: FloatArray
+    gradients: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """What the prior is about at one configuration: 26 coordinates, the twist's sharing, and the pelvis's tilt.
+
+    Attributes:
+        coordinates: (26,) radians, of ``SoftCoordinates``.
+        residuals: (29,) differences from the prior's means.
+        gradients: (29, 32) by the tangent.
+    """
+
+    coordinates: FloatArray
+    residuals: FloatArray
+    gradients: FloatArray
+
+
+class PosturePrior:
+    """The mean and the deviation of each coordinate of ``upper_body`` after the base.
+
+    What posture does not tell, arms but for the clavicles, has the centre of its range of motion and a deviation of a
+    third of half of it.
+
+    Attributes:
+        mean, stddev: (26,) radians, of ``SoftCoordinates``.
+        postural: (26,) which of them posture tells.
+        tilt_stddev: (2,) radians, of :class:`Tilt`.
+    """
+
+    def __init__(self, model: UpperBody, ranges: Ranges) -> None:
+        names = [name.removesuffix("_left").removesuffix("_right") for name in model.coordinate_names[6:]]
+        self.postural: BoolArray = np.array([name in STDDEV for name in names])
+        told = np.radians([STDDEV.get(name, 0.0) for name in names])
+        self.mean: FloatArray = np.where(self.postural, 0.0, ranges.centre)
+        self.stddev: FloatArray = np.where(self.postural, told, ranges.stddev)
+        self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
+        self._ranges = ranges
+
+    def rows(self, q: FloatArray, lines: Linearisation) -> Rows:
+        """Deviations from the prior's mean at one configuration, with their derivatives.
+
+        Args:
+            q: (35,) configuration.
+            lines: of the model there.
+        """
+        soft, tilt = self._ranges.soft_coordinates(q), self.tilt(lines)
+        gradients = np.zeros((len(self.mean) + 3, tilt.gradients.shape[1]))
+        gradients[:-3, 6:] = soft.gradients
+        gradients[-3, 6:] = self._ranges.twist @ soft.gradients
+        gradients[-2:] = tilt.gradients
+        twist = [self._ranges.twist @ soft.values]
+        return Rows(soft.values, np.concatenate([soft.values - self.mean, twist, tilt.values]), gradients)
+
+    @staticmethod
+    def tilt_of(rotation: FloatArray) -> FloatArray:
+        """(..., 2) sines of the lean of a pelvis forward and to the left, of its rotations (..., 3, 3)."""
+        ways = _ways(rotation)
+        values: FloatArray = (ways @ rotation[..., :, 2:])[..., 0]
+        return values
+
+    @staticmethod
+    def tilt(lines: Linearisation) -> Tilt:
+        """The lean of the pelvis at one configuration, with its derivative.
+
+        Args:
+            lines: of the model there.
+        """
+        rotation, turning = lines.posture.rotations[0], lines.rotation_jacobian[0]
+        ways = _ways(rotation)
+        forward, left = ways @ rotation[:, 2]
+        gradients: FloatArray = ways @ so3.skew(-rotation[:, 2]) @ turning
+        # both ways turn with the heading
+        size = max(float(np.hypot(rotation[0, 1], rotation[1, 1])), _VERTICAL)
+        heading = (-ways[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
+        gradients += np.outer([left, -forward], heading)
+        return Tilt(np.array([forward, left]), gradients)
+
+
+def _ways(rotation: FloatArray) -> FloatArray:
+    """(..., 2, 3) horizontal unit vectors: where a pelvis of rotation (..., 3, 3) faces, and to its left."""
+    x, y = rotation[..., 0, 1], rotation[..., 1, 1]
+    size = np.maximum(np.hypot(x, y), _VERTICAL)
+    x, y, zero = x / size, y / size, np.zeros_like(x)
+    return np.stack([np.stack([y, -x, zero], axis=-1), np.stack([x, y, zero], axis=-1)], axis=-2)
