@@ -45,6 +45,23 @@ def headings_of(points: FloatArray) -> list[float]:
     return found
 
 
+def heading_weights(points: FloatArray, variance: FloatArray) -> list[float]:
+    """What :func:`headings_of` is worth: the inverse variances of both headings, 1/rad2; 0 where not known.
+
+    The variance of the direction of an axis is that of the difference of its ends across it over its squared length.
+
+    Args:
+        points: (25, 3) metres in world.
+        variance: (25,) square metres.
+    """
+    weights = []
+    for left, right in PAIRS:
+        x, y, _ = (points[left] - points[right]).tolist()
+        weight = (x * x + y * y) / (float(variance[left]) + float(variance[right]))
+        weights.append(weight if math.isfinite(weight) else 0.0)
+    return weights
+
+
 def agree(headings: Sequence[float], believed: Sequence[float]) -> bool:
     """Whether nothing is to be put right, as far as that is known."""
     return not any(math.cos(a - b) < SAME_SENSE for a, b in zip(headings, believed, strict=True))

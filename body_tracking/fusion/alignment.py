@@ -18,7 +18,7 @@ from body_tracking.fusion.fusion import WORLD, FusionError
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
 from body_tracking.fusion.sides import Sides
 from body_tracking.measurement import joint_stddev, viewing_angle
-from body_tracking.sides import agree, headings_of, put_right
+from body_tracking.sides import agree, heading_weights, headings_of, put_right
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 FRESH = 0.1
@@ -39,6 +39,7 @@ class _Seen:
     states: np.ndarray
     angle: float
     headings: list[float]
+    weights: list[float]
     body: int
 
 
@@ -125,7 +126,10 @@ class SensorAlignment:
             self.counters["unknown_sensor"] += 1
             return None
         self._note(sensor, source, skeleton.stamp_ns)
-        stamp = source.to_reference(skeleton.stamp_ns)
+        stamp = source.stamp(skeleton.stamp_ns)
+        if stamp is None:
+            self.counters["other_clock"] += 1
+            return None
         pose = source.pose(stamp)
         if pose is None:
             self.counters["uncalibrated"] += 1
@@ -181,7 +185,8 @@ class SensorAlignment:
         }
         frames = [frame for frame in fresh.values() if frame is not None]
         angles, headings = [frame.angle for frame in frames], [frame.headings for frame in frames]
-        believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, self.counters)
+        weights = [frame.weights for frame in frames]
+        believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
         points, variance, states = seen.positions, seen.variance, seen.states
         counted: Counter[str] = Counter()
         if not agree(seen.headings, believed):
@@ -210,4 +215,5 @@ def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Seen:
     angle = viewing_angle(positions)
     variance = joint_stddev(positions, states, angle) ** 2
     placed = pose.apply(positions)
-    return _Seen(stamp_ns, placed, variance, states, float(angle), headings_of(placed), skeleton.body)
+    headings, weights = headings_of(placed), heading_weights(placed, variance)
+    return _Seen(stamp_ns, placed, variance, states, float(angle), headings, weights, skeleton.body)

@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
 
@@ -189,6 +188,10 @@ class Association:
     """
 
     def __init__(self, hold: float = HOLD) -> None:
+        # Takes half a second, which only who assigns need pay; at a second person's first frame it would be too late.
+        from scipy.optimize import linear_sum_assignment
+
+        self._least_total = linear_sum_assignment
         self.counters: Counter[str] = Counter()
         self._hold_ns = round(hold * NANOSECONDS)
         self._number = 0
@@ -333,7 +336,7 @@ class Association:
         costs[~(distances <= np.array(gate)[:, None])] = _IMPOSSIBLE
         rows: IntArray
         columns: IntArray
-        rows, columns = linear_sum_assignment(costs)
+        rows, columns = self._least_total(costs)
         for row, column in zip(rows, columns, strict=True):
             if costs[row, column] < _IMPOSSIBLE:
                 whose[column] = people[row]
@@ -357,7 +360,7 @@ class Association:
         expected = np.stack([person.expected(other, stamp_ns) for person, other in present])
         distances = np.minimum(torso_distances(expected, points[columns]), 2.0 * GATE)
         now = distances[list(mine.values()), range(len(columns))].sum()
-        rows, chosen = linear_sum_assignment(distances)
+        rows, chosen = self._least_total(distances)
         if now - distances[rows, chosen].sum() <= _MARGIN:
             self._contested.pop(sensor, None)
             return whose

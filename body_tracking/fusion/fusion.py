@@ -148,6 +148,8 @@ class _Sensor(Placement):
     def clear(self) -> None:
         self.frames: deque[_Frame] = deque(maxlen=8)
         self.rhythm = Rhythm()
+        self.newest_ns: int | None = None  # in the reference's clock
+        self.ahead = False  # its clock is not what it is taken for: the reference's frames came from its past
 
 
 class Fusion:
@@ -181,6 +183,7 @@ class Fusion:
     def _forget_output(self) -> None:
         self._pending.clear()
         self._last_ns: int | None = None
+        self._behind_since_ns: int | None = None
         self._position: FloatArray = np.zeros((N_JOINTS, 3))
         self._velocity: FloatArray = np.zeros((N_JOINTS, 3))
         self._known_ns: FloatArray = np.full(N_JOINTS, -np.inf)
@@ -252,7 +255,10 @@ class Fusion:
             else:
                 source.clear()
                 self.counters["resets"] += 1
-        stamp = source.to_reference(skeleton.stamp_ns)
+        stamp = source.stamp(skeleton.stamp_ns)
+        if stamp is None or not self._in_step(sensor, source, stamp, now_ns):
+            self.counters["other_clock"] += 1
+            return False
         # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:
@@ -262,6 +268,29 @@ class Fusion:
         else:
             deadline = now_ns + round(self.parameters.max_wait * NANOSECONDS)
             insort(self._pending, (stamp, sensor != self.reference, deadline))
+        return True
+
+    def _in_step(self, sensor: str, source: _Sensor, stamp: int, now_ns: int) -> bool:
+        """Whether a frame is of the time in which the reference sensor is, as far as that can be told.
+
+        The clock of another sensor may be misstated. What it says of a time to come is not waited for: where the
+        reference's frames have been older than the output for longer than a delay explains, the output starts again.
+        """
+        jump = CLOCK_JUMP * NANOSECONDS
+        source.newest_ns = stamp
+        if sensor != self.reference:
+            reference_ns = self._sensors[self.reference].newest_ns
+            source.ahead &= reference_ns is not None and stamp > reference_ns + jump
+            return not source.ahead and (reference_ns is None or stamp >= reference_ns - jump)
+        for other in self._sensors.values():
+            other.ahead |= other.newest_ns is not None and other.newest_ns > stamp + jump
+        if self._last_ns is None or self._last_ns <= stamp + jump:
+            self._behind_since_ns = None
+        elif self._behind_since_ns is None:
+            self._behind_since_ns = now_ns
+        elif now_ns - self._behind_since_ns > jump:
+            self._forget_output()
+            self.counters["resets"] += 1
         return True
 
     def _remember(self, source: _Sensor, skeleton: Skeleton, stamp: int) -> None:
@@ -385,8 +414,9 @@ class Fusion:
             return self._combined(stamp, body, points, variance, weights, states)
         # What moves between a sensor's capture and the output's is not known better than this.
         variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
-        self._sides.settle(stamp, names, [frame.angle for frame in frames], points, variance, states, self.counters)
-        weights = self._gated(stamp, names, points, variance)
+        angles = [frame.angle for frame in frames]
+        as_believed = self._sides.settle(stamp, names, angles, points, variance, states, self.counters)
+        weights = self._gated(stamp, names, points, variance, as_believed)
         if min(shares) < 1.0:
             weights *= np.array(shares)[:, None]
         fused = self._combined(stamp, body, points, variance, weights, states)
@@ -394,7 +424,9 @@ class Fusion:
         self._follow(stamp, fused.positions)
         return fused
 
-    def _gated(self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray) -> FloatArray:
+    def _gated(
+        self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray, as_believed: BoolArray
+    ) -> FloatArray:
         """(k, 25) weights: the inverse variances, less for joints away from their prediction, none beyond the gate."""
         # A joint that is nowhere has an infinite variance; one without a recent past has an infinite prediction error.
         weights = 1.0 / variance
@@ -406,14 +438,14 @@ class Fusion:
         far = squared > self.parameters.gate**2  # False for NaN
         if far.any() or self._rejecting:
             self._judge(stamp, names, far)
-        # Both shoulders and both hips from the same sensors, or the axis between them means nothing; and the believed
-        # sensor's at once, when it has turned them as a whole.
-        believed = names.index(self._sides.trusted) if self._sides.trusted in names else None
-        for pair, (least, most) in zip(PAIRS, _WIDTHS, strict=True):
+        # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those with the
+        # believed heading are not gated: a prediction does not know yet that the body turned.
+        for half, (pair, (least, most)) in enumerate(zip(PAIRS, _WIDTHS, strict=True)):
             far[:, pair] |= far[:, pair[::-1]]
-            if believed is not None and least < math.dist(*points[believed, pair].tolist()) < most:
-                far[believed, pair] = False
-                squared[believed, pair] = 0.0
+            width = np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1)
+            turned = np.flatnonzero(as_believed[:, half] & (least < width) & (width < most))
+            far[turned[:, None], pair] = False
+            squared[turned[:, None], pair] = 0.0
         weights /= 1.0 + squared / 4.0
         weights[far | ~np.isfinite(weights)] = 0.0
         self.counters["gated_joints"] += int(np.count_nonzero(far))

@@ -237,7 +237,10 @@ class People:
             else:
                 self.sensor_jumped_back(sensor)
         source.last_ns = sensor_ns
-        stamp_ns = source.to_reference(sensor_ns)
+        stamp_ns = source.stamp(sensor_ns)
+        if stamp_ns is None:
+            self._counters["other_clock"] += 1
+            return None
         pose = source.pose(stamp_ns)
         if pose is None:
             self._counters["uncalibrated"] += 1

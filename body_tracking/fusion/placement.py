@@ -5,9 +5,13 @@ from __future__ import annotations
 from bisect import bisect_right
 
 from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.skeleton import MAX_STAMP_NS
 
 CLOCK_JUMP = 1.0
 """A sensor whose stamps go back by more than this starts again, seconds."""
+
+_MOST = 64
+"""Poses, and clocks, of one sensor that may wait for their time: a calibration announces one at a time."""
 
 
 class Placement:
@@ -18,12 +22,16 @@ class Placement:
         self._clocks: list[tuple[int, ClockModel]] = []  # likewise
 
     def set_pose(self, pose: SensorPose) -> None:
-        """Take a pose, in force from its ``valid_from_ns``."""
-        self._poses.insert(bisect_right(self._poses, pose.valid_from_ns, key=_valid_from), pose)
+        """Take a pose, in force from its ``valid_from_ns`` instead of what was said before of later times."""
+        del self._poses[bisect_right(self._poses, pose.valid_from_ns, key=_valid_from) :]
+        self._poses.append(pose)
+        del self._poses[:-_MOST]
 
     def set_clock(self, valid_from_ns: int, clock: ClockModel) -> None:
-        """Take a relation of the clocks, in force from a reference time."""
-        self._clocks.insert(bisect_right(self._clocks, valid_from_ns, key=_first), (valid_from_ns, clock))
+        """Take a relation of the clocks, in force from a reference time, likewise."""
+        del self._clocks[bisect_right(self._clocks, valid_from_ns, key=_first) :]
+        self._clocks.append((valid_from_ns, clock))
+        del self._clocks[:-_MOST]
 
     def to_reference(self, sensor_ns: int) -> int:
         """A stamp of this sensor in the reference's clock, by the relation that is in force then."""
@@ -34,6 +42,11 @@ class Placement:
                 break
             found = reference_ns
         return found
+
+    def stamp(self, sensor_ns: int) -> int | None:
+        """The same; None where that is no time of ROS, because the clock is not what it is said to be."""
+        found = self.to_reference(sensor_ns)
+        return found if 0 <= found <= MAX_STAMP_NS else None
 
     def pose(self, now_ns: int) -> SensorPose | None:
         """The pose in force at a reference time."""

@@ -4,21 +4,37 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from body_tracking.sides import HALVES, PAIRS, SAME_SENSE, headings_of, put_right
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.sides import HALVES, PAIRS, SAME_SENSE, heading_weights, headings_of, put_right
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 _CLOSE = math.sqrt(0.5)
-"""... above which one sensor says the same as another, or as was said before."""
+"""Cosine between the headings that two sensors see above which they agree."""
+
+_SURE = math.cos(math.radians(30.0))
+"""Cosine of the angle to the believed line from which on an axis is as it is believed to be."""
+
+HEADING_DRIFT = 1.6
+"""Spectral density of a person's turning, as a random walk of the heading, rad2/s."""
+
+_START_VARIANCE = 1.0
+"""Of a heading that one frame of one sensor told, before that frame is taken, rad2."""
+
+HEADING_BIAS = 0.2
+"""Standard deviation of what a sensor's heading is wrong by for long, radians."""
 
 MORE_FRONTAL = math.pi / 6
 """A sensor is believed more on left and right when it sees the body this much more from the front, radians ..."""
 
 TRUST_AFTER = round(1.0 * NANOSECONDS)
 """... for this long, while it agrees with the one believed so far, nanoseconds."""
+
+VIEW_KEPT = round(0.5 * NANOSECONDS)
+"""A sensor that was silent for longer may have exchanged left and right meanwhile, nanoseconds."""
 
 HOLD = 10.0
 """A reversal that all sensors see at once is not believed for this long, seconds ..."""
@@ -30,7 +46,68 @@ TURN_RATE = 8.0
 """A person's shoulders turn no faster than this, radians per second (throwing athletes' trunks reach it)."""
 
 TURN_ONCE = math.pi / 3
-"""... and by no more than this between two outputs, however long they are apart, radians."""
+"""Radians that they turn at most between two outputs, however long these are apart."""
+
+JUMP = math.radians(20.0)
+"""Radians beyond ``TURN_RATE`` by which an axis that one sensor sees must turn between two frames to be an outlier."""
+
+JUMP_WIDTH = 1.3
+"""Factor by which the axis must become longer or shorter as well: then one of its two joints is misplaced."""
+
+JUMP_HOLD = 0.3
+"""Seconds after which a new heading and width is accepted."""
+
+
+class _Heading:
+    """A Kalman filter of the heading of half a body: a random walk, measured by each sensor as the direction of a line.
+
+    Args:
+        angle: at first, radians.
+    """
+
+    def __init__(self, angle: float) -> None:
+        self.angle, self._variance = angle, _START_VARIANCE
+
+    def predict(self, elapsed: float) -> None:
+        """Go on by a time, seconds."""
+        self._variance += HEADING_DRIFT * max(elapsed, 0.0)
+
+    def innovation(self, angle: float) -> float:
+        """From the state to a line, radians within a quarter turn: angles that differ by half a turn mean the same."""
+        return math.remainder(angle - self.angle, math.pi)
+
+    def update(self, angles: Sequence[float], weights: Sequence[float]) -> float:
+        """Take what sensors measure; what is far from the state has less weight.
+
+        Args:
+            angles: radians.
+            weights: inverse variances, 1/rad2; 0 where nothing was measured.
+
+        Returns:
+            By how much the angle changed, radians.
+        """
+        total = towards = 0.0
+        for angle, weight in zip(angles, weights, strict=True):
+            if not weight:
+                continue
+            noise = 1.0 / weight + HEADING_BIAS**2
+            away = self.innovation(angle)
+            information = 1.0 / (noise * (1.0 + away**2 / (self._variance + noise) / 4.0))
+            total += information
+            towards += information * away
+        if not total:
+            return 0.0
+        self._variance = 1.0 / (1.0 / self._variance + total)
+        self.angle += self._variance * towards
+        return abs(self._variance * towards)
+
+
+class _View(NamedTuple):
+    """What a sensor last saw of a body: when, its headings, and 1, or -1 where left and right are exchanged."""
+
+    stamp: int
+    headings: Sequence[float]
+    sense: float
 
 
 class Sides:
@@ -50,10 +127,13 @@ class Sides:
         self.trusted: str | None = None
         self._trusted_ns = 0
         self._better_since: int | None = None
-        self._axes = [math.nan, math.nan]  # headings taken for true
-        self._axes_ns: int | None = None
-        self._known_since = [0, 0]  # without having been reversed
-        self._reversed_since: list[int | None] = [None, None]
+        self._halves = [_Heading(math.nan), _Heading(math.nan)]  # taken for true
+        self._headings_ns: int | None = None
+        self._known_since = 0  # without having been reversed
+        self._reversed_since: int | None = None
+        self._views: dict[str, _View] = {}
+        # the latest heading, width and stamp, by sensor and half
+        self._seen: dict[tuple[str, int], tuple[float, float, int]] = {}
         self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
 
     def settle(
@@ -65,7 +145,7 @@ class Sides:
         variance: FloatArray,
         states: np.ndarray,
         counters: Counter[str],
-    ) -> None:
+    ) -> BoolArray:
         """Repair or reject, in place, what a sensor sees turned around or with its sides swapped.
 
         Where a sensor's left-right axis is opposite to the believed one, left and right are exchanged; where it is
@@ -78,12 +158,38 @@ class Sides:
             points: (k, 25, 3) metres in world.
             variance: (k, 25) square metres.
             states: (k, 25).
-            counters: counts ``repaired``, ``turned`` and ``reversals_accepted``.
+            counters: counts ``repaired``, ``turned``, ``jumped`` and ``reversals_accepted``.
+
+        Returns:
+            (k, 2) whether what is left of a sensor's upper and lower body has the heading that is taken for true.
         """
         headings = [headings_of(each) for each in points]
-        believed = self.believed(stamp, names, angles, headings, counters)
+        weights = [heading_weights(*each) for each in zip(points, variance, strict=True)]
+        for index, name in enumerate(names):
+            for half in self._jumped(stamp, name, headings[index], points[index]):
+                weights[index][half] = 0.0
+                variance[index, HALVES[half]] = np.inf
+                counters["jumped"] += 1
+        believed = self.believed(stamp, names, angles, headings, weights, counters)
         for index, found in enumerate(headings):
             put_right(found, believed, points[index], variance[index], states[index], counters)
+        lines = [[abs(math.cos(a - b)) for a, b in zip(found, believed, strict=True)] for found in headings]
+        return np.array(lines) > _SURE
+
+    def _jumped(self, stamp: int, name: str, headings: Sequence[float], points: FloatArray) -> list[int]:
+        """The halves of a body of which one sensor sees one end elsewhere at once: another heading, another width."""
+        jumped = []
+        for half, (heading, pair) in enumerate(zip(headings, PAIRS, strict=True)):
+            width = math.dist(*points[pair].tolist())
+            before, width_before, before_ns = self._seen.get((name, half), (math.nan, math.nan, 0))
+            elapsed = (stamp - before_ns) / NANOSECONDS
+            turn = abs(math.remainder(heading - before, math.pi))  # exchanged sides are another matter
+            other = max(width, width_before) > JUMP_WIDTH * min(width, width_before)
+            if elapsed < JUMP_HOLD and other and turn > TURN_RATE * elapsed + JUMP:
+                jumped.append(half)
+            elif not math.isnan(heading):
+                self._seen[name, half] = heading, width, stamp
+        return jumped
 
     def believed(
         self,
@@ -91,42 +197,90 @@ class Sides:
         names: Sequence[str],
         angles: Sequence[float],
         headings: Sequence[Sequence[float]],
+        weights: Sequence[Sequence[float]],
         counters: Counter[str],
     ) -> list[float]:
         """The headings of both halves that are taken for true, radians.
 
-        They are those of the believed sensor; another takes over that sees the body more from the front for a while
-        and agrees with it. While the believed one is missing, or sees the body turned round at once and another does
-        not, they are that other's.
+        Each is estimated by a Kalman filter of its own. A sensor measures the left-right axis as a line; its
+        sense is the one nearer to the state, whichever way the sensor sees the body. Which sense is the true one the
+        trusted sensor decides, for the whole body: at the start, and where it sees the body reversed for so long that
+        this is believed. Another sensor becomes the trusted one when it sees the body more from the front for a while
+        and agrees with it, or when the trusted one is missing.
 
         Args:
             stamp: reference time, nanoseconds.
             names: k sensors.
             angles: k angles under which they see the body, radians.
             headings: k times what :func:`headings_of` says of what they see.
+            weights: k times what :func:`heading_weights` says.
             counters: counts ``reversals_accepted``.
         """
         known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
         if not known:
-            return self._axes
+            return [half.angle for half in self._halves]
         leading = next((index for index in known if names[index] == self.trusted), None)
         if leading is None:
             leading = min(known, key=lambda index: angles[index])
             takes_over = self.trusted is None or stamp - self._trusted_ns > TRUST_AFTER
         else:
             leading, takes_over = self._most_frontal(stamp, leading, known, angles, headings), True
-        recent = self._axes_ns is not None and stamp - self._axes_ns <= TRUST_AFTER
-        if not recent:
-            self._known_since, self._reversed_since = [self._credited(stamp, angles[leading])] * 2, [None, None]
-        others = [headings[index] for index in known if index != leading]
-        self._axes = [
-            self._held(stamp, half, heading, [other[half] for other in others], recent, angles[leading], counters)
-            for half, heading in enumerate(headings[leading])
+        if self._headings_ns is None or stamp - self._headings_ns > TRUST_AFTER:
+            self._start(stamp, headings[leading], weights[leading], angles[leading])
+        else:
+            for half in self._halves:
+                half.predict((stamp - self._headings_ns) / NANOSECONDS)
+            senses = {index: self._sense(headings[index], weights[index]) for index in known}
+            if self._reversal_believed(stamp, leading, senses, angles[leading]):
+                counters["reversals_accepted"] += 1
+                for half in self._halves:
+                    half.angle += math.pi
+                self._views.clear()
+        moved = [
+            half.update([headings[index][number] for index in known], [weights[index][number] for index in known])
+            for number, half in enumerate(self._halves)
         ]
-        self._axes_ns = stamp
+        upper, lower = self._halves
+        if math.cos(upper.angle - lower.angle) < 0.0:  # nobody's shoulders are turned round above the hips
+            (lower if moved[1] > moved[0] else upper).angle += math.pi
+        expected = {index: self._expected(stamp, names[index], headings[index], weights[index]) for index in known}
+        if expected[leading] * self._sense(headings[leading], weights[leading]) < -SAME_SENSE:
+            # what drew the estimate round is not the sensor that sees the body best: that one saw no reversal
+            counters["senses_restored"] += 1
+            for half in self._halves:
+                half.angle += math.pi
+        self._headings_ns = stamp
         if takes_over:
             self.trusted, self._trusted_ns = names[leading], stamp
-        return self._axes
+        return [half.angle for half in self._halves]
+
+    def _start(self, stamp: int, headings: Sequence[float], weights: Sequence[float], angle: float) -> None:
+        """Take the headings that one sensor sees for true, and of two opposite ones that which is better known."""
+        self._halves = [_Heading(heading) for heading in headings]
+        if math.cos(headings[0] - headings[1]) < 0.0:
+            self._halves[int(weights[0] > weights[1])].angle += math.pi
+        self._known_since, self._reversed_since = self._credited(stamp, angle), None
+
+    def _sense(self, headings: Sequence[float], weights: Sequence[float]) -> float:
+        """1 where a sensor sees a body as it is taken to stand, -1 where reversed; the mean of both halves."""
+        total = sum(weights)
+        agreement = (
+            weight * math.cos(heading - half.angle)
+            for heading, half, weight in zip(headings, self._halves, weights, strict=True)
+        )
+        return sum(agreement) / total if total else 0.0
+
+    def _expected(self, stamp: int, name: str, headings: Sequence[float], weights: Sequence[float]) -> float:
+        """The sense in which a sensor should see the body: as in its last frame, unless it exchanged left and right."""
+        view = self._views.get(name)
+        total = sum(weights)
+        if view is None or stamp - view.stamp > VIEW_KEPT or not total:
+            sense = math.copysign(1.0, self._sense(headings, weights))
+        else:
+            kept = sum(w * math.cos(a - b) for a, b, w in zip(headings, view.headings, weights, strict=True)) / total
+            sense = view.sense if kept > 0.0 else -view.sense
+        self._views[name] = _View(stamp, headings, sense)
+        return sense
 
     def _most_frontal(
         self,
@@ -136,7 +290,7 @@ class Sides:
         angles: Sequence[float],
         headings: Sequence[Sequence[float]],
     ) -> int:
-        """The believed sensor, or one that has agreed with it and seen the body more from the front for a while."""
+        """The trusted sensor, or one that has agreed with it and seen the body more from the front for a while."""
         upper = headings[leading][0]
         agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE]
         better = min(agreeing, key=lambda index: angles[index])
@@ -149,17 +303,8 @@ class Sides:
             return better
         return leading
 
-    def _held(
-        self,
-        stamp: int,
-        half: int,
-        heading: float,
-        others: Sequence[float],
-        recent: bool,
-        angle: float,
-        counters: Counter[str],
-    ) -> float:
-        """The heading; another sensor's, or the opposite, where the believed one turned the body between two frames.
+    def _reversal_believed(self, stamp: int, leading: int, senses: Mapping[int, float], angle: float) -> bool:
+        """Whether the body stands the other way round than it was taken to, since the trusted sensor sees it reversed.
 
         Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
         another one goes on as before, it errs now, for as long as that one does, unless most sensors are with it. Else
@@ -167,26 +312,19 @@ class Sides:
         reversal is believed when it has lasted as long as what it contradicts; and seldom so that it sees somebody's
         back, so that who was seen to face it counts as one who was seen for long.
         """
-        before = self._axes[half]
-        sense = math.cos(before - heading)
-        if recent and sense < SAME_SENSE:
-            as_before = [other for other in others if math.cos(other - before) > _CLOSE]
-            with_it = sum(math.cos(other - heading) > _CLOSE for other in others)
-            # of as many on either side those are right that nobody has seen turn
-            if len(as_before) > with_it:
-                self._reversed_since[half] = None
-                return max(as_before, key=lambda other: math.cos(other - before))
-        if not (recent and sense < -SAME_SENSE):
-            self._reversed_since[half] = None
-            return heading
-        since = self._reversed_since[half]
+        as_before = sum(sense > _CLOSE for sense in senses.values())
+        with_it = sum(sense < -_CLOSE for index, sense in senses.items() if index != leading)
+        # of as many on either side those are right that nobody has seen turn
+        if senses[leading] > -SAME_SENSE or as_before > with_it:
+            self._reversed_since = None
+            return False
+        since = self._reversed_since
         if since is None:
-            since = self._reversed_since[half] = stamp
-        if stamp - since <= min(max(since - self._known_since[half], self._least_ns), self._hold_ns):
-            return heading + math.pi
-        counters["reversals_accepted"] += 1
-        self._known_since[half] = self._credited(since, angle)
-        return heading
+            since = self._reversed_since = stamp
+        if stamp - since <= min(max(since - self._known_since, self._least_ns), self._hold_ns):
+            return False
+        self._known_since, self._reversed_since = self._credited(since, angle), None
+        return True
 
     def _credited(self, stamp: int, angle: float) -> int:
         """Since when a body counts as known that a sensor sees from a time on, under an angle."""

@@ -19,6 +19,7 @@ from body_tracking.fusion.sides import HOLD
 from body_tracking.measurement import left_right_axes
 from body_tracking.sensors.csv_recording import CsvRecording
 from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Joint, Skeleton
+from draws import some
 from walkers import OPTICAL_FROM_LEVEL, TRACKED, about_y, frame, walk
 
 FRAME = 1 / 30
@@ -103,7 +104,9 @@ def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
 def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
     alone = run(fusion(["kinect1"]), [each for each in frames(8.0, 0.02) if each[0] == "kinect1"])
     together = run(fusion(), frames(8.0, 0.02))
-    assert errors(together)[30:90].mean() < 0.8 * errors(alone)[30:90].mean()
+    assert np.nanmean(errors(together)[30:90]) < 0.8 * np.nanmean(
+        errors(alone)[30:90]
+    )  # NaN: a hip was elsewhere at once
     for each, other in zip(alone[30:], together[30:], strict=True):
         assert each.covariances is not None
         assert other.covariances is not None
@@ -400,7 +403,7 @@ def test_what_nobody_knows_is_counted_or_refused() -> None:
 # --- real sensors
 
 
-@pytest.mark.parametrize("person", ["p02", "p07", "p12"])
+@pytest.mark.parametrize("person", some(["p02", "p07", "p12"]))
 def test_the_shoulders_of_real_people_never_reverse(shared_data: Path, person: str) -> None:
     """At 90 degrees one sensor sees the body turned around in up to 22 % of its frames."""
     calibration = OnlineCalibration(("kinect1", "kinect2"))

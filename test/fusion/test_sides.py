@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from body_tracking.fusion.sides import LEAST_HOLD, Sides
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.sides import PAIRS
+from body_tracking.skeleton import NANOSECONDS, Joint
 
 HOLD = 1.0
 ROUND = math.pi
+WEIGHTS = [[50.0, 10.0]] * 4
 
 
 def believed(seconds: float, seen: Mapping[str, tuple[float, float]], hold: float = HOLD) -> list[float]:
@@ -30,7 +32,9 @@ def believed(seconds: float, seen: Mapping[str, tuple[float, float]], hold: floa
         time = number / 30.0
         headings = [[ROUND if begin <= time < end else 0.0] * 2 for begin, end in seen.values()]
         stamp = 10 * NANOSECONDS + round(time * NANOSECONDS)
-        heading, _ = sides.believed(stamp, tuple(seen), [upper for upper, _ in headings], headings, counters)
+        heading, _ = sides.believed(
+            stamp, tuple(seen), [upper for upper, _ in headings], headings, WEIGHTS[: len(headings)], counters
+        )
         found.append(math.remainder(heading, math.tau))
     return found
 
@@ -83,7 +87,61 @@ def test_who_takes_over_from_a_sensor_that_vanishes_is_held_to_what_that_saw() -
         other = ROUND if 2.5 <= time < 5.5 else 0.0
         headings = [[math.nan if time >= 2.0 else 0.0] * 2, [other] * 2]
         stamp = 10 * NANOSECONDS + round(time * NANOSECONDS)
-        heading, _ = sides.believed(stamp, ("front", "side"), [0.0, other], headings, counters)
+        heading, _ = sides.believed(
+            stamp, ("front", "side"), [0.0, other], headings, WEIGHTS[: len(headings)], counters
+        )
         found.append(math.remainder(heading, math.tau))
     assert found == pytest.approx([0.0] * 240)
     assert sides.trusted == "side"
+
+
+def test_a_sensor_beside_the_body_is_not_believed_on_its_heading_though_it_is_trusted() -> None:
+    """The trusted sensor comes to see the body from the side, its hips 6 cm apart, while another faces it."""
+    sides, counters = Sides(), Counter[str]()
+    for number in range(60):
+        turn = min(number / 30.0, 1.2)
+        seen, weights = [[0.3 * turn] * 2, [turn] * 2], [[5.0, 2.0], [60.0, 15.0]]
+        stamp = 10 * NANOSECONDS + number * NANOSECONDS // 30
+        believed_headings = sides.believed(stamp, ("side", "front"), [0.1 + turn, 0.0], seen, weights, counters)
+    assert believed_headings == pytest.approx([1.2, 1.2], abs=0.15)
+
+
+def test_nobodys_shoulders_are_turned_round_above_the_hips() -> None:
+    """However long a sensor says so of one half: the other half of what it sees speaks against it."""
+    sides, counters = Sides(), Counter[str]()
+    for number in range(600):
+        seen = [[0.0 if number < 60 else ROUND, 0.0]]
+        stamp = 10 * NANOSECONDS + number * NANOSECONDS // 30
+        upper, lower = sides.believed(stamp, ("alone",), [0.0], seen, [[50.0, 60.0]], counters)
+        assert math.cos(upper - lower) > 0.0
+
+
+def test_one_that_sees_badly_reverses_nobody_while_the_other_is_silent_for_a_moment() -> None:
+    """Beside the body a Kinect tells any heading; the trusted one is silent for a quarter of a second."""
+    sides, counters = Sides(), Counter[str]()
+    for number in range(150):
+        silent = 60 <= number < 68
+        seen = [[math.nan if silent else 0.0] * 2, [-1.8 if number < 90 else 2.5] * 2]
+        weights = [[0.0 if silent else 30.0] * 2, [3.0, 5.0]]
+        stamp = 10 * NANOSECONDS + number * NANOSECONDS // 30
+        headings = sides.believed(stamp, ("front", "side"), [0.2, 0.0], seen, weights, counters)
+    assert np.cos(headings).min() > 0.8
+
+
+def test_a_hip_that_is_elsewhere_at_once_does_not_turn_the_hips() -> None:
+    """A label that jumps by 25 cm for two frames, in the only sensor."""
+    sides = Sides()
+    hips, shoulders = PAIRS[1], PAIRS[0]
+    for number in range(40):
+        points = np.zeros((1, len(Joint), 3))
+        points[0, shoulders[0], 1], points[0, shoulders[1], 1] = 0.18, -0.18
+        points[0, hips[0], 1], points[0, hips[1], 1] = 0.08, -0.08
+        wild = number in (30, 31)
+        if wild:
+            points[0, hips[1], 0] += 0.25
+        variance = np.full((1, len(Joint)), 0.03**2)
+        states = np.full((1, len(Joint)), 2, dtype=np.uint8)
+        stamp = 10 * NANOSECONDS + number * NANOSECONDS // 30
+        sides.settle(stamp, ("alone",), [0.0], points, variance, states, Counter())
+        assert np.isinf(variance[0, hips]).all() == wild
+        assert np.isfinite(variance[0, shoulders]).all()
