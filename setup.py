@@ -1,5 +1,6 @@
 """An ament_python package for colcon, and an ordinary one for pip."""
 
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,6 +24,10 @@ NODES = [
 
 MANIFEST = ElementTree.parse("package.xml")
 
+# setup.cfg puts entry points where `ros2 run` looks, so colcon gets the commands once more, for the PATH. In a wheel
+# they would collide with pip's entry points, which are on the PATH already.
+COMMANDS = [("bin", ["scripts/body_tracking", "scripts/kinect_sender"])] if "bdist_wheel" not in sys.argv else []
+
 
 def share(folder: str, pattern: str) -> tuple[str, list[str]]:
     """A ``data_files`` entry: the files of a folder of the project, under the package's share."""
@@ -41,6 +46,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
+        *COMMANDS,
         share("config", "*.yaml"),
         share("config/robots", "*.yaml"),
         share("launch", "*.launch.py"),
@@ -91,10 +97,10 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "body_tracking = body_tracking.cli:main",
-            "kinect_sender = body_tracking.sensors.kinect_sender:main",
-            *(f"{node} = body_tracking.nodes.{node}:main" for node in NODES),
+            *(f"{name} = body_tracking.executables:{name}" for name in ("body_tracking", "kinect_sender", *NODES)),
         ]
     },
+    # Of the scripts that colcon installs: see body_tracking/executables.py.
+    options={"build_scripts": {"executable": f"/usr/bin/env -S --block-signal=INT,TERM {sys.executable}"}},
     zip_safe=True,
 )

@@ -28,6 +28,13 @@ _AGAIN = 10.0
 _SOONER = 0.1
 """... this much of the interval is enough to drop some again."""
 
+MAX_AGE = 0.25
+"""Seconds: a longer pause between two messages may be a standstill, and after it older ones are left out. With what the
+nodes behind add it is below the age up to which a robot follows angles (``SafetyLimits.max_age``, 0.3 s)."""
+
+_RECOVERY = 1.0
+"""Seconds after a standstill in which messages that were sent before may still come."""
+
 _SMOOTHING = 0.3
 """Weight of the last work in what a frame costs."""
 
@@ -97,15 +104,52 @@ class Backlog:
         return sorted(set(range(len(arrived))) - set(kept))
 
 
+class Standstill:
+    """Leaves out old messages where a process was stopped (or held up for as long) and goes on.
+
+    What was sent meanwhile waits in the socket's buffer, which keeps the oldest of it, whatever the depth of the queue.
+    At other times the rule does not apply: the sender may be another computer whose clock is wrong.
+
+    Attributes:
+        left_out: how many messages of each topic, since the construction.
+    """
+
+    def __init__(self) -> None:
+        self.left_out: Counter[str] = Counter()
+        self._last_ns: int | None = None
+        self._over_ns: int | None = None
+
+    def is_stale(self, topic: str, sent_ns: int, now_ns: int) -> bool:
+        """Whether a message is to be left out; to be asked of every message.
+
+        Args:
+            topic: on which it came.
+            sent_ns: when it was sent.
+            now_ns: the time now, by the same clock.
+        """
+        if self._last_ns is not None and now_ns - self._last_ns > MAX_AGE * NANOSECONDS:
+            self._over_ns = now_ns
+        self._last_ns = now_ns
+        over = self._over_ns is not None and now_ns - self._over_ns < _RECOVERY * NANOSECONDS
+        if not over or now_ns - sent_ns <= MAX_AGE * NANOSECONDS:
+            return False
+        self.left_out[topic] += 1
+        return True
+
+
 class Sequences:
     """Counts messages that were sent and never came, by the numbers that their publishers give them.
 
     Attributes:
         lost: how many of each topic, since the construction.
+        switched: how often a message of each topic came from another publisher than the one before. Of one publisher
+            numbers only rise; of two that take turns every second message counts.
     """
 
     def __init__(self) -> None:
         self.lost: Counter[str] = Counter()
+        self.switched: Counter[str] = Counter()
+        self._latest: dict[str, int] = {}
         self._last: dict[str, list[int]] = {}
 
     def note(self, topic: str, number: int) -> None:
@@ -115,6 +159,10 @@ class Sequences:
             topic: on which.
             number: its publisher's, which goes up by one from each message to the next.
         """
+        if number == _UNKNOWN:
+            return
+        self.switched[topic] += number <= self._latest.get(topic, -1)
+        self._latest[topic] = number
         last = self._last.setdefault(topic, [])
         before = max((each for each in last if each < number), default=None)
         if before is None or number - before > _MOST_LOST:
@@ -127,5 +175,7 @@ class Sequences:
             self.lost[topic] += number - before - 1
 
 
+_UNKNOWN = 2**64 - 1
+"""What a middleware says that gives messages no numbers."""
 _PUBLISHERS, _MOST_LOST = 4, 10_000
 """Publishers of a topic that are told apart, and the largest number of messages lost at once."""

@@ -334,7 +334,7 @@ def _read_header(cdr: bytes) -> tuple[int, str, int] | None:
     if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
         return None
     sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)
-    if cdr[15 + length : 16 + length] != b"\0":  # the end of the frame's name
+    if sec < 0 or nanosec >= NANOSECONDS or cdr[15 + length : 16 + length] != b"\0":  # the end of the frame's name
         return None
     try:
         frame_id = cdr[16 : 15 + length].decode()

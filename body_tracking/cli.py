@@ -12,21 +12,23 @@ from importlib.metadata import version
 from body_tracking.errors import BodyTrackingError
 
 SUBCOMMANDS = {
-    "import": "recording.importer",
-    "bag": "recording.info",
-    "replay": "recording.replay",
-    "calibrate": "calibration.offline",
-    "up": "up",
-    "doctor": "doctor.command",
-    "show": "evaluation.show",
-    "evaluate": "evaluation.evaluate",
-    "simulate": "simulation.bags",
+    "import": ("recording.importer", "turn CSV recordings, NTU RGB+D .skeleton or Xsens .mvnx files into a bag"),
+    "bag": ("recording.info", "look into recordings, close one that was cut off"),
+    "replay": ("recording.replay", "run the whole graph offline over a bag"),
+    "calibrate": ("calibration.offline", "the poses and clocks of a bag's sensors"),
+    "up": ("up", "run the live graph: sensors or a bag in, joint angles out"),
+    "doctor": ("doctor.command", "what is wrong with the machine, its ROS, the sensors or a bag, and what to do"),
+    "show": ("evaluation.show", "show the joint angles in a recording"),
+    "evaluate": ("evaluation.evaluate", "compare what was estimated with the truth"),
+    "simulate": ("simulation.bags", "people who move before simulated sensors, as a bag with the truth"),
+    "make-bags": ("simulation.bags", "make the simulated recordings that are shipped in bags/"),
 }
-"""In the help's order; modules of the package with ``add_parser(subparsers)``, which sets ``run`` on its parser."""
+"""Of each in the help's order: the module of the package with its ``add_parser(subparsers)``, which sets ``run`` on its
+parser, and what it does. The module is loaded only for its own command."""
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The parser with all subcommands, or with one only: the others' modules need not be loaded for it."""
+    """The parser of one subcommand; without one that there is, of the names of all."""
     top = argparse.ArgumentParser(
         prog="body_tracking",
         description="Joint angles with honest uncertainty from several sensors: recordings in, the live graph, "
@@ -35,8 +37,12 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name in [command] if command in SUBCOMMANDS else SUBCOMMANDS:
-        importlib.import_module(f"body_tracking.{SUBCOMMANDS[name]}").add_parser(subparsers)
+    if command in SUBCOMMANDS:
+        module, _ = SUBCOMMANDS[command]
+        importlib.import_module(f"body_tracking.{module}").add_parser(subparsers)
+    else:
+        for name, (_, text) in SUBCOMMANDS.items():
+            subparsers.add_parser(name, help=text)
     return top
 
 
@@ -47,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # which OpenBLAS lets spin meanwhile; it has to be said before numpy is loaded, with the first subcommand.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         arguments = sys.argv[1:]
-    args = parser(arguments[0] if arguments else None).parse_args(arguments)
     try:
+        args = parser(arguments[0] if arguments else None).parse_args(arguments)
         code: int = args.run(args)
     except BodyTrackingError as error:
         print(f"body_tracking: {error}", file=sys.stderr)

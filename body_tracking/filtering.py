@@ -90,7 +90,7 @@ ANGLES = (
         "convention",
         graph.AUTO,
         "which angles: the model's own, those of the ISB, of REP-155, of Schlagenhauf (2017), or angles between joint "
-        "positions; auto: by the filter, positional for linear ones, else model",
+        "positions; auto: model where they are made of a model's state, else positional",
         choices=(graph.AUTO, *ALL_CONVENTIONS),
         live=True,
     ),
@@ -98,7 +98,7 @@ ANGLES = (
         "input",
         graph.AUTO,
         "what they are made of: the state of the filter's model, or filtered skeletons, to which a model is fitted "
-        "(positional angles need none); auto: by the filter",
+        "(positional angles need none); auto: what the filter publishes, also where that changes",
         choices=(graph.AUTO, graph.SKELETON_INPUT, graph.MODEL_INPUT),
         live=True,
     ),

@@ -1,5 +1,6 @@
 """The table of the graph: its topics with their QoS, its executables, and which nodes run for given sensors.
 
+Topics have their names in the root namespace; see :mod:`body_tracking.names`.
 ``body_tracking up``, ``launch/two_kinects.launch.py``, the nodes and the documentation read it here; none repeats it.
 Knows no ROS library.
 """
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from body_tracking import names
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion.subject import ALL, MAX_PEOPLE, SUBJECTS
@@ -57,10 +59,10 @@ TRUE_MODEL_STATE = "/ground_truth/model_state"
 TRUE_ANGLES = "/ground_truth/joint_states"
 TRUE_CALIBRATION = "/ground_truth/calibration"
 TRUE_CLOCK = f"{TRUE_CALIBRATION}/clock"
-DIAGNOSTICS_TOPIC = "/diagnostics"
-CLOCK_TOPIC = "/clock"
-TF = "/tf"
-TF_STATIC = "/tf_static"
+DIAGNOSTICS_TOPIC = names.DIAGNOSTICS
+CLOCK_TOPIC = names.CLOCK
+TF = names.TF
+TF_STATIC = names.TF_STATIC
 START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
 ALIGN_SERVICE = "imu_skeleton/align"
@@ -84,9 +86,14 @@ def orientation_topic(segment: str) -> str:
     return f"/imu/{segment}/orientation"
 
 
+def is_model_covariance(topic: str) -> bool:
+    """Whether a topic is the covariance of a person's model (:func:`model_topics`), in any namespace."""
+    return re.fullmatch(r"(/\w+)*/(filtered|humans/bodies/\w+)/model_covariance", topic) is not None
+
+
 def is_orientation_topic(topic: str) -> bool:
     """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
-    return topic == orientation_topic(topic.removeprefix("/imu/").removesuffix("/orientation"))
+    return re.fullmatch(r"(/\w+)*/imu/\w+/orientation", topic) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +104,13 @@ class ImuTopics:
         segment: on which it is.
         imu: of ``sensor_msgs/Imu``, with orientation or raw.
         mag: of ``sensor_msgs/MagneticField``.
+        absolute: the names hold in every namespace.
     """
 
     segment: str
     imu: tuple[str, ...]
     mag: str
+    absolute: bool = False
 
 
 def imu_topics(entries: Iterable[str]) -> tuple[ImuTopics, ...]:
@@ -120,7 +129,7 @@ def imu_topics(entries: Iterable[str]) -> tuple[ImuTopics, ...]:
         if not segment or (colon and not re.fullmatch(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*", where)):
             raise GraphError(f"inertial sensor {entry!r}: expected SEGMENT, SEGMENT:NAME or SEGMENT:/TOPIC")
         if where.startswith("/"):
-            found.append(ImuTopics(segment, (where,), f"{where.rpartition('/')[0]}/mag"))
+            found.append(ImuTopics(segment, (where,), f"{where.rpartition('/')[0]}/mag", absolute=True))
         else:
             base = f"/{where or segment}/imu"
             found.append(ImuTopics(segment, (f"{base}/data", f"{base}/data_raw"), f"{base}/mag"))
@@ -147,6 +156,11 @@ def played_imu_topics(entries: Iterable[str], there: Collection[str]) -> tuple[s
             raise GraphError(f"the bag has no topic {' nor '.join(each.imu)} of the inertial sensor on {each.segment}")
         found += [*own, *([each.mag] if each.mag in there else [])]
     return tuple(found)
+
+
+def has_one_publisher(topic: str) -> bool:
+    """Whether a topic may have one publisher only: skeletons, calibration and joint angles, in any namespace."""
+    return bool(re.search(r"/(skeleton|calibration(/clock)?|humans/bodies/\w+/joint_states(_stddev)?)$", topic))
 
 
 def joint_states_topic(body: str) -> str:
@@ -423,14 +437,14 @@ TOPICS: tuple[TopicSpec, ...] = (
         JOINT_STATE,
         RELIABLE,
         "joint_angles",
-        "angle and angular velocity per name, capture stamp; names end in `_<id>`",
+        "angle and angular velocity per name, capture stamp; names end in `_<id>`; `frame_id` names the convention",
     ),
     TopicSpec(
         joint_states_stddev_topic("<id>"),
         JOINT_STATE,
         RELIABLE,
         "joint_angles",
-        "the standard deviation of each, same names and order; infinity where nothing observes the angle",
+        "the standard deviation of each, same header, names and order; infinity where there is no estimate",
     ),
     TopicSpec(
         "<topic of the mapping>",
@@ -471,6 +485,11 @@ SERVICES: tuple[tuple[str, str, str], ...] = (
     (START_SERVICE, "calibration", "estimate the poses anew; what is published holds until the new estimate"),
     (RESET_SERVICE, "calibration", "forget the calibration"),
     (ALIGN_SERVICE, "imu_skeleton", "align the inertial sensors anew in the next pose that is held"),
+    (
+        "robot_commands/enable",
+        "robot_commands",
+        "a person says that the robot stands at `home` or where it was left, and may move; below the node's own name",
+    ),
     ("recorder/start", "bag_recorder", "record, into a new file of the same bag"),
     ("recorder/stop", "bag_recorder", "stop recording and close the bag"),
     ("bag_player/pause", "bag_player", "stand still"),
@@ -544,6 +563,10 @@ class NodeSpec:
         """As in a parameters file: ``/fusion``."""
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
+    def meant_by(self, section: str) -> bool:
+        """Whether a section of a parameters file is about this node; one file serves in every namespace."""
+        return matches(section, self.full_name) or matches(section, f"/{self.name}")
+
 
 @dataclass(frozen=True, slots=True)
 class GraphOptions:
@@ -553,6 +576,7 @@ class GraphOptions:
         sensors: the first one is the reference.
         bag: play this instead of running sensor nodes; empty for live.
         record: record into this folder; empty for not.
+        record_covariance: record the covariance of the filter's model, too.
         rate: of the bag.
         filter_name: overrides the parameters file; empty for not.
         filter_input: likewise: what the filter listens to.
@@ -564,6 +588,7 @@ class GraphOptions:
         imu_topics: of the bag, those that are played for these.
         subject: overrides the parameters file; empty for not: whom to track.
         people: likewise, 0 for not: how many at most.
+        namespace: of all nodes.
         robot: mapping file of a robot that follows; empty for none.
         external: live, somebody else publishes the sensors' skeletons.
         adapted: sensors whose skeletons come from another camera's ROS driver: ``SENSOR`` or ``SENSOR:/TOPIC``.
@@ -574,6 +599,7 @@ class GraphOptions:
     sensors: tuple[str, ...] = DEFAULT_SENSORS
     bag: str = ""
     record: str = ""
+    record_covariance: bool = False
     rate: float = 1.0
     filter_name: str = ""
     filter_input: str = ""
@@ -585,6 +611,7 @@ class GraphOptions:
     imu_topics: tuple[str, ...] = ()
     subject: str = ""
     people: int = 0
+    namespace: str = "/"
     robot: str = ""
     external: bool = False
     adapted: tuple[str, ...] = ()
@@ -616,7 +643,12 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     role = role_of(options)
     asked = {"filter": options.filter_name, "input": options.filter_input}
     chosen: dict[str, Value] = {name: value for name, value in asked.items() if value}
-    angles: dict[str, Value] = {"convention": role.convention, "input": role.angles_input}
+    # What nobody asked for is left to joint_angles, which follows the filter while that changes.
+    angles: dict[str, Value] = {}
+    if options.convention not in ("", AUTO) or role.convention != _CONVENTIONS[role.angles_input]:
+        angles["convention"] = role.convention
+    if options.angles_input:
+        angles["input"] = options.angles_input
     asked_of_people: dict[str, Value] = {"subject": options.subject, "people": options.people}
     people = {name: value for name, value in asked_of_people.items() if value}
     subject: dict[str, Value] = {"subject": options.subject} if options.subject else {}
@@ -636,10 +668,11 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
         )
     if options.robot:
         specs.insert(0, NodeSpec("robot_commands", "robot_commands", parameters={"mapping": options.robot, **several}))
+    recorded: dict[str, Value] = {**common, **({"model_covariance": True} if options.record_covariance else {})}
     if options.record:
-        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **common}))
+        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options.record, **recorded}))
     elif options.viewer:
-        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **common}))
+        specs.append(NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **recorded}))
     # These listen to every skeleton.
     watchers = [name for name, wanted in (("body_markers", options.markers), ("viewer", options.viewer)) if wanted]
     specs += [NodeSpec(name, name, parameters={"sensors": sensors, **common}) for name in watchers]
@@ -649,7 +682,10 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     models = [model_topics(body, several=True) for body in options.bodies] or [model_topics(DEFAULT_BODY)]
     states = {topic: 1 for each in models for topic in (each.state, each.covariance)}
     to_angles = {FILTERED: 1 + len(watchers)} if role.angles_input == SKELETON_INPUT else states
-    after = {topic: count + recorders for topic, count in {**to_filter, **to_angles}.items()}
+    after = {
+        topic: count + (recorders if options.record_covariance or not is_model_covariance(topic) else 0)
+        for topic, count in {**to_filter, **to_angles}.items()
+    }
     if options.record:
         after |= {joint_states_stddev_topic(body): 1 for body in options.bodies or [DEFAULT_BODY]}
     if options.bag:
@@ -668,7 +704,7 @@ def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
             )
             for sensor in sensors
         ]
-    return tuple(specs)
+    return tuple(replace(spec, namespace=options.namespace) for spec in specs)
 
 
 def _adapted(entries: Iterable[str], sensors: Collection[str]) -> dict[str, dict[str, Value]]:
@@ -727,16 +763,14 @@ def convention_of_robot(mapping: Path, asked: str) -> str:
 
 
 def angles_for(convention: str, source: str) -> tuple[str, str]:
-    """The convention and the input of ``joint_angles`` by its parameters; what is not said is as the default filter's.
+    """The convention and the input of ``joint_angles``.
 
     Args:
-        convention: a convention, or ``AUTO``.
-        source: ``SKELETON_INPUT``, ``MODEL_INPUT``, or ``AUTO``.
+        convention: a convention, or ``AUTO`` for that of the input.
+        source: ``SKELETON_INPUT`` or ``MODEL_INPUT``: what the filter publishes, or what was asked for.
     """
-    default = ROLES[DEFAULT_FILTER]
-    source = default.angles_input if source == AUTO else source
     if convention == AUTO:
-        convention = default.convention if source == default.angles_input else _CONVENTIONS[source]
+        convention = _CONVENTIONS[source]
     return convention, SKELETON_INPUT if convention == POSITIONAL else source
 
 
@@ -748,10 +782,19 @@ _FROM_FILE: Final = (
     ("subject", "skeleton_filter", "subject"),
 )
 """(option, node, parameter) by which the nodes must know of each other, whoever says it."""
+
+
+def in_order(sections: Mapping[str, dict[str, object]]) -> list[tuple[str, dict[str, object]]]:
+    """The sections of a parameters file, those later that hold against the ones before: the more exact ones."""
+    return sorted(sections.items(), key=lambda item: (not is_wildcard(item[0]), item[0].count("/")))
+
+
 _IMUS_FROM_FILE: Final = ("imus", "imu_skeleton", "segments")
 """The same, of a list."""
 _PEOPLE_FROM_FILE: Final = ("people", "skeleton_filter", "people")
 """The same, of a number."""
+_COVARIANCE_FROM_FILE: Final = ("record_covariance", "bag_recorder", "model_covariance")
+"""The same, of a switch."""
 
 
 def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
@@ -762,20 +805,28 @@ def with_file(options: GraphOptions, file: Path | None) -> GraphOptions:
     """
     sections = read_file(file) if file is not None else {}
     found: dict[str, Any] = {}
-    for pattern, values in sorted(sections.items(), key=lambda item: not is_wildcard(item[0])):
+    for pattern, values in in_order(sections):
+
+        def meant(node: str, pattern: str = pattern) -> bool:
+            return NodeSpec(node, node, options.namespace).meant_by(pattern)
+
         for option, node, parameter in _FROM_FILE:
             value = values.get(parameter)
             # What is no string at all is refused by whoever checks the parameters.
-            if isinstance(value, str) and not getattr(options, option) and matches(pattern, f"/{node}"):
+            if isinstance(value, str) and not getattr(options, option) and meant(node):
                 found[option] = value
         option, node, parameter = _IMUS_FROM_FILE
         listed = values.get(parameter)
-        if isinstance(listed, list) and not getattr(options, option) and matches(pattern, f"/{node}"):
+        if isinstance(listed, list) and not getattr(options, option) and meant(node):
             found[option] = tuple(entry for entry in listed if isinstance(entry, str) and entry)
         option, node, parameter = _PEOPLE_FROM_FILE
         count = values.get(parameter)
-        if type(count) is int and not getattr(options, option) and matches(pattern, f"/{node}"):
+        if type(count) is int and not getattr(options, option) and meant(node):
             found[option] = count
+        option, node, parameter = _COVARIANCE_FROM_FILE
+        switch = values.get(parameter)
+        if isinstance(switch, bool) and not getattr(options, option) and meant(node):
+            found[option] = switch
     return replace(options, **found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 
@@ -11,7 +11,7 @@ class NodeStatus:
     """One status of ``/diagnostics``.
 
     Attributes:
-        name: ``<node>: <what>``.
+        name: ``<node>: <what>``, with the namespace before the node where that is not known.
         level: 0 OK, 1 warning, 2 error, 3 stale.
         text: one line.
         values: rates, counters.
@@ -35,3 +35,16 @@ class NodeStatus:
             return float(self.values[key])
         except (KeyError, ValueError):
             return None
+
+
+MOST = 64
+"""Nodes of which a status is kept: a graph has some twenty."""
+
+
+def note_statuses(known: dict[str, NodeStatus], told: Iterable[NodeStatus]) -> None:
+    """Keep the newest status of each node, in place; of too many nodes those that were heard last."""
+    for status in told:
+        known.pop(status.node, None)
+        known[status.node] = status
+        if len(known) > MOST:
+            del known[next(iter(known))]

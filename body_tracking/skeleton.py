@@ -21,6 +21,9 @@ BoolArray = NDArray[np.bool_]
 
 NANOSECONDS = 1_000_000_000
 
+MAX_STAMP_NS = 2**31 * NANOSECONDS - 1
+"""The last stamp that a ROS message can hold (``builtin_interfaces/Time``, January 2038); the first one is 0."""
+
 MAX_RANGE = 100.0
 """A coordinate beyond this many metres is no measurement of a person but a damaged number."""
 

@@ -22,12 +22,13 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import yaml
 
-from body_tracking import dds, graph
+from body_tracking import dds, graph, names
 from body_tracking.errors import BodyTrackingError
+from body_tracking.executables import signals_held
 from body_tracking.filters import FILTERS
 from body_tracking.graph import GraphOptions, NodeSpec
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
@@ -39,11 +40,10 @@ from body_tracking.parameters import (
     check_all,
     is_ros_own,
     is_wildcard,
-    matches,
     read_file,
     to_ros,
 )
-from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.rig import RigReader
 from body_tracking.skeleton import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -63,6 +63,9 @@ LISTENERS_TIMEOUT = 30.0
 
 START_DELAY = 5.0
 """Recordings in place of sensors begin this long after the start, in step, seconds; by then every node is there."""
+
+CANNOT_START = 2
+"""Exit code of a node that has said in one line why it cannot start."""
 
 STOP_TIMEOUT = 8.0
 """Seconds for a node to end after it was asked to."""
@@ -85,7 +88,7 @@ class UpError(BodyTrackingError):
 
 
 def options_for(args: argparse.Namespace) -> GraphOptions:
-    """The graph that the command line asks for.
+    """The graph that a command line, of ``up`` or of ``ros2 launch``, asks for.
 
     Raises:
         BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already, the robot's
@@ -94,18 +97,18 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
     sensors = tuple(name for name in args.sensors.split(",") if name) if args.sensors else ()
     topics: frozenset[str] = frozenset()
     if args.sensors is not None and not sensors:
-        raise UpError("--sensors: no name")
+        raise UpError("sensors: no name")
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
     if args.external and args.bag is not None:
-        raise UpError("--external: a bag is played in place of the sensors; give one of the two")
+        raise UpError("external: a bag is played in place of the sensors; give one of the two")
     if args.bag is None:
         if args.rate != 1.0:
-            raise UpError("--rate is the rate of a bag; give --bag too")
+            raise UpError("rate is that of a bag; name the bag, too")
     else:
         if not 0.01 <= args.rate <= 100.0:
-            raise UpError(f"--rate {args.rate:g}: expected 0.01 to 100")
-        with BagReader(args.bag) as reader:
+            raise UpError(f"rate {args.rate:g}: expected 0.01 to 100")
+        with RigReader(args.bag) as reader:
             topics = frozenset(reader.topics)
             there = graph.sensors_among(reader.topics)
         if not there:
@@ -123,6 +126,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         sensors=sensors or graph.DEFAULT_SENSORS,
         bag=str(args.bag) if args.bag else "",
         record=str(args.record) if args.record else "",
+        record_covariance=args.model_covariance,
         rate=args.rate,
         filter_name=args.filter or "",
         convention=convention,
@@ -130,6 +134,7 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
         reliable=args.reliable,
         subject=args.subject or "",
         people=args.people,
+        namespace=names.check_namespace(args.namespace),
         robot=str(args.robot) if args.robot else "",
         external=args.external,
         adapted=tuple(args.adapt or ()),
@@ -158,13 +163,17 @@ def parameters_for(
         ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
             allowed.
     """
+    if file is None:  # what we set ourselves, each node checks
+        return {
+            spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
+        }
     possible = {spec.name: spec for spec in (*absent, *specs)}
     tables = {
         name: {item.name: item for item in graph.parameters_of(spec.executable)} for name, spec in possible.items()
     }
-    sections = read_file(file) if file is not None else {}
+    sections = read_file(file)
     for pattern, values in sections.items():
-        about = [spec for spec in possible.values() if matches(pattern, spec.full_name)]
+        about = [spec for spec in possible.values() if spec.meant_by(pattern)]
         if not about:
             there = ", ".join(spec.full_name for spec in possible.values())
             raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
@@ -175,14 +184,46 @@ def parameters_for(
     result: dict[str, dict[str, Value]] = {}
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
-        for pattern, values in sorted(sections.items(), key=lambda item: not is_wildcard(item[0])):
-            if matches(pattern, spec.full_name):
+        for pattern, values in graph.in_order(sections):
+            if spec.meant_by(pattern):
                 wildcard = is_wildcard(pattern)
                 given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
         given |= spec.parameters
         own: dict[str, Any] = {name: given.pop(name) for name in list(given) if is_ros_own(name)}
-        checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}" if file else spec.full_name)
+        checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}")
         result[spec.name] = {**own, **{name: checked[name] for name in given}}
+    return result
+
+
+def all_parameters(
+    options: GraphOptions,
+    specs: Sequence[NodeSpec],
+    file: Path | None,
+    defaults: Mapping[str, Mapping[str, Value]] | None = None,
+) -> dict[str, dict[str, Value]]:
+    """The same, with a file that may be about every node that there can be.
+
+    Args:
+        options: the graph.
+        specs: its nodes.
+        file: as above.
+        defaults: as above.
+
+    Raises:
+        ParameterError: as above.
+        UpError: a sensor node has nothing to read: there is no bag, and the file does not say.
+    """
+    result = parameters_for(specs, file, defaults, graph.all_nodes_for(options))
+    for spec in specs:
+        given = result[spec.name]
+        if (
+            spec.executable == "kinect_skeleton"
+            and not given.get("file")
+            and given.get("backend") in (None, "recording")
+        ):
+            raise UpError(
+                f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
+            )
     return result
 
 
@@ -290,7 +331,7 @@ class Supervisor:
         self.failure = ""
         self._bag_start_ns = 0
         if options.bag:
-            with BagReader(options.bag) as reader:
+            with RigReader(options.bag) as reader:
                 self._bag_start_ns = reader.start_ns
 
     def run(self, monitor: GraphMonitor) -> int:
@@ -298,8 +339,16 @@ class Supervisor:
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
         begin = time.monotonic()
+        self.console.line(f"starting {', '.join(child.spec.name for child in self.children)}")
         try:
             while not self.stopping.wait(0.05):
+                if monitor.has_predecessor():
+                    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+                    self.failure = (
+                        f"another body_tracking up runs in ROS domain {domain} already, and the two would mix; "
+                        "end it, or give this one another ROS_DOMAIN_ID"
+                    )
+                    break
                 self._look_after(monitor)
                 self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
                 if any(child.done for child in self.children):
@@ -361,14 +410,15 @@ class Supervisor:
             "PYTHONUNBUFFERED": "1",
         }
         # A group of its own: Ctrl-C in the terminal goes to us alone, and we end the nodes in order.
-        child.process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            start_new_session=True,
-        )
+        with signals_held():  # a node that is to end while it starts does so in order
+            child.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
         child.started, child.due = time.monotonic(), None
         child.reader = threading.Thread(target=self._read, args=(child, child.process), daemon=True)
         child.reader.start()
@@ -379,10 +429,10 @@ class Supervisor:
         if child.reader is not None:
             child.reader.join(timeout=1.0)
         playing = child.spec.executable == "bag_player"
-        if playing and (code == 0 or (child.restarts and code == 2)):
+        if playing and (code == 0 or (child.restarts and code == CANNOT_START)):
             child.done = True
             return
-        if code == 2 and child.restarts == 0:
+        if code == CANNOT_START and child.restarts == 0:
             self.failure = child.last_lines[-1] if child.last_lines else f"{child.spec.name} could not start"
             self.stopping.set()
             return
@@ -472,7 +522,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``up`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser(
         "up",
-        help="run the live graph: sensors or a bag in, joint angles out",
         description="Start the graph as separate processes: the sensors (or a bag in their place), calibration, "
         "fusion, filter, joint angles and, with --record, a recorder. A node that dies is started again. Ends with "
         "Ctrl-C, or when the bag ends.",
@@ -482,6 +531,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--bag", type=Path, metavar="BAG", help="play this bag in place of the sensors")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="play the bag X times as fast (default 1)")
     parser.add_argument("--record", type=Path, metavar="BAG", help="record everything into this new folder")
+    parser.add_argument(
+        "--model-covariance",
+        action="store_true",
+        help="record /filtered/model_covariance, too: with ekf most of a recording, which replay computes again",
+    )
     parser.add_argument("--filter", choices=FILTERS, help="which filter; overrides the parameters file")
     parser.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles; overrides the file, too")
     parser.add_argument(
@@ -510,8 +564,27 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--markers", action="store_true", help="publish markers for RViz and Foxglove")
     graph.add_people(parser)
+    parser.add_argument(
+        "--namespace", default="/", metavar="NAME", help="of all nodes, and so of their topics; a second rig needs one"
+    )
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UpError(message.removeprefix("argument --"))  # launch has no dashes
+
+
+def arguments_from(words: Sequence[str]) -> argparse.Namespace:
+    """The options of ``body_tracking up`` in these words, for another program that starts the graph.
+
+    Raises:
+        UpError: an option has a value that it cannot have.
+    """
+    parser: argparse.ArgumentParser = _Parser()
+    add_parser(parser.add_subparsers())
+    return parser.parse_args(["up", *words])
 
 
 def run(args: argparse.Namespace) -> int:
@@ -522,8 +595,7 @@ def run(args: argparse.Namespace) -> int:
         from body_tracking.nodes.graph_monitor import GraphMonitor
     except ImportError as error:
         raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
-    absent = graph.all_nodes_for(options)
-    parameters_for(specs, args.params_file, absent=absent)  # what is wrong is said before a folder is made
+    all_parameters(options, specs, args.params_file)  # what is wrong is reported before a folder is made
     folder = _log_folder(args.log_dir)
     dds.stay_on_this_machine()
     dds.prepare()
@@ -531,12 +603,13 @@ def run(args: argparse.Namespace) -> int:
         # A calibration node that is started again goes on from here.
         "calibration": {"calibration_file": str(folder / "calibration.yaml")}
     }
-    parameters = parameters_for(specs, args.params_file, defaults, absent)
+    parameters = all_parameters(options, specs, args.params_file, defaults)
     start = time.time() + START_DELAY
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    monitor = GraphMonitor(options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),))
+    bodies = options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),)
+    monitor = GraphMonitor(bodies, options.namespace)
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

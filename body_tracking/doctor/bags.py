@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from body_tracking import graph
+from body_tracking import graph, names
 from body_tracking.doctor.finding import OK, PROBLEM, WARNING, Finding
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages.base import IMU, POINT_CLOUD
@@ -36,20 +36,24 @@ def bag(path: Path, deadline: float | None = None) -> Iterator[Finding]:
         yield Finding(
             "bag", WARNING, warning, f"body_tracking bag recover {path}; what is damaged is left out when it is played"
         )
-    sensors = graph.sensors_among(topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
+    namespace = names.rig_namespace(topic.name for topic in info.topics)
+    clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
+    own = (names.within(name, namespace) for name in clouds)
+    sensors = graph.sensors_among(name for name in own if name is not None)
     if not sensors:
-        names = ", ".join(topic.name for topic in info.topics)
+        there = ", ".join(topic.name for topic in info.topics)
         yield Finding(
             "bag",
             PROBLEM,
-            f"{path}: no skeletons on /<sensor>/skeleton; it has {names or 'no topics'}",
+            f"{path}: no skeletons on /<sensor>/skeleton; it has {there or 'no topics'}",
             "record the sensors' topics: ros2 bag record -a, or body_tracking up --record; "
             "see docs/your_own_sensor.md for another format",
         )
     elif len(sensors) == 1:
         yield Finding("bag", OK, f"{path}: one sensor, {sensors[0]}: nothing to calibrate")
+    skeletons = {names.resolved(graph.skeleton_topic(sensor), namespace) for sensor in sensors}
     for topic in info.topics:
-        if topic.name in map(graph.skeleton_topic, sensors) or (topic.type == IMU and topic.count):
+        if topic.name in skeletons or (topic.type == IMU and topic.count):
             yield _stream(topic)
 
 

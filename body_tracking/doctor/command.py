@@ -90,7 +90,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``doctor`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser(
         "doctor",
-        help="what is wrong with the machine, its ROS, the sensors or a bag, and what to do",
         description="Checks this machine, the ROS environment of this shell, whether nodes find each other, the clock, "
         "the sensors and nodes that run in the domain, network buffers and ports, and with --bag a recording. Each "
         "check says OK, warning or problem, what was found, and what to do. Takes 5 seconds, 15 at most.",
@@ -98,7 +97,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--bag", type=Path, metavar="BAG", help="look at this recording, too")
     parser.add_argument("--bag-only", action="store_true", help="look at the recording alone")
-    parser.add_argument("--sensors", default="", metavar="A,B", help="these must be publishing, or begin to soon")
+    parser.add_argument(
+        "--sensors",
+        default="",
+        metavar="A,B",
+        help="these must be publishing, or begin to soon; of a rig in a namespace as NAMESPACE/A",
+    )
     parser.add_argument(
         "--seconds", type=float, default=LISTEN, metavar="S", help="to listen to the graph (default %(default)g)"
     )

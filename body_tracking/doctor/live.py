@@ -193,7 +193,11 @@ def sensors(seen: Observation, wanted: Sequence[str] = ()) -> Iterator[Finding]:
         seen: what was seen.
         wanted: cameras that must be there.
     """
-    there = graph.sensors_among(seen.streams)
+    there = sorted(  # of every rig, with its namespace
+        topic.removeprefix("/").removesuffix(graph.SKELETON_SUFFIX)
+        for topic, stream in seen.streams.items()
+        if stream.type == POINT_CLOUD
+    )
     for sensor in wanted:
         if sensor not in there:
             yield Finding(

@@ -39,15 +39,12 @@ from body_tracking.evaluation.summary import (
     read_angles,
     read_joint_states,
     read_skeletons,
+    true_angles,
 )
-from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
-from body_tracking.messages.model import coordinates_to_configuration
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.skeleton import (
     JOINT_NAMES,
@@ -66,8 +63,6 @@ AS_IT_IS, ALIGNED = "as it is", "aligned"
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
 """A true angle that would not stand out of 10 mm of doubt in every joint, as the plane of a hanging arm, counts not."""
-_EXACT, _AMPLIFIED = 1e-6, 10.0
-"""Radians: so well known is the body model's true pose; an angle that makes more than ten times of it counts not."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
 
 
@@ -256,7 +251,7 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
         BagError: no such bag, or nothing of it can be read.
         EvaluationError: it holds no such topic, of no such type, nothing in it, or no angles of this person.
     """
-    with BagReader(path) as bag:
+    with RigReader(path) as bag:
         if topic is None:
             full = [each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics and bag.topics[each].count]
             topic = full[0] if full else graph.FILTERED
@@ -278,7 +273,7 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         BagError: no such bag, or nothing of it can be read.
         EvaluationError: it holds no true skeletons.
     """
-    with BagReader(path) as bag:
+    with RigReader(path) as bag:
         wanted = "; the truth is a bag from a simulation or what replay made of it"
         skeletons = _skeletons(bag, graph.TRUE_SKELETON, wanted)
         ids = (body,) if body is not None else bodies(bag)
@@ -447,13 +442,13 @@ def evaluate(
         if p.own_clock:
             raise EvaluationError(f"{estimate.source} and {truth.source}: {error}") from error
         notes.append(f"not aligned: {error}")
-    true_angles = _true_angles(estimate.angles, truth)
     mine = estimate.angles
-    if mine is not None and true_angles is not None and mine.names != true_angles.names:
+    truly = truth.angles if mine is None else true_angles(mine.names, truth.angles, truth.coordinates)
+    if mine is not None and truly is not None and mine.names != truly.names:
         notes.append("estimate and truth have different sets of angles: one name may mean two things")
     comparisons = []
     for number, (name, alignment) in enumerate(alignments.items()):
-        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, true_angles, p))
+        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, truly, p))
         done(0.3 + 0.7 * (number + 1) / len(alignments))
     last = comparisons[-1]
     moved = last.alignment.apply(whole)
@@ -617,31 +612,6 @@ def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None
         for number, each in enumerate(positions)
     ]
     return np.stack([each.position for each in angles]), np.stack([each.position_stddev for each in angles])
-
-
-def _true_angles(mine: AngleSeries | None, truth: Recorded) -> AngleSeries | None:
-    """The true angles in the convention of the estimate's where the truth has the model's coordinates, or its own."""
-    if mine is None or truth.coordinates is None:
-        return truth.angles
-    model = UpperBody()
-    of_names = {convention(name, model).names: name for name in CONVENTIONS}
-    if mine.names not in of_names or truth.coordinates.names != model.coordinate_names:
-        return truth.angles
-    exact = _EXACT**2 * np.eye(2 * model.nv)
-    lengths = model.default_lengths()  # no angle depends on them
-    rates = np.zeros(model.nv)
-    series: list[JointAngles] = []
-    for stamp_ns, tangent in zip(truth.coordinates.stamps_ns, truth.coordinates.position, strict=True):
-        q, _ = coordinates_to_configuration(tangent, rates, model)
-        estimate = ModelEstimate(int(stamp_ns), truth.frame_id, 0, q, rates, exact, lengths, np.zeros_like(lengths))
-        series.append(angles_of(estimate, model, of_names[mine.names], series[-1] if series else None))
-    stddev = np.stack([each.position_stddev for each in series])
-    return AngleSeries(
-        truth.coordinates.stamps_ns,
-        mine.names,
-        np.stack([each.position for each in series]),
-        np.where(stddev > _AMPLIFIED * _EXACT, np.inf, stddev),
-    )
 
 
 def _named(

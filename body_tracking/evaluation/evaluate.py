@@ -42,7 +42,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking evaluate``."""
     parser = subparsers.add_parser(
         "evaluate",
-        help="compare what was estimated with the truth",
         description="Compare skeletons and joint angles in a recording with the truth: errors of position and angle "
         "as they are, and aligned in time and space as the thesis does (100 Hz, one shift, one rigid transform); "
         "delay, jitter, segment lengths, calibration, and whether the stated standard deviations hold.",

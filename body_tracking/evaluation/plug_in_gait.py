@@ -59,6 +59,7 @@ from scipy.linalg import solveh_banded
 from scipy.optimize import minimize_scalar
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
 from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, Joint
 
 LONGEST_GAP = 0.2
@@ -315,7 +316,8 @@ def read_measurements(path: Path | str) -> Measurements:
         MarkerError: no such file, not XML, or none of the measurements in it.
     """
     try:
-        root = ElementTree.parse(path).getroot()
+        with open_regular(Path(path)) as stream:
+            root = ElementTree.parse(stream).getroot()
     except OSError as error:
         raise MarkerError(f"{path}: {error.strerror or error}") from error
     except ElementTree.ParseError as error:
@@ -607,7 +609,7 @@ def _announced_frames(path: Path) -> int:
         size = path.stat().st_size
         if not path.is_file():
             raise MarkerError(f"{path}: not a file")
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             head = stream.read(256 * _BLOCK)
     except OSError as error:
         raise MarkerError(f"{path}: {error.strerror or error}") from error

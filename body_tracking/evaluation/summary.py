@@ -11,13 +11,21 @@ import numpy as np
 from body_tracking import graph
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, MessageError, to_nanoseconds
+from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
+_EXACT, _AMPLIFIED = 1e-6, 10.0
+"""Radians: so well known is the body model's true pose; an angle that makes more than ten times of it counts not."""
 
 
 class EvaluationError(BodyTrackingError):
@@ -83,7 +91,10 @@ class AngleSummary:
         last: in the last frame in which it is known.
         stddev: median stated standard deviation over all frames; infinity where it is mostly unknown.
         known: share of the frames in which it is known.
+        true_min: of the truth in the same frames.
+        true_max: likewise.
         rms_error: against the truth, over the frames in which it is known.
+        max_error: likewise, the largest.
         within_2_stddev: share of these frames in which the truth lies within two stated standard deviations.
     """
 
@@ -93,33 +104,78 @@ class AngleSummary:
     last: float
     stddev: float
     known: float
+    true_min: float
+    true_max: float
     rms_error: float
+    max_error: float
     within_2_stddev: float
 
 
-def read(path: Path, body: str | None = None) -> Tracked:
+def read(path: Path, body: str | None = None, truth: Path | None = None) -> Tracked:
     """Read the angles of a person, and all that helps to show them, from a bag.
 
     Args:
         path: a bag folder or an mcap file.
         body: the person's id; the first one in the bag where None.
+        truth: the bag with the truth; this one where None.
 
     Raises:
         BagError: no such bag, or nothing of it can be read.
         EvaluationError: it holds no joint angles, or none of this person.
     """
-    with BagReader(path) as bag:
+    with RigReader(path) as bag:
         if not bodies(bag):
             raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
         body, angles = read_angles(bag, body)
+        skeletons = read_skeletons(bag, graph.FILTERED)
+    with RigReader(truth or path) as bag:
+        own, coordinates = (
+            read_joint_states(bag, topic, of) for topic, of in ((graph.TRUE_ANGLES, body), (graph.TRUE_MODEL_STATE, ""))
+        )
+        if truth is not None and own is None and coordinates is None:
+            raise EvaluationError(f"{truth}: holds no truth ({graph.TRUE_ANGLES}); recordings of simulate do")
         return Tracked(
             bag=Path(path),
             body=body,
             angles=angles,
-            skeletons=read_skeletons(bag, graph.FILTERED),
-            true_angles=read_joint_states(bag, graph.TRUE_ANGLES, body),
+            skeletons=skeletons,
+            true_angles=true_angles(angles.names, own, coordinates),
             true_skeletons=read_skeletons(bag, graph.TRUE_SKELETON),
         )
+
+
+def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: AngleSeries | None) -> AngleSeries | None:
+    """The truth in the convention of the angles that are judged.
+
+    Args:
+        names: of the judged angles.
+        own: the true angles that a recording holds, of ``kinematics.positional``; None for none.
+        coordinates: the true coordinates of the body model; None for none.
+
+    Returns:
+        The angles of a convention of the model, made of the coordinates, where these are there; ``own`` otherwise.
+    """
+    if coordinates is None:
+        return own
+    model = UpperBody()
+    of_names = {convention(name, model).names: name for name in CONVENTIONS}
+    if names not in of_names or coordinates.names != model.coordinate_names:
+        return own
+    exact = _EXACT**2 * np.eye(2 * model.nv)
+    lengths = model.default_lengths()  # no angle depends on them
+    rates = np.zeros(model.nv)
+    series: list[JointAngles] = []
+    for stamp_ns, tangent in zip(coordinates.stamps_ns, coordinates.position, strict=True):
+        q, _ = coordinates_to_configuration(tangent, rates, model)
+        estimate = ModelEstimate(int(stamp_ns), "", 0, q, rates, exact, lengths, np.zeros_like(lengths))
+        series.append(angles_of(estimate, model, of_names[names], series[-1] if series else None))
+    stddev = np.stack([each.position_stddev for each in series])
+    return AngleSeries(
+        coordinates.stamps_ns,
+        names,
+        np.stack([each.position for each in series]),
+        np.where(stddev > _AMPLIFIED * _EXACT, np.inf, stddev),
+    )
 
 
 def bodies(bag: BagReader) -> tuple[str, ...]:
@@ -226,19 +282,19 @@ def summaries(angles: AngleSeries, truth: AngleSeries | None = None) -> tuple[An
         angles: what was measured.
         truth: what was true, at any stamps within 20 ms of the measured ones.
     """
-    errors = np.full_like(angles.position, np.nan)
+    errors, true = np.full_like(angles.position, np.nan), np.full_like(angles.position, np.nan)
     if truth is not None:
         matches = nearest(truth.stamps_ns, angles.stamps_ns)
         for column, name in enumerate(angles.names):
             if name in truth.names:
-                true = truth.position[matches, truth.names.index(name)]
-                error = (angles.known[:, column] - true + np.pi) % (2.0 * np.pi) - np.pi
-                errors[:, column] = np.where(matches >= 0, error, np.nan)
+                true[:, column] = np.where(matches >= 0, truth.known[matches, truth.names.index(name)], np.nan)
+        errors = (angles.known - true + np.pi) % (2.0 * np.pi) - np.pi
     result = []
     for column, name in enumerate(angles.names):
         values, stddev = np.degrees(angles.known[:, column]), np.degrees(angles.stddev[:, column])
         known, error = np.isfinite(values), np.degrees(errors[:, column])
         values, compared = values[known], np.isfinite(error)
+        right = np.degrees(true[compared, column])
         nothing = float("nan")
         result.append(
             AngleSummary(
@@ -248,7 +304,10 @@ def summaries(angles: AngleSeries, truth: AngleSeries | None = None) -> tuple[An
                 last=float(values[-1]) if len(values) else nothing,
                 stddev=float(np.median(stddev)),
                 known=float(known.mean()),
+                true_min=float(right.min()) if len(right) else nothing,
+                true_max=float(right.max()) if len(right) else nothing,
                 rms_error=float(np.sqrt(np.mean(error[compared] ** 2))) if compared.any() else nothing,
+                max_error=float(np.abs(error[compared]).max()) if compared.any() else nothing,
                 within_2_stddev=(
                     float((np.abs(error) <= 2.0 * stddev)[compared].mean()) if compared.any() else nothing
                 ),
@@ -263,7 +322,7 @@ def table(rows: tuple[AngleSummary, ...]) -> str:
     width = max(len(row.name) for row in rows)
     header = f"{'angle (deg)':<{width}} {'min':>8} {'max':>8} {'final':>8} {'stddev':>8} {'known':>7}"
     if with_truth:
-        header += f" {'rms err':>8} {'in 2 sd':>8}"
+        header += f" {'true min':>9} {'true max':>8} {'rms err':>8} {'max err':>8} {'in 2 sd':>8}"
     lines = [header, "-" * len(header)]
     for row in rows:
         line = f"{row.name:<{width}}" + "".join(
@@ -272,7 +331,8 @@ def table(rows: tuple[AngleSummary, ...]) -> str:
         line += f" {row.known:>7.0%}"
         if with_truth:
             share = "-" if np.isnan(row.within_2_stddev) else f"{row.within_2_stddev:.0%}"
-            line += f" {_number(row.rms_error):>8} {share:>8}"
+            line += f" {_number(row.true_min):>9} {_number(row.true_max):>8}"
+            line += f" {_number(row.rms_error):>8} {_number(row.max_error):>8} {share:>8}"
         lines.append(line)
     return "\n".join(lines)
 

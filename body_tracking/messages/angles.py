@@ -17,7 +17,8 @@ def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types:
     Args:
         angles: radians and radians per second.
         body: the REP-155 body id; every name ends in ``_<body>``.
-        frame_id: written into both headers.
+        frame_id: of both headers. What ``joint_angles`` publishes names its convention here, so that a subscriber can
+            tell angles of the same name apart.
         types: the family of message classes to build.
     """
     header = to_header(angles.stamp_ns, frame_id, types)
@@ -48,11 +49,12 @@ def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngl
         body: whose they are; the ending ``_<body>`` of their names is left out.
 
     Raises:
-        MessageError: different names or stamps, a name without that ending, sizes that do not go together.
+        MessageError: different names, stamps or frames, a name without that ending, sizes that do not go together.
     """
     names, stamp_ns = tuple(values.name), to_nanoseconds(values.header.stamp)
-    if tuple(deviations.name) != names or to_nanoseconds(deviations.header.stamp) != stamp_ns:
-        raise MessageError("joint states and their standard deviations have other names or stamps")
+    same = deviations.header == values.header and tuple(deviations.name) == names
+    if not same:
+        raise MessageError("joint states and their standard deviations have other names, stamps or frames")
     other = next((name for name in names if not name.endswith(f"_{body}")), None)
     if other is not None:
         raise MessageError(f"name {other!r} does not end in _{body}")

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -83,12 +83,25 @@ class BagMessages:
 
 
 def to_nanoseconds(stamp: Any) -> int:
-    """``builtin_interfaces/Time`` to integer nanoseconds."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    """``builtin_interfaces/Time`` to integer nanoseconds, 0 to :data:`~body_tracking.skeleton.MAX_STAMP_NS`.
+
+    Raises:
+        MessageError: a time that ROS time does not have: negative, or with a second or more of nanoseconds.
+    """
+    sec, nanosec = int(stamp.sec), int(stamp.nanosec)
+    if not (0 <= sec < 2**31 and 0 <= nanosec < NANOSECONDS):
+        raise MessageError(f"a stamp of {sec} s and {nanosec} ns, expected 0 to 2147483647 s and less than 1e9 ns")
+    return sec * NANOSECONDS + nanosec
 
 
 def to_time(nanoseconds: int, types: MessageTypes) -> Any:
-    """Integer nanoseconds to ``builtin_interfaces/Time``."""
+    """Integer nanoseconds to ``builtin_interfaces/Time``.
+
+    Raises:
+        MessageError: a time that ROS time does not have.
+    """
+    if not 0 <= nanoseconds <= MAX_STAMP_NS:
+        raise MessageError(f"a stamp of {nanoseconds} ns, expected 0 to {MAX_STAMP_NS}")
     sec, nanosec = divmod(nanoseconds, NANOSECONDS)
     return types.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 

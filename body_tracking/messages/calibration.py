@@ -16,6 +16,7 @@ from body_tracking.messages.base import (
     to_nanoseconds,
     to_time,
 )
+from body_tracking.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 
 
 def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:
@@ -38,8 +39,8 @@ def transform_to_pose(message: Any) -> SensorPose:
     """The inverse of :func:`pose_to_transform`.
 
     Raises:
-        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a quaternion
-            far from unit length.
+        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a place that is
+            too far away, a quaternion far from unit length, a stamp that is none.
     """
     suffix = "_optical_frame"
     child = str(message.child_frame_id)
@@ -48,7 +49,7 @@ def transform_to_pose(message: Any) -> SensorPose:
     t, q = message.transform.translation, message.transform.rotation
     translation, quat_xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
     norm = float(np.linalg.norm(quat_xyzw))
-    if not np.isfinite(translation).all() or not abs(norm - 1.0) < 1e-3:
+    if not (np.abs(translation) <= MAX_RANGE).all() or not abs(norm - 1.0) < 1e-3:
         raise MessageError(f"transform of {child!r}: translation {translation}, quaternion of length {norm:.3g}")
     return SensorPose(child.removesuffix(suffix), translation, quat_xyzw / norm, to_nanoseconds(message.header.stamp))
 
@@ -59,18 +60,29 @@ def clock_to_time_reference(sensor: str, clock: ClockModel, at_ns: int, types: M
     Args:
         sensor: written into ``source``.
         clock: the sensor's clock against the reference clock.
-        at_ns: the reference time from which the relation is valid.
+        at_ns: the reference time from which the relation is valid; where the sensor's clock shows 0 only later, from
+            then on, which is as good: it has no frame of before.
         types: the family of message classes to build.
     """
+    at_ns = max(at_ns, clock.to_reference(0))
     return types.make(
         TIME_REFERENCE,
         header=to_header(at_ns, "", types),
-        time_ref=to_time(clock.to_sensor(at_ns), types),
+        time_ref=to_time(max(0, clock.to_sensor(at_ns)), types),  # which rounding may make -1 ns
         source=sensor,
     )
 
 
 def time_reference_to_clock(message: Any) -> tuple[str, int, ClockModel]:
-    """(sensor, valid from in the reference clock, the relation of the clocks from then on)."""
-    at_ns = to_nanoseconds(message.header.stamp)
-    return str(message.source), at_ns, ClockModel(to_nanoseconds(message.time_ref) - at_ns, 0.0, at_ns)
+    """(sensor, valid from in the reference clock, the relation of the clocks from then on).
+
+    ``time_ref`` may be negative, as it was in recordings of sensors that were switched on later than the reference.
+
+    Raises:
+        MessageError: a stamp that is none.
+    """
+    at_ns, shown = to_nanoseconds(message.header.stamp), message.time_ref
+    shown_ns = int(shown.sec) * NANOSECONDS + int(shown.nanosec)
+    if abs(shown_ns) > MAX_STAMP_NS or not 0 <= shown.nanosec < NANOSECONDS:
+        raise MessageError(f"the sensor's clock shows {shown.sec} s and {shown.nanosec} ns")
+    return str(message.source), at_ns, ClockModel(shown_ns - at_ns, 0.0, at_ns)

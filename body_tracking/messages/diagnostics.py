@@ -8,6 +8,9 @@ from typing import Any
 from body_tracking.messages.base import DIAGNOSTICS, MessageTypes, RosMessages, to_header
 from body_tracking.node_status import NodeStatus
 
+MAX_VALUES, MAX_TEXT = 500, 1000
+"""Values of a status, and characters of each text, that are kept of what comes; our nodes tell a tenth of that."""
+
 
 def diagnostics(
     stamp_ns: int, name: str, hardware_id: str, level: int, text: str, values: Mapping[str, object], types: MessageTypes
@@ -16,7 +19,7 @@ def diagnostics(
 
     Args:
         stamp_ns: node time.
-        name: ``<node>: <what>``.
+        name: ``<node>: <what>``, with the node's full name but for the leading slash.
         hardware_id: the sensor, or empty.
         level: 0 OK, 1 warning, 2 error, 3 stale.
         text: one line for people.
@@ -34,15 +37,24 @@ def diagnostics(
     return types.make(DIAGNOSTICS, header=to_header(stamp_ns, "", types), status=[status])
 
 
-def statuses(message: Any, received: float = 0.0) -> tuple[NodeStatus, ...]:
-    """Those in a ``diagnostic_msgs/DiagnosticArray``, received at a steady time in seconds."""
+def statuses(message: Any, received: float = 0.0, namespace: str | None = None) -> tuple[NodeStatus, ...]:
+    """Those in a ``diagnostic_msgs/DiagnosticArray``.
+
+    Args:
+        message: the array.
+        received: steady time, seconds.
+        namespace: only of nodes in this namespace, by their names there; None for all nodes by their full names.
+    """
+    prefix = "" if namespace is None else f"{namespace.strip('/')}/".removeprefix("/")
     return tuple(
         NodeStatus(
-            each.name,
+            each.name.removeprefix(prefix)[:MAX_TEXT],
             each.level[0] if isinstance(each.level, bytes) else int(each.level),
-            each.message,
-            {item.key: item.value for item in each.values},
+            each.message[:MAX_TEXT],
+            {item.key[:MAX_TEXT]: item.value[:MAX_TEXT] for item in each.values[:MAX_VALUES]},
             received,
         )
         for each in message.status
+        if namespace is None
+        or (each.name.startswith(prefix) and "/" not in each.name.removeprefix(prefix).partition(":")[0])
     )

@@ -90,6 +90,8 @@ def _record_of(cloud: Any) -> np.dtype[Any]:
     formats: list[str] = []
     offsets: list[int] = []
     step = int(cloud.point_step)
+    if step > len(cloud.data):
+        raise MessageError(f"point_step {step} of {len(cloud.data)} bytes of data")
     for field in cloud.fields:
         if field.name not in wanted or field.name in names:
             continue

@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 
-from body_tracking.graph import EXECUTABLES, config_text
-from body_tracking.nodes.supervised import die_with_parent
+from body_tracking.executables import hold_signals, start
 
 if __name__ == "__main__":
+    hold_signals()
+    from body_tracking.graph import EXECUTABLES, config_text
+    from body_tracking.nodes.supervised import die_with_parent
+
     die_with_parent()
     if sys.argv[1:] == ["parameters"]:
         print(config_text(), end="")
@@ -19,5 +21,4 @@ if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in EXECUTABLES:
         print(f"usage: python -m body_tracking.nodes {{{','.join(EXECUTABLES)}}} [--ros-args ...]", file=sys.stderr)
         sys.exit(2)
-    name = sys.argv.pop(1)
-    sys.exit(importlib.import_module(f"body_tracking.nodes.{name}").main())
+    start(sys.argv.pop(1))

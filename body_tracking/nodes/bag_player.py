@@ -19,7 +19,8 @@ from body_tracking.nodes.common import ROS, STEADY, GraphNode, run
 from body_tracking.parameters import Parameter, Value
 from body_tracking.recording.player import Playback
 from body_tracking.recording.qos import RELIABLE, Qos
-from body_tracking.recording.rosbag2 import BagError, BagReader
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import BagError
 from body_tracking.skeleton import NANOSECONDS
 
 PARAMETERS = (
@@ -72,7 +73,7 @@ class BagPlayer(GraphNode):
         given: dict[str, Any] = dict(self.values)
         if not given["bag"]:
             raise BagError("parameter 'bag': no bag to play")
-        self.reader = BagReader(given["bag"])
+        self.reader = RigReader(given["bag"])
         self.offers = self.offer(given["topics"] or tuple(self.reader.topics))
         self.absent = self.wanted_subscribers(given["wait_for_subscribers"])
         self.playback = Playback(
@@ -86,7 +87,7 @@ class BagPlayer(GraphNode):
         )
         self.clock_topic = None
         if given["clock_rate"]:
-            self.clock_topic = self.create_publisher(Clock, graph.CLOCK_TOPIC, to_profile(RELIABLE))
+            self.clock_topic = self.make_publisher(Clock, graph.CLOCK_TOPIC, to_profile(RELIABLE))
         self.clock_ns = self.reader.start_ns
         self.warned = 0
         self.warn_of_damage()
@@ -121,7 +122,7 @@ class BagPlayer(GraphNode):
             if self.values["reliable"]:
                 qos = Qos("reliable", qos.durability, max(qos.depth, graph.RELIABLE_SKELETON.depth))
             try:
-                publishers[topic] = self.create_publisher(message_class(info.type_name), topic, to_profile(qos))
+                publishers[topic] = self.make_publisher(message_class(info.type_name), topic, to_profile(qos))
             except UnknownTypeError as error:
                 self.monitor.totals["topics not played"] += 1
                 self.get_logger().error(f"{topic} is not played: {error}")

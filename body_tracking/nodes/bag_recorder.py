@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
@@ -14,11 +15,13 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
+from body_tracking import graph, names
 from body_tracking.errors import BodyTrackingError
+from body_tracking.graph import is_model_covariance
 from body_tracking.nodes.bag_topics import from_profile, message_class, to_profile
 from body_tracking.nodes.common import STEADY, GraphNode, run
 from body_tracking.parameters import Parameter, Value
-from body_tracking.recording.qos import Qos, request_for
+from body_tracking.recording.qos import LATCHED, Qos, request_for
 from body_tracking.recording.rosbag2 import BagError, BagWriter
 
 PARAMETERS = (
@@ -29,11 +32,24 @@ PARAMETERS = (
         "between recorder/stop and recorder/start",
         live=True,
     ),
-    Parameter("topics", (), "record only these topics; empty for all that appear. May change likewise", live=True),
+    Parameter(
+        "topics",
+        (),
+        "record only these topics; empty for all that appear in the node's namespace, /tf and /diagnostics. May change "
+        "likewise",
+        live=True,
+    ),
     Parameter(
         "exclude",
         ("/clock", "/rosout", "/parameter_events"),
         "topics not to record, where topics is empty. May change likewise",
+        live=True,
+    ),
+    Parameter(
+        "model_covariance",
+        False,
+        "where topics is empty: record /filtered/model_covariance (and that of each of several people), too; with ekf "
+        "it is most of a recording, and body_tracking replay computes it again. May change likewise",
         live=True,
     ),
     Parameter("start_recording", True, "begin at once, not only with recorder/start", fixed="it is about the start"),
@@ -48,6 +64,12 @@ PARAMETERS = (
 )
 
 _DEPTH = 1000  # messages of a topic that may wait while the disk is slow
+_EARLY_S = 1.0
+"""With simulated time, what comes so shortly before the first ``/clock`` belongs to it; what came earlier does not."""
+_EARLY_LATCHED = 256
+"""Latched messages, which hold until there is another, that wait for it however long."""
+_EARLY_BYTES = 16 << 20
+"""Of all that waits."""
 
 
 class BagRecorder(GraphNode):
@@ -60,8 +82,9 @@ class BagRecorder(GraphNode):
         """Where to, and what."""
         given: dict[str, Any] = dict(values)
         self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
-        self.chosen = frozenset(given["topics"])
-        self.exclude = frozenset(given["exclude"])
+        self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
+        self.exclude = frozenset(map(self.resolve_topic_name, given["exclude"]))
+        self.model_covariance = bool(given["model_covariance"])
 
     def reconfigure(self, values: Mapping[str, Value]) -> None:
         """For the next recording.
@@ -79,7 +102,9 @@ class BagRecorder(GraphNode):
         self.writer: BagWriter | None = None
         self.inputs: dict[str, tuple[Qos, Any]] = {}
         self.refused: dict[str, str] = {}
-        self.early: list[tuple[str, bytes]] = []
+        self.early: deque[tuple[float, str, bytes]] = deque()
+        self.early_latched: deque[tuple[str, bytes]] = deque()
+        self.before_the_clock = 0
         self.error = ""
         self.written = self.lost = self.n_bytes = 0
         self.create_service(Trigger, "recorder/start", partial(self.answer, self.begin))
@@ -117,6 +142,8 @@ class BagRecorder(GraphNode):
         """
         for topic in tuple(self.inputs):
             self.forget(topic)
+        if self.simulated and self.now_ns() == 0:
+            self.drop_early()
         self.write_early()
         writer, self.writer = self.writer, None
         if writer is not None:
@@ -156,8 +183,16 @@ class BagRecorder(GraphNode):
         if self.writer is None:
             return
         for topic, types in self.get_topic_names_and_types():
-            if topic in self.chosen if self.chosen else topic not in self.exclude:
+            if self.wanted(topic):
                 self.adapt(topic, types[0])
+
+    def wanted(self, topic: str) -> bool:
+        """Whether the topic of this full name is to be recorded."""
+        if self.chosen:
+            return topic in self.chosen
+        if is_model_covariance(topic) and not self.model_covariance:
+            return False
+        return topic not in self.exclude and names.within(topic, self.get_namespace()) is not None
 
     def adapt(self, topic: str, type_name: str) -> None:
         """Subscribe as the topic's publishers allow, anew when they have changed."""
@@ -202,17 +237,47 @@ class BagRecorder(GraphNode):
             received_ns = info["received_timestamp"] or time.time_ns()
             self.write(topic, cdr, received_ns, info["source_timestamp"] or received_ns)
         elif self.now_ns() == 0:
-            # No /clock yet: 0 would put the beginning of the bag years before its rest.
-            self.early.append((topic, cdr))
+            self.wait_for_clock(topic, cdr)
         else:
             self.write_early()
             self.write(topic, cdr, self.now_ns())
 
+    def wait_for_clock(self, topic: str, cdr: bytes) -> None:
+        """Keep a message that came before ``/clock``, for a moment, or while it is latched: 0 would put the beginning
+        of the bag years before its rest.
+        """
+        if topic in self.inputs and self.inputs[topic][0].durability == LATCHED.durability:
+            self.early_latched.append((topic, cdr))
+        else:
+            self.early.append((time.monotonic(), topic, cdr))
+        self.forget_early()
+
+    def forget_early(self) -> None:
+        """Of what waits, drop what is too old or too much."""
+        now = time.monotonic()
+        size = sum(len(cdr) for _, _, cdr in self.early) + sum(len(cdr) for _, cdr in self.early_latched)
+        while self.early and (now - self.early[0][0] > _EARLY_S or size > _EARLY_BYTES):
+            size -= len(self.early.popleft()[-1])
+            self.before_the_clock += 1
+        while self.early_latched and (len(self.early_latched) > _EARLY_LATCHED or size > _EARLY_BYTES):
+            size -= len(self.early_latched.popleft()[-1])
+            self.before_the_clock += 1
+
+    def drop_early(self) -> None:
+        """Drop all that waits."""
+        self.before_the_clock += len(self.early) + len(self.early_latched)
+        self.early.clear()
+        self.early_latched.clear()
+
     def write_early(self) -> None:
         """Write what came before the clock did."""
-        early, self.early = self.early, []
-        for topic, cdr in early:
-            self.write(topic, cdr, self.now_ns())
+        if self.early or self.early_latched:
+            self.forget_early()
+            early = [*self.early_latched, *((topic, cdr) for _, topic, cdr in self.early)]
+            self.early.clear()
+            self.early_latched.clear()
+            for topic, cdr in early:
+                self.write(topic, cdr, self.now_ns())
 
     def write(self, topic: str, cdr: bytes, received_ns: int, sent_ns: int | None = None) -> None:
         """Write at once; if that is not possible, count."""
@@ -249,8 +314,13 @@ class BagRecorder(GraphNode):
         }
         if self.refused:
             values["refused"] = ", ".join(f"{topic} ({type_name})" for topic, type_name in self.refused.items())
+        if self.before_the_clock:
+            values["before the clock, not recorded"] = self.before_the_clock
         if self.error:
             return 2, self.error, values
+        if self.simulated and self.now_ns() == 0 and self.writer is not None:
+            self.forget_early()
+            return 1, f"waiting for {graph.CLOCK_TOPIC} (use_sim_time): nothing is recorded", values
         return (1 if self.refused else 0), ("stopped" if self.writer is None else "recording"), values
 
 

@@ -71,7 +71,7 @@ class BodyMarkers(GraphNode):
         self.colours = {**sensor_colours(sensors), "fused": FUSED, "filtered": FILTERED}
         self.latest: dict[str, dict[int, Skeleton]] = {}
         self.poses: dict[str, SensorPose] = {}
-        self.output = self.create_publisher(MarkerArray, graph.markers_topic(self.body), to_profile(RELIABLE))
+        self.output = self.make_publisher(MarkerArray, graph.markers_topic(self.body), to_profile(RELIABLE))
         sources = {graph.FUSED: "fused", graph.FILTERED: "filtered", **{graph.skeleton_topic(s): s for s in sensors}}
         for topic, name in sources.items():
             self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
@@ -79,7 +79,7 @@ class BodyMarkers(GraphNode):
         model = UpperBody()
         self.framed = {"segments": model.segment_names, "root": model.segment_names[:1], "none": ()}[given["tf"]]
         if TFMessage is not None and self.framed:
-            self.tf = self.create_publisher(TFMessage, graph.TF, to_profile(RELIABLE))
+            self.tf = self.make_publisher(TFMessage, graph.TF, to_profile(RELIABLE))
             segments = graph.segments_topic(self.body)
             self.listen(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
         self.create_timer(1.0 / given["rate"], self.publish, clock=STEADY)
@@ -93,7 +93,8 @@ class BodyMarkers(GraphNode):
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""
         pose = transform_to_pose(message)
-        self.poses[pose.sensor] = pose
+        if pose.sensor in self.colours:
+            self.poses[pose.sensor] = pose
 
     def on_segments(self, message: Any, sent_ns: int) -> None:
         """Where the segments are."""
@@ -114,8 +115,7 @@ class BodyMarkers(GraphNode):
             markers.figure(name, figure(placed, self.colours[name]), self.colours[name], 0.02, 0.01)
         markers.ellipsoids("uncertainty", ellipsoids(tuple(latest.get("filtered", {}).values())), UNCERTAINTY, 0.3)
         for number, (name, pose) in enumerate(sorted(self.poses.items())):
-            if name in self.colours:
-                markers.lines("sensors", number, frustum(_FRUSTUM_DEPTH), pose, self.colours[name])
+            markers.lines("sensors", number, frustum(_FRUSTUM_DEPTH), pose, self.colours[name])
         self.send(self.output, markers.message())
 
 

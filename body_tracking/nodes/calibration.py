@@ -85,9 +85,9 @@ class CalibrationNode(GraphNode):
         self.unsaved = False
         # Two batches: whoever comes late needs the one that holds now when the latest one is to hold only later.
         latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(self.sensors))))
-        self.poses = self.create_publisher(TransformStamped, graph.CALIBRATION, latched)
-        self.clocks = self.create_publisher(TimeReference, graph.CALIBRATION_CLOCK, latched)
-        self.tf = None if TFMessage is None else self.create_publisher(TFMessage, graph.TF_STATIC, to_profile(LATCHED))
+        self.poses = self.make_publisher(TransformStamped, graph.CALIBRATION, latched)
+        self.clocks = self.make_publisher(TimeReference, graph.CALIBRATION_CLOCK, latched)
+        self.tf = None if TFMessage is None else self.make_publisher(TFMessage, graph.TF_STATIC, to_profile(LATCHED))
         self.publish(self.calibration.current_update())
         for sensor in self.sensors:
             self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))

@@ -8,14 +8,16 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import gc
+import inspect
 import signal
 import socket
 import sys
 import threading
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -35,15 +37,19 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
 
-from body_tracking import dds, graph
-from body_tracking.backlog import Backlog, Sequences
+from body_tracking import dds, graph, names
+from body_tracking.backlog import Backlog, Sequences, Standstill
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
+from body_tracking.executables import ENDING, release_signals
 from body_tracking.messages.base import MessageError, RosMessages, to_nanoseconds
 from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
@@ -53,6 +59,7 @@ from body_tracking.parameters import (
     Parameter,
     ParameterError,
     Value,
+    as_yaml,
     check_all,
     is_ros_own,
     is_wildcard,
@@ -79,6 +86,9 @@ _ACKNOWLEDGE_S = 2.0
 _LEAVE_S = 5.0
 """Seconds for the middleware to let a node go that is closed."""
 
+_FORGOTTEN_S = 25.0
+"""Seconds after which DDS has forgotten a process that was killed: Fast DDS's lease of 20 s, and some more."""
+
 JUMP_BACK_NS = 1 * NANOSECONDS
 """A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
 
@@ -87,7 +97,13 @@ GAP_NS = 50_000_000
 
 _EVERYWHERE = frozenset({"/rosout", "/parameter_events", graph.DIAGNOSTICS_TOPIC})
 """Outputs that every node has."""
-_LOG_PERIOD_S = 5.0
+_LOG_PERIOD_S, _DOUBLED_PERIOD_S = 5.0, 30.0
+_REPORT_S = 1.0
+"""Seconds between two reports of a node in ``/diagnostics``."""
+_LOOK_S = 0.2
+"""Seconds between two looks whether to report."""
+_FAILURES = 10
+"""Callbacks of one input that fail one after the other, after which the node forgets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
 
 RELIABLE = Parameter(
@@ -128,6 +144,8 @@ class Monitor:
     def __init__(self) -> None:
         self.totals: Counter[str] = Counter()
         self.last_reason = ""
+        self.failures: Counter[str] = Counter()
+        """Of each input and kind of error how many callbacks raised one that nobody expected."""
         self._window: Counter[str] = Counter()
         self._delays_ns: list[int] = []
         self._latencies_ns: list[int] = []
@@ -190,6 +208,7 @@ class Monitor:
                 values[f"{name} max ms"] = f"{max(samples) / 1e6:.2f}"
                 samples.clear()
         values.update(self.totals)
+        values |= {f"raised {where}": count for where, count in self.failures.items()}
         if self.last_reason:
             values["last malformed"] = self.last_reason
         return values
@@ -256,13 +275,18 @@ class GraphNode(Node):
     PARAMETERS: ClassVar[tuple[Parameter, ...]]
 
     def __init__(self) -> None:
-        super().__init__(self.NAME)
         self.monitor = Monitor()
+        self._failed_in_a_row: Counter[str] = Counter()
+        self._told_failures = 0
+        super().__init__(self.NAME)
         self.backlog = Backlog()
         self.sequences = Sequences()
+        self.standstill = Standstill()
         self._droppable: dict[Subscription, str] = {}
         self._told_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
+        self._switched: Counter[str] = Counter()
+        self._several_since: dict[str, float] = {}
         self.simulated = bool(self.get_parameter("use_sim_time").value)
         self._simulated_ns = 0
         self._alarms: list[Alarm] = []
@@ -278,7 +302,9 @@ class GraphNode(Node):
         self.add_on_set_parameters_callback(self._on_set)
         self._diagnostics = self.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, to_profile(RELIABLE_QOS))
         self.start()
-        self.create_timer(1.0, self._report, clock=STEADY)
+        self._reported = -_REPORT_S
+        self._told_listeners: dict[str, object] = {}
+        self.create_timer(_LOOK_S, self._look, clock=STEADY)
 
     # --- to be written by a node
 
@@ -386,6 +412,84 @@ class GraphNode(Node):
         self._alarms.append(alarm)
         return alarm
 
+    # --- callbacks, whatever they raise
+
+    def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """A callback that does not raise: what it raises is counted and logged, and the node goes on.
+
+        Args:
+            where: the topic, the service, or what else calls it, for people.
+            callback: takes anything.
+        """
+
+        @wraps(callback)
+        def guard(*given: Any) -> Any:
+            try:
+                result = callback(*given)
+            except (ExternalShutdownException, InvalidHandle):
+                raise  # the executor's
+            except BodyTrackingError as error:
+                self.malformed(where, str(error), "malformed" if isinstance(error, MessageError) else "refused")
+            except Exception as error:
+                if not self.context.ok():
+                    raise  # the node is ending
+                self._failed(where, error)
+            else:
+                self._failed_in_a_row.pop(where, None)
+                return result
+
+        return guard
+
+    def _failed(self, where: str, error: Exception) -> None:
+        """Count an error that nobody expected; where the same goes wrong time and again, forget the state."""
+        kind = type(error).__name__
+        self.monitor.failures[f"{where} {kind}"] += 1
+        self._failed_in_a_row[where] += 1
+        key = f"raised {where} {kind}"
+        if self._may_log(key):
+            trace = "".join(traceback.format_exception(error))
+            self.get_logger().error(f"{where}: {kind} in a callback, which is left out: {error}\n{trace}")
+        if self._failed_in_a_row[where] % _FAILURES == 0:
+            self.log_seldom(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; starting anew")
+            with contextlib.suppress(Exception):
+                self.time_jumped_back(where)
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Any, *given: Any, **named: Any) -> Subscription:
+        """Subscribe with a callback that cannot end the node."""
+        if msg_type is ClockMessage and callback != self._on_clock:
+            callback = self._without_false_times(callback)
+        guard = self.guarded(self.resolve_topic_name(topic), callback)
+        return super().create_subscription(msg_type, topic, guard, *given, **named)
+
+    def create_timer(self, timer_period_sec: float, callback: Any, *given: Any, **named: Any) -> Timer:
+        """A timer with a callback that cannot end the node."""
+        guard = self.guarded(f"timer {getattr(callback, '__name__', 'callback')}", callback)
+        return super().create_timer(timer_period_sec, guard, *given, **named)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Any, *given: Any, **named: Any) -> Service:
+        """A service with a callback that cannot end the node; where that raises, whoever called gets an answer."""
+        guard = self.guarded(f"service {srv_name}", callback)
+
+        def answer(request: Any, response: Any) -> Any:
+            answered = guard(request, response)
+            if answered is None:
+                answered = srv_type.Response()
+                if hasattr(answered, "message"):
+                    answered.message = "failed; the log of the node says why"
+            return answered
+
+        return super().create_service(srv_type, srv_name, answer, *given, **named)
+
+    def _without_false_times(self, callback: Callable[[ClockMessage], None]) -> Callable[[ClockMessage], None]:
+        """rclpy's own reader of ``/clock`` without times that there are not, for which it would raise."""
+
+        def checked(message: ClockMessage) -> None:
+            with contextlib.nullcontext() if not self.simulated else contextlib.suppress(MessageError):
+                to_nanoseconds(message.clock)
+                callback(message)
+
+        return checked
+
     # --- messages
 
     def skeleton_qos(self) -> QoSProfile:
@@ -396,40 +500,55 @@ class GraphNode(Node):
         """Of results, which are reliable; as deep as skeletons by the parameter ``reliable``."""
         return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else RELIABLE_QOS)
 
+    def full_name(self, topic: str) -> str:
+        """The full name of a topic of the graph, in this node's namespace and as it is remapped."""
+        return str(self.resolve_topic_name(names.relative(topic)))
+
+    def make_publisher(self, kind: type[Any], topic: str, qos: QoSProfile) -> Publisher:
+        """Publish on a topic of the graph."""
+        return self.create_publisher(kind, names.relative(topic), qos)
+
     def listen(
-        self, topic: str, kind: type[Any], qos: QoSProfile, handle: Callable[[Any, int], None], *, raw: bool = False
+        self,
+        topic: str,
+        kind: type[Any],
+        qos: QoSProfile,
+        handle: Callable[[Any, int], None],
+        *,
+        raw: bool = False,
+        absolute: bool = False,
     ) -> Subscription:
         """Subscribe, so that a message which is not as it should be is counted and logged, and never ends the node.
 
         Args:
-            topic: its name.
+            topic: of the graph.
             kind: the message class.
             qos: the profile.
             handle: takes the message, and the wall time in nanoseconds at which it was sent.
             raw: hand over the message as CDR bytes.
+            absolute: the name was chosen by the user, and one with a leading slash holds in every namespace.
         """
+        name = self.resolve_topic_name(topic) if absolute else self.full_name(topic)
 
         def callback(message: Any, info: dict[str, int]) -> None:
-            self.sequences.note(topic, info["publication_sequence_number"])
-            self.monitor.arrived(topic)
+            self.sequences.note(name, info["publication_sequence_number"])
+            self.monitor.arrived(name)
             self._arrived(info)
-            try:
-                handle(message, info["source_timestamp"])
-            except MessageError as error:
-                self.malformed(topic, str(error))
-            except BodyTrackingError as error:
-                self.malformed(topic, str(error), "refused")
+            handle(message, info["source_timestamp"])
 
         checked: Any = callback  # rclpy passes the message info to callbacks of two arguments
-        return self.create_subscription(kind, topic, checked, qos, raw=raw)
+        return self.create_subscription(kind, topic if absolute else names.relative(topic), checked, qos, raw=raw)
 
     def listen_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
+        name = self.full_name(topic)
 
         def convert(cdr: bytes, sent_ns: int) -> None:
+            if self.is_stale(name, sent_ns):
+                return
             skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
-                self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+                self.log_seldom("jump", f"{name}: time jumped back, starting anew", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
@@ -437,8 +556,12 @@ class GraphNode(Node):
         qos.depth = max(qos.depth, _FRAMES_KEPT)
         subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
         if not self.values["reliable"]:
-            self._droppable[subscription] = topic
+            self._droppable[subscription] = name
         return subscription
+
+    def is_stale(self, topic: str, sent_ns: int) -> bool:
+        """Whether a frame was sent before this process stood still, and is too old now; never with ``reliable``."""
+        return not self.values["reliable"] and self.standstill.is_stale(topic, sent_ns, time.time_ns())
 
     def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
         """All messages but frames that are too late where the node is too slow; called by the executor."""
@@ -462,21 +585,27 @@ class GraphNode(Node):
     def time_jumped_back(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""
 
-    def send(self, publisher: Publisher, message: Any, stamp_ns: int | None = None, sent_ns: int | None = None) -> None:
-        """Publish and count.
+    def send(self, publisher: Publisher, message: Any, stamp_ns: int | None = None, sent_ns: int | None = None) -> bool:
+        """Publish and count; nothing is published if the process stood still since it received the input.
 
         Args:
             publisher: where to.
             message: what; a message, or one as CDR bytes.
             stamp_ns: its capture time, for the latency.
             sent_ns: wall time at which the input that it answers was sent, for the delay.
+
+        Returns:
+            Whether the message was published.
         """
+        if sent_ns is not None and self.is_stale(publisher.topic_name, sent_ns):
+            return False
         publisher.publish(message)
         self.monitor.message_out(
             publisher.topic_name,
             None if sent_ns is None else time.time_ns() - sent_ns,
             None if stamp_ns is None or not self.monitor.wants_latency() else self.now_ns() - stamp_ns,
         )
+        return True
 
     def malformed(self, topic: str, reason: str, what: str = "malformed") -> None:
         """Count a message that is not used, and why."""
@@ -486,32 +615,80 @@ class GraphNode(Node):
 
     def log_seldom(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
         """Warn, but not again about the same within some seconds."""
-        now = time.monotonic()
-        if now - self._logged.get(key, -period_s) >= period_s:
-            self._logged[key] = now
+        if self._may_log(key, period_s):
             self.get_logger().warning(text)
+
+    def _may_log(self, key: str, period_s: float = _LOG_PERIOD_S) -> bool:
+        """Whether something is to be logged: not again within some seconds."""
+        now = time.monotonic()
+        due = now - self._logged.get(key, -period_s) >= period_s
+        if due:
+            self._logged[key] = now
+        return due
 
     # --- diagnostics
 
     @cached_property
     def _status_name(self) -> str:
-        return f"{self.get_name()}: stream"
+        return f"{self.get_fully_qualified_name().removeprefix('/')}: stream"
+
+    def _look(self) -> None:
+        """Report every second, and at once when somebody else listens: a source may wait for that."""
+        if time.monotonic() - self._reported >= _REPORT_S or self._told_listeners != self._listeners():
+            self._report()
 
     def _report(self) -> None:
+        self._reported = time.monotonic()
+        self._told_listeners = self._listeners()
         level, text, values = self.state()
-        values = {**self.monitor.values(), **self._listeners(), **values}
+        values = {**self.monitor.values(), **self._told_listeners, **values}
         values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
         values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
+        values |= {f"left out after a standstill {topic}": n for topic, n in self.standstill.left_out.items()}
+        for topic, nodes in self._doubled().items():
+            values[f"publishers {topic}"] = ", ".join(nodes)
+            said = f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
+            level, text = max(level, 1), said + (f"; {text}" if text else "")
+            self.log_seldom(f"publishers {topic}", said, _DOUBLED_PERIOD_S)
         dropped = self.backlog.dropped - self._told_dropped
         if dropped:
             self._told_dropped = Counter(self.backlog.dropped)
             said = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
             level, text = max(level, 1), f"too slow: dropped {said}" + (f"; {text}" if text else "")
             self.log_seldom("dropped", text)
+        failures = self.monitor.failures.total()
+        if failures > self._told_failures:
+            self._told_failures = failures
+            said = f"{failures} callbacks failed, lately of {next(reversed(self.monitor.failures))}"
+            level, text = max(level, 2), said + (f"; {text}" if text else "")
         if self.monitor.totals["malformed"] and level == 0:
             text = text or f"{self.monitor.totals['malformed']} malformed messages"
         message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)
         self._diagnostics.publish(message)
+
+    def publishers_of(self, topic: str) -> list[str]:
+        """Full names of the nodes that publish a topic, this one's among them; one that was killed for 20 s more."""
+        found = self.get_publishers_info_by_topic(topic)
+        return sorted(f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in found)
+
+    def _doubled(self) -> dict[str, list[str]]:
+        """Who publishes the inputs that should have one publisher and have several.
+
+        Where their nodes have the same name, one may be what DDS still knows of a node that was killed and started
+        again. They count once messages come from them in turn, or when DDS would have forgotten the dead one.
+        """
+        now, found = time.monotonic(), {}
+        inputs = {each.topic_name for each in self.subscriptions}
+        for topic in sorted(filter(graph.has_one_publisher, inputs)):
+            nodes = self.publishers_of(topic) if self.count_publishers(topic) > 1 else []
+            switched, self._switched[topic] = self._switched[topic], self.sequences.switched[topic]
+            if len(nodes) < 2:
+                self._several_since.pop(topic, None)
+                continue
+            since = self._several_since.setdefault(topic, now)
+            if len(set(nodes)) > 1 or self._switched[topic] > switched + 1 or now - since > _FORGOTTEN_S:
+                found[topic] = nodes
+        return found
 
     def _listeners(self) -> dict[str, object]:
         """How many subscribers this node has found of each of its outputs: none yet is why nothing arrives."""
@@ -611,14 +788,22 @@ class _Ending:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             signal.signal(number, lambda *_: None)
         threading.Thread(target=self._wait, daemon=True).start()
+        release_signals()
+
+    def over(self) -> None:
+        """Everything has ended: another Ctrl-C, as ``ros2 launch`` passes it on, must not kill what shuts down.
+
+        Python lets go of its handlers then, but for signals that are ignored.
+        """
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def _wait(self) -> None:
         while True:
             number = self._reader.recv(1)[0]
-            if number not in (signal.SIGINT, signal.SIGTERM):
+            if number not in ENDING:
                 continue
             with self._lock:
                 self._asked += 2 if number == signal.SIGTERM else 1
@@ -641,8 +826,24 @@ class _Ending:
             (self._executor.finish if self.in_order else self._executor.stop)()
 
 
+def usage(node_class: type[GraphNode]) -> str:
+    """What ``--help`` prints."""
+    name = node_class.NAME
+    return (
+        f"usage: ros2 run body_tracking {name} [--ros-args [-p PARAMETER:=VALUE ...] [--params-file FILE]]\n\n"
+        f"{inspect.getdoc(node_class)}\n\nIts parameters with their defaults, as a parameters file:\n\n"
+        f"{as_yaml({name: node_class.PARAMETERS})}"
+    ).rstrip()
+
+
 def run(node_class: type[GraphNode]) -> None:
     """``main`` of every node: exit code 0 at its end or on Ctrl-C, 2 with one line when it cannot start."""
+    if signal.sigpending() & set(ENDING):
+        return  # it was to end while it was imported
+    asked = {"-h", "--help"}
+    if asked & set(sys.argv) and asked & set(remove_ros_args(sys.argv)[1:]):  # the latter reads parameters files
+        print(usage(node_class))
+        return
     code, node = 0, None
     faulthandler.enable()  # a crash below Python says where it was
     ending = _Ending()
@@ -680,5 +881,6 @@ def run(node_class: type[GraphNode]) -> None:
                 node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
+        ending.over()
     if code:
         sys.exit(code)

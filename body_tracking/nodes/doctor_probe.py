@@ -28,10 +28,9 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Float64
 
-from body_tracking import dds, graph
+from body_tracking import dds, graph, names
 from body_tracking.cdr import decode_skeletons
 from body_tracking.doctor.live import Observation, Stream
-from body_tracking.errors import BodyTrackingError
 from body_tracking.messages.base import IMU, POINT_CLOUD, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
@@ -87,7 +86,8 @@ class Listener(Node):
             if topic in self.streams:
                 self.streams[topic].publishers = max(publishers, self.streams[topic].publishers)
                 continue
-            sensor = POINT_CLOUD in types and graph.sensors_among([topic])
+            own = names.within(topic, names.rig_namespace([topic]))  # of whatever rig
+            sensor = POINT_CLOUD in types and own is not None and graph.sensors_among([own])
             if not publishers or not (sensor or (IMU in types and not graph.is_orientation_topic(topic))):
                 continue
             self.streams[topic] = Stream(types[0], publishers)
@@ -98,7 +98,7 @@ class Listener(Node):
         stream, now = self.streams[topic], time.time()
         try:
             stamp_ns = read(topic, cdr)
-        except BodyTrackingError as error:
+        except Exception as error:  # ours, and whatever the client library raises of bytes that are no message
             stream.malformed += 1
             stream.reason = str(error)
             return

@@ -12,6 +12,7 @@ shutdown.)
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, Protocol, runtime_checkable
 
@@ -47,6 +48,14 @@ class LeavesOut(Protocol):
         """Called after that."""
 
 
+@runtime_checkable
+class Guards(Protocol):
+    """A node that lets nothing through that its own callbacks raise."""
+
+    def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """A callback that does not raise; None where it would have."""
+
+
 class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
@@ -57,7 +66,8 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def __init__(self, node: Node) -> None:
         super().__init__()
-        self._taken = node.messages_taken if isinstance(node, TakesTogether) else None
+        self._guarded = node.guarded if isinstance(node, Guards) else lambda where, callback: callback
+        self._taken = self._guarded("messages", node.messages_taken) if isinstance(node, TakesTogether) else None
         self._leaving_out = node if isinstance(node, LeavesOut) else None
         self._changed = True
         self._stopped = False
@@ -127,6 +137,8 @@ class LeanExecutor(SingleThreadedExecutor):
                 count.num_events,
                 context,
             )
+            # what the middleware cannot make a message of is left out
+            takes = [self._guarded(each.topic_name, each.handle.take_message) for each in subscriptions]
             looked_ns = 0
             ready_since_ns: int | None = None
             while not self._changed:
@@ -152,7 +164,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 wait_set.wait(0 if until_ns is not None else -1 if whole else _LOOK_PERIOD_NS - since_ns)
                 if not self._context.ok():
                     return
-                messages = _take_all(subscriptions, wait_set)
+                messages = _take_all(subscriptions, takes, wait_set)
                 if until_ns is not None:
                     messages = [each for each in messages if each[1][1]["source_timestamp"] <= until_ns]
                     if not messages:
@@ -188,7 +200,7 @@ def _others_ready(wait_set: Any, waitables: list[Any]) -> bool:
     )
 
 
-def _take_all(subscriptions: list[Any], wait_set: Any) -> list[tuple[Any, Any]]:
+def _take_all(subscriptions: list[Any], takes: list[Callable[..., Any]], wait_set: Any) -> list[tuple[Any, Any]]:
     """All messages that are there, each with its subscription, in the order in which they were sent.
 
     However far a node lags behind, it then handles several sensors' frames as an offline run reads them from the
@@ -200,8 +212,8 @@ def _take_all(subscriptions: list[Any], wait_set: Any) -> list[tuple[Any, Any]]:
     # maybe after its own topic was looked at.
     while found:
         found = False
-        for index, subscription in enumerate(subscriptions):
-            while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+        for index, (subscription, take) in enumerate(zip(subscriptions, takes, strict=True)):
+            while (taken := take(subscription.msg_type, subscription.raw)) is not None:
                 found = True
                 arrived.append((taken[1]["source_timestamp"], index, taken))
     arrived.sort(key=lambda each: each[:2])

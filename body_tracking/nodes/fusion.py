@@ -57,7 +57,7 @@ class FusionNode(GraphNode):
     def start(self) -> None:
         """Connect."""
         self.last_sent_ns = 0
-        self.output = self.create_publisher(PointCloud2, graph.FUSED, self.skeleton_qos())
+        self.output = self.make_publisher(PointCloud2, graph.FUSED, self.skeleton_qos())
         latched = to_profile(Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(self.sensors))))
         self.listen(graph.CALIBRATION_CLOCK, TimeReference, latched, self.on_clock)
         self.listen(graph.CALIBRATION, TransformStamped, latched, self.on_pose)

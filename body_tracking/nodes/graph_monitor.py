@@ -19,15 +19,16 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from body_tracking import graph
+from body_tracking import graph, names
 from body_tracking.graph import GraphOptions
-from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
-from body_tracking.node_status import NodeStatus
+from body_tracking.node_status import NodeStatus, note_statuses
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.recording.qos import RELIABLE
 
 _CHAIN = ("skeleton_filter", "joint_angles")
+_NAME = "body_tracking_up"
 _FRESH = 3.0
 """Seconds for which a node's diagnostics count."""
 
@@ -37,9 +38,10 @@ class GraphMonitor:
 
     Args:
         bodies: the ids of those who may be tracked.
+        namespace: of the graph.
     """
 
-    def __init__(self, bodies: Sequence[str]) -> None:
+    def __init__(self, bodies: Sequence[str], namespace: str = "/") -> None:
         self.clock_ns = 0
         """The latest time on ``/clock``; 0 before there is one."""
         self.last_angles = 0.0
@@ -50,13 +52,16 @@ class GraphMonitor:
         self._statuses: dict[str, NodeStatus] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("body_tracking_up", context=self._context)
+        self._namespace = namespace
+        # by the time of its start the older of two can be told
+        self._node = rclpy.create_node(f"{_NAME}_{time.time_ns()}", namespace=namespace, context=self._context)
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
         for topic in self._angles_topics:
             # deep, so that all are counted though we are held up
-            self._node.create_subscription(JointState, topic, self._on_angles, to_profile(graph.RELIABLE_SKELETON))
+            name, qos = names.relative(topic), to_profile(graph.RELIABLE_SKELETON)
+            self._node.create_subscription(JointState, name, self._on_angles, qos)
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -68,20 +73,35 @@ class GraphMonitor:
         """Stop listening."""
         rclpy.try_shutdown(context=self._context)
         self._thread.join(timeout=2.0)
+        self._executor.shutdown()  # before Python takes things down in any order
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException):
             self._executor.spin()
 
     def _on_diagnostics(self, message: Any) -> None:
-        self._statuses |= {status.node: status for status in statuses(message, time.monotonic())}
+        known = dict(self._statuses)  # the other thread reads them
+        note_statuses(known, statuses(message, time.monotonic(), self._namespace))
+        self._statuses = known
 
     def _on_angles(self, message: Any) -> None:
         self.angles += 1
         self.last_angles = time.monotonic()
 
     def _on_clock(self, message: Any) -> None:
-        self.clock_ns = to_nanoseconds(message.clock)
+        with contextlib.suppress(MessageError):
+            self.clock_ns = to_nanoseconds(message.clock)
+
+    def has_predecessor(self) -> bool:
+        """Whether another ``up`` was started earlier in this domain and namespace, and is there still.
+
+        One that was killed is not: it does not answer who comes later.
+        """
+        name, namespace = self._node.get_name(), self._node.get_namespace()
+        return any(
+            other.startswith(f"{_NAME}_") and where == namespace and (len(other), other) < (len(name), name)
+            for other, where in self._node.get_node_names_and_namespaces()
+        )
 
     def listened_to(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
         """Whether who publishes each of these topics says that it has found at least so many subscribers.
@@ -94,7 +114,7 @@ class GraphMonitor:
         """
         statuses = [self._statuses.get(name) for name in nodes]
         for topic, number in wanted.items():
-            key = f"subscribers {topic}"
+            key = f"subscribers {names.resolved(topic, self._namespace)}"
             found = [status.number(key) or 0.0 for status in statuses if status is not None and key in status.values]
             if found and sum(found) < number:
                 return False
@@ -119,18 +139,23 @@ class GraphMonitor:
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
+        values = {f"{key}: {said}" for status in fresh.values() for key, said in status.values.items()}
+        parts += sorted(each for each in values if each.startswith("publishers "))
+        if options.robot:
+            parts.append(f"robot {fresh['robot_commands'].text if 'robot_commands' in fresh else '-'}")
         if restarts:
             parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
         return " | ".join(parts)
 
     def _rates(self, options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
-        def rate(node: str, key: str) -> str:
-            value = fresh[node].values.get(f"rate {key}") if node in fresh else None
+        def rate(node: str, way: str, topic: str) -> str:
+            key = f"rate {way} {names.resolved(topic, self._namespace)}"
+            value = fresh[node].values.get(key) if node in fresh else None
             return f"{float(value):.0f}" if value is not None else "-"
 
-        sensors = " ".join(f"{name} {rate('fusion', f'in {graph.skeleton_topic(name)}')}" for name in options.sensors)
-        fused = rate("fusion", f"out {graph.FUSED}")
-        rates = [rate("joint_angles", f"out {topic}") for topic in self._angles_topics]
+        sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in options.sensors)
+        fused = rate("fusion", "out", graph.FUSED)
+        rates = [rate("joint_angles", "out", topic) for topic in self._angles_topics]
         # those of whom something comes; of nobody at least how it is with the first
         angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
         return f"{sensors}, fused {fused}, angles {angles} Hz"
@@ -138,7 +163,12 @@ class GraphMonitor:
     @staticmethod
     def _delay(options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
         """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
-        by_sensor = graph.role_of(options).input == graph.SENSORS_INPUT
+        running = fresh.get("skeleton_filter")
+        role = graph.ROLES.get(running.text if running is not None else "")  # it may have changed since the start
+        taken = (
+            (role or graph.role_of(options)).input if options.filter_input in ("", graph.AUTO) else options.filter_input
+        )
+        by_sensor = taken == graph.SENSORS_INPUT
         chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)
         values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in chain]
         known = [float(value) for value in values if value is not None]

@@ -50,17 +50,17 @@ class ImuSkeletonNode(GraphNode):
 
     def start(self) -> None:
         """Connect."""
-        self.skeletons = self.create_publisher(PointCloud2, graph.IMU_SKELETON, self.skeleton_qos())
+        self.skeletons = self.make_publisher(PointCloud2, graph.IMU_SKELETON, self.skeleton_qos())
         self.orientations = {
-            each.segment: self.create_publisher(Imu, graph.orientation_topic(each.segment), self.skeleton_qos())
+            each.segment: self.make_publisher(Imu, graph.orientation_topic(each.segment), self.skeleton_qos())
             for each in self.stage.sensors
         }
         waiting = self.skeleton_qos()
         waiting.depth = max(waiting.depth, _READINGS)
-        for topic in self.stage.mag:
-            self.listen(topic, MagneticField, waiting, partial(self.on_field, topic))
-        for topic in self.stage.imu:
-            self.listen(topic, Imu, waiting, partial(self.on_imu, topic))
+        for each in self.stage.sensors:
+            self.listen(each.mag, MagneticField, waiting, partial(self.on_field, each.mag), absolute=each.absolute)
+            for topic in each.imu:
+                self.listen(topic, Imu, waiting, partial(self.on_imu, topic), absolute=each.absolute)
         self.wearer = HeldSubject(HOLD) if self.values["subject"] == ALL else SubjectSelector()
         self.listen_to_skeletons(graph.FUSED, self.on_skeletons)
         given: dict[str, Any] = dict(self.values)

@@ -20,6 +20,7 @@ from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter
 from body_tracking.sensors import check_sensor_name
 from body_tracking.sensors.live import SourceSettings, backends, described, open_source
+from body_tracking.skeleton import Skeleton
 
 _DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0
@@ -87,20 +88,29 @@ class KinectSkeleton(GraphNode):
             given["least_delay"],
         )
         self.source = open_source(given["backend"], settings)
-        self.output = self.create_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
         self.thread = threading.Thread(target=self.publish_frames, daemon=True)
         self.thread.start()
 
     def publish_frames(self) -> None:
         """Until the source or the node ends, or the source fails: then the node stays, and says why."""
+        publish = self.guarded("frames", self.publish_frame)
         try:
             while self.context.ok() and not self.source.ended:
                 frame = self.source.read(timeout=0.2)
-                if frame is not None:
-                    self.send(self.output, encode_skeletons(frame.skeletons), frame.skeletons[0].stamp_ns)
+                if frame is None:
+                    continue
+                publish(frame.skeletons)
         except Exception as error:  # whatever the library of a sensor raises
             if self.context.ok():  # not closed while it was being read
                 self.failed(error)
+
+    def publish_frame(self, skeletons: tuple[Skeleton, ...]) -> None:
+        """One message; a frame of which none can be made is left out."""
+        stamp_ns, message = skeletons[0].stamp_ns, encode_skeletons(skeletons)
+        # the network's stamps are ROS time, those of a recording of any
+        if self.values["backend"] != "network" or not self.is_stale(self.output.topic_name, stamp_ns):
+            self.send(self.output, message, stamp_ns)
 
     def failed(self, error: Exception) -> None:
         """Say what the source has raised, and where, for who writes it; to be called where it is caught."""

@@ -26,7 +26,7 @@ PARAMETERS = (
     Parameter("sensor", "azure1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
     Parameter(
         "topic",
-        "/body_tracking_data",
+        "body_tracking_data",
         "what is listened to: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
     ),
     Parameter(
@@ -54,10 +54,10 @@ class SkeletonAdapter(GraphNode):
         sensor = check_sensor_name(given["sensor"])
         self.frame_id = optical_frame(sensor)
         self.joint_state = TrackingState[given["state"].upper()]
-        self.topic: str = given["topic"]
+        self.topic: str = self.resolve_topic_name(given["topic"])
         self.heard: float | None = None
-        self.output = self.create_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
-        self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers)
+        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:
         """Publish the bodies of one message; nobody in view is no message."""

@@ -120,20 +120,22 @@ class SkeletonFilterNode(GraphNode):
 
     def start(self) -> None:
         """Connect."""
-        self.ids = IdsList and self.create_publisher(IdsList, graph.TRACKED, to_profile(RELIABLE_QOS))
+        self.ids = IdsList and self.make_publisher(IdsList, graph.TRACKED, to_profile(RELIABLE_QOS))
         self.tracked: tuple[str, ...] = ()
         self.advertise()
         self.connect(self.values)
         self.due = self.make_alarm(self.on_alarm)
 
     def advertise(self) -> None:
-        """Make the publishers that the filter needs, and that are not there yet."""
+        """Make the publishers that the filter needs, and no others: joint_angles goes by them."""
         assert self.stage is not None
+        for topic in self.outputs.keys() - self.stage.topics.keys():
+            self.destroy_publisher(self.outputs.pop(topic))
         qos = {SEGMENTS: self.result_qos(), STRING: to_profile(graph.URDF_QOS)}
         for topic, kind in self.stage.topics.items():
             if topic not in self.outputs:
                 profile = qos.get(kind) or self.skeleton_qos()
-                self.outputs[topic] = self.create_publisher(message_class(kind), topic, profile)
+                self.outputs[topic] = self.make_publisher(message_class(kind), topic, profile)
 
     def connect(self, values: Mapping[str, Value]) -> None:
         """Listen to what the filter takes, and to nothing else."""
@@ -230,7 +232,7 @@ class SkeletonFilterNode(GraphNode):
         """One message of the filter."""
         if topic in self.told_apart:
             self.send(self.outputs[topic], cdr, stamp_ns, self.sent_ns)
-        else:
+        elif self.sent_ns is None or not self.is_stale(topic, self.sent_ns):
             self.outputs[topic].publish(cdr)
 
     def finish(self) -> None:

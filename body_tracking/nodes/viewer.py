@@ -25,12 +25,11 @@ from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2
 from std_srvs.srv import Trigger
 
-from body_tracking import graph
+from body_tracking import graph, names
 from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
-from body_tracking.graph import GraphOptions
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
@@ -38,7 +37,7 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.node_status import NodeStatus
+from body_tracking.node_status import NodeStatus, note_statuses
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run
 from body_tracking.parameters import Parameter
@@ -145,11 +144,14 @@ class ViewerNode(GraphNode):
     def on_pose(self, message: Any, sent_ns: int) -> None:
         """A sensor's pose."""
         pose = transform_to_pose(message)
-        self.poses[pose.sensor] = pose
+        if pose.sensor in self.sensors:
+            self.poses[pose.sensor] = pose
 
     def on_diagnostics(self, message: Any, sent_ns: int) -> None:
         """What a node says of itself."""
-        self.statuses |= {status.node: status for status in statuses(message, time.monotonic())}
+        statuses_now = dict(self.statuses)  # the other thread reads them
+        note_statuses(statuses_now, statuses(message, time.monotonic(), self.get_namespace()))
+        self.statuses = statuses_now
 
     # --- drawing, in a thread of its own
 
@@ -257,7 +259,8 @@ class ViewerNode(GraphNode):
 
     def bodies(self) -> tuple[str, ...]:
         """The persons whose joint angles are published."""
-        return graph.bodies_among(name for name, _ in self.get_topic_names_and_types())
+        own = (names.within(topic, self.get_namespace()) for topic, _ in self.get_topic_names_and_types())
+        return graph.bodies_among(topic for topic in own if topic is not None)
 
     # --- what people press, in threads of the page's own
 
@@ -270,18 +273,15 @@ class ViewerNode(GraphNode):
 
     def choose_filter(self, name: str) -> str:
         """Another filter, and what the joint angles then are made of."""
-        role = graph.role_of(GraphOptions(filter_name=name))
+        convention = graph.ROLES[name].convention
         self.set_parameters_of("skeleton_filter", filter=name)
-        self.set_parameters_of("joint_angles", convention=role.convention, input=role.angles_input)
-        return f"{name}, with angles {role.convention}"
+        self.set_parameters_of("joint_angles", convention=convention, input=graph.AUTO)
+        return f"{name}, with angles {convention}"
 
     def choose_convention(self, name: str) -> str:
         """Other angles of the filter that runs."""
-        running = self.statuses.get("skeleton_filter")
-        filter_name = running.text if running is not None and running.text in FILTERS else ""
-        role = graph.role_of(GraphOptions(filter_name=filter_name, convention=name))
-        self.set_parameters_of("joint_angles", convention=role.convention, input=role.angles_input)
-        return f"angles {role.convention}, of {role.angles_input}"
+        self.set_parameters_of("joint_angles", convention=name, input=graph.AUTO)
+        return f"angles {name}"
 
     def choose_body(self, name: str) -> str:
         """Another person's joint angles."""

@@ -319,7 +319,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``import`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser(
         "import",
-        help="turn CSV recordings, NTU RGB+D .skeleton or Xsens .mvnx files into a bag",
         description="Turn recordings into one bag with a topic /<sensor>/skeleton per camera, and /<sensor>/imu/data "
         "or data_raw, and /<sensor>/imu/mag, per inertial sensor. Header stamps are the "
         "sensors' own clocks as recorded, the bag's log time is the time of receipt. Formats: docs/recordings.md.",

@@ -41,6 +41,7 @@ from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.recording.stages import JUMP_BACK_NS, ReplaySettings, Sink, Upstream, start_downstream
 from body_tracking.skeleton import NANOSECONDS, Skeleton
@@ -176,16 +177,17 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     """
     began = time.perf_counter()
     counters: Counter[str] = Counter()
-    with BagReader(bag_path) as bag:
+    with RigReader(bag_path) as bag:
         topics = sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
         inertial = () if settings.imus is None else graph.played_imu_topics(settings.imus.segments, bag.topics)
         kept = (*topics, *truth, *inertial)
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
+        upstream = Upstream(settings)  # before `out` is touched
         downstream = start_downstream(settings, out, passed, overwrite=overwrite)
         try:
-            upstream = Upstream(settings, downstream)
+            upstream.sink = downstream
             progress = Progress(bag.start_ns, bag.end_ns)
             beside = _Passed(bag, truth, downstream)
             felt = _Felt(bag, inertial, downstream, upstream, counters)
@@ -346,6 +348,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         imus,
         _names(filtering["orientations"]) or tuple(each.segment for each in graph.imu_topics(chosen.imus)),
         people_from(filtering),
+        args.model_covariance,
     )
 
 
@@ -366,7 +369,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking replay``."""
     command = subparsers.add_parser(
         "replay",
-        help="run the whole graph offline over a bag",
         description="Calibrates, fuses, filters and computes joint angles offline, with the same results as the live "
         "graph, and writes every topic that the graph would publish into a new bag.",
     )
@@ -382,6 +384,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument("--params-file", type=Path, metavar="F", help="ROS parameters file, as for the nodes")
     command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
     graph.add_people(command)
+    command.add_argument(
+        "--model-covariance",
+        action="store_true",
+        help="with ekf: write /filtered/model_covariance, too; it is most of such a bag",
+    )
     command.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=run)

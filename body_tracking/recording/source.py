@@ -12,7 +12,8 @@ from pathlib import Path
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
-from body_tracking.recording.rosbag2 import BagError, BagReader, deserialize
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import BagError, deserialize
 from body_tracking.sensors import RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.sensors.csv_recording import sensor_column
 from body_tracking.sensors.live import SourceError, SourceSettings, register
@@ -143,7 +144,7 @@ def _frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None
 
 def _bag_frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None]]:
     topic = f"/{sensor}/skeleton"
-    with BagReader(path) as reader:
+    with RigReader(path) as reader:
         if topic not in reader.topics:
             raise BagError(f"{path}: no topic {topic}; it has {', '.join(reader.topics) or 'none'}")
         type_name = reader.topics[topic].type_name

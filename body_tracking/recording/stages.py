@@ -63,7 +63,7 @@ from body_tracking.messages.calibration import (
 from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, deserialize, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter, deserialize, remove_file, serialize
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 JUMP_BACK_NS = NANOSECONDS
@@ -94,6 +94,7 @@ class ReplaySettings:
         imus: inertial sensors, if there are any.
         orientations: segments whose orientations by these the filter takes.
         people: whom to track.
+        model_covariance: write the covariance of the filter's model, too.
     """
 
     sensors: tuple[str, ...]
@@ -112,6 +113,7 @@ class ReplaySettings:
     imus: ImuSettings | None = None
     orientations: tuple[str, ...] = ()
     people: PeopleParameters = field(default_factory=PeopleParameters)
+    model_covariance: bool = False
 
     def role(self) -> graph.FilterRole:
         """What the filter is to do.
@@ -155,10 +157,17 @@ class Upstream:
 
     Args:
         settings: what to run.
-        sink: gets every message that they publish.
+
+    Attributes:
+        sink: gets every message that they publish; to be set before the first call.
+
+    Raises:
+        CalibrationError: the calibration file cannot be used, or the reference is not among the sensors.
     """
 
-    def __init__(self, settings: ReplaySettings, sink: Sink) -> None:
+    sink: Sink
+
+    def __init__(self, settings: ReplaySettings) -> None:
         reference = settings.reference or None
         self.calibration = OnlineCalibration(settings.sensors, settings.calibration, reference)
         if settings.calibration_file is not None:
@@ -170,7 +179,6 @@ class Upstream:
         self._last_ns: dict[str, int] = {}
         several = settings.people.subject == ALL
         self._wearer = HeldSubject(settings.people.hold) if several else SubjectSelector()
-        self._sink = sink
 
     def start(self, log_time_ns: int) -> None:
         """What is known before the first frame."""
@@ -205,9 +213,9 @@ class Upstream:
         told = self.imus.on_imu(topic, deserialize(IMU, cdr), log_time_ns)
         if told.orientation is not None:
             message = serialize(orientation_to_message(told.orientation, BAG_MESSAGES))
-            self._sink.take(graph.orientation_topic(told.orientation.segment), message, log_time_ns)
+            self.sink.take(graph.orientation_topic(told.orientation.segment), message, log_time_ns)
         if told.skeleton is not None:
-            self._sink.take(graph.IMU_SKELETON, encode_skeletons([told.skeleton]), log_time_ns)
+            self.sink.take(graph.IMU_SKELETON, encode_skeletons([told.skeleton]), log_time_ns)
 
     def finish(self, log_time_ns: int) -> None:
         """What still waits for a frame that does not come."""
@@ -217,7 +225,7 @@ class Upstream:
 
     def _fused(self, fused: tuple[Skeleton, ...], log_time_ns: int) -> None:
         cdr = encode_skeletons(fused)
-        self._sink.take(graph.FUSED, cdr, log_time_ns)
+        self.sink.take(graph.FUSED, cdr, log_time_ns)
         if self.imus is not None and (wearer := self._wearer.pick(_decoded(cdr))) is not None:
             self.imus.on_skeleton(wearer, log_time_ns)
 
@@ -226,11 +234,11 @@ class Upstream:
         for sensor, clock in result.clocks.items():
             if sensor != result.reference:
                 reference = clock_to_time_reference(sensor, clock, update.valid_from_ns, BAG_MESSAGES)
-                self._sink.take(graph.CALIBRATION_CLOCK, serialize(reference), log_time_ns)
+                self.sink.take(graph.CALIBRATION_CLOCK, serialize(reference), log_time_ns)
                 self.fusion.set_clock(*time_reference_to_clock(reference))
         for pose in result.poses.values():
             transform = pose_to_transform(pose, self.fusion.world, BAG_MESSAGES)
-            self._sink.take(graph.CALIBRATION, serialize(transform), log_time_ns)
+            self.sink.take(graph.CALIBRATION, serialize(transform), log_time_ns)
             self.fusion.set_pose(transform_to_pose(transform))
 
 
@@ -330,15 +338,15 @@ class FilterAndAngles:
             assert covariance is not None
             _, frame_id, q, velocity = state
             estimate = state_estimate(angles.model, stamp_ns, frame_id, q, velocity, covariance[1])
-            self._tell(body, angles.of_estimate(estimate), frame_id)
+            self._tell(body, angles.of_estimate(estimate))
 
     def _arrived(self, skeletons: tuple[Skeleton, ...]) -> None:
         for body, skeleton in by_person(skeletons, self._angles, several=self._several):
-            self._tell(body, self._angles[body].of_skeleton(skeleton), skeleton.frame_id)
+            self._tell(body, self._angles[body].of_skeleton(skeleton))
 
-    def _tell(self, body: str, angles: JointAngles | None, frame_id: str) -> None:
+    def _tell(self, body: str, angles: JointAngles | None) -> None:
         if angles is not None:
-            states, stddevs = encode_angles(angles, body, frame_id)
+            states, stddevs = encode_angles(angles, body, self._angles[body].convention)
             self._publish(graph.joint_states_topic(body), states)
             self._publish(graph.joint_states_stddev_topic(body), stddevs)
             self.frames += 1
@@ -368,6 +376,7 @@ class Downstream:
     ) -> None:
         self._rest = FilterAndAngles(settings, self._write)
         self._now_ns = 0
+        self._covariance = settings.model_covariance
         self._writer = BagWriter(out, overwrite=overwrite)
         published = {
             graph.CALIBRATION: (TRANSFORM, LATCHED),
@@ -380,7 +389,8 @@ class Downstream:
             for each in graph.imu_topics(settings.imus.segments):
                 published[graph.orientation_topic(each.segment)] = IMU, SENSOR_DATA
         for topic, (type_name, qos) in {**topics, **published}.items():
-            self._writer.add_topic(topic, type_name, qos)
+            if self._written(topic):
+                self._writer.add_topic(topic, type_name, qos)
 
     def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
         """One serialised message."""
@@ -388,8 +398,12 @@ class Downstream:
         self._now_ns = log_time_ns
         self._rest.take(topic, cdr, log_time_ns)
 
+    def _written(self, topic: str) -> bool:
+        return self._covariance or not graph.is_model_covariance(topic)
+
     def _write(self, topic: str, cdr: bytes) -> None:
-        self._writer.write(topic, cdr, self._now_ns)
+        if self._written(topic):
+            self._writer.write(topic, cdr, self._now_ns)
 
     def finish(self) -> Written:
         """Close the bag; one without angles is removed again."""
@@ -399,6 +413,11 @@ class Downstream:
         else:
             self._writer.discard()
         return Written(self._rest.frames, dict(self._rest.counters))
+
+    @property
+    def path(self) -> Path:
+        """The file that is written."""
+        return self._writer.path
 
     def abandon(self) -> None:
         """Remove the unfinished bag."""
@@ -417,7 +436,10 @@ class ForkedDownstream:
     ) -> None:
         context = multiprocessing.get_context("fork")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, settings, out, topics, overwrite), daemon=True)
+        # What a process that is killed at once leaves of a bag that was not there before.
+        self._path = None if out.exists() else out.absolute() / f"{out.absolute().name}_0.mcap"
+        arguments = (self._connection, theirs, settings, out, topics, overwrite)
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
         self._batch: list[tuple[str, bytes, int]] = []
         with warnings.catch_warnings():
             # Python 3.12 warns of forking with threads; those of the numeric libraries are prepared for it.
@@ -430,7 +452,7 @@ class ForkedDownstream:
                 if collects:
                     gc.enable()
         theirs.close()
-        self._receive()
+        self._path = self._receive()
 
     def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
         """One serialised message."""
@@ -451,6 +473,8 @@ class ForkedDownstream:
         """Remove the unfinished bag."""
         self._connection.close()
         self._process.join()
+        if self._path is not None:
+            remove_file(self._path)  # still there where the other process was killed
 
     def _send(self) -> None:
         try:
@@ -459,23 +483,29 @@ class ForkedDownstream:
             self._receive()  # raises why
         self._batch = []
 
-    def _receive(self) -> Written | None:
+    def _receive(self) -> Any:
         try:
             answer = self._connection.recv()
         except (EOFError, ConnectionResetError):  # the latter where it left something unread
-            self._process.join()
+            self.abandon()
             raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
         if isinstance(answer, BaseException):
             self._process.join()
             raise answer
-        assert answer is None or isinstance(answer, Written)
         return answer
 
 
 def _serve(
-    connection: Connection, settings: ReplaySettings, out: Path, topics: Mapping[str, tuple[str, Qos]], overwrite: bool
+    theirs: Connection,
+    connection: Connection,
+    settings: ReplaySettings,
+    out: Path,
+    topics: Mapping[str, tuple[str, Qos]],
+    overwrite: bool,
 ) -> None:
     """The other process."""
+    # While a copy of the first process's end is open here, its closing would not be seen.
+    theirs.close()
     # Garbage of the first process is not this one's to take down. ROS nodes among it have threads that are not here,
     # and end in a crash.
     gc.freeze()
@@ -483,7 +513,7 @@ def _serve(
     stage: Downstream | None = None
     try:
         stage = Downstream(settings, out, topics, overwrite=overwrite)
-        connection.send(None)
+        connection.send(stage.path)
         while (batch := connection.recv()) is not None:
             for topic, cdr, log_time_ns in batch:
                 stage.take(topic, cdr, log_time_ns)

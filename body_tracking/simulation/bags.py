@@ -167,7 +167,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking simulate`` and ``body_tracking make-bags``."""
     command = subparsers.add_parser(
         "simulate",
-        help="people who move before simulated sensors, as a bag with the truth",
         description="Simulates people in front of Kinect v2 sensors that err like real ones, with inertial sensors on "
         "them if asked, and writes what the sensors say and what is true into a bag. The same arguments give the same "
         "numbers.",
@@ -223,7 +222,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     bags = subparsers.add_parser(
         "make-bags",
-        help="make the simulated recordings that are shipped in bags/",
         description="Simulate two Kinect v2 sensors and a person in three motions, and write a bag of each.",
     )
     bags.add_argument(

@@ -1,13 +1,15 @@
-"""Keeps pages of other sites from pressing the viewer's buttons.
+"""Keeps pages of other sites from pressing the viewer's buttons, and from showing it in a frame of theirs.
 
 Browsers let any page open a websocket to any address, also to one of this machine, and say in ``Origin`` whose page it
 is (RFC 6455, section 10.2). viser does not look at it, and has no place to put a look in: so the server that it makes
-is given one here.
+is given one here. What is shown in a frame of another page can be laid under what people press there (clickjacking), so
+every answer forbids that, too (RFC 7034; Content Security Policy Level 3, section 6.4.2).
 """
 
 from __future__ import annotations
 
 import http
+import inspect
 import ipaddress
 import socket
 from collections.abc import Callable, Iterator
@@ -18,6 +20,8 @@ from urllib.parse import urlsplit
 import websockets.asyncio.server
 
 from body_tracking.viewing.snapshot import PageError
+
+_NO_FRAMES = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
 
 
 def is_own(origin: str | None, host: str | None) -> bool:
@@ -52,7 +56,7 @@ def _is_mine(name: str) -> bool:
 
 @contextmanager
 def same_origin() -> Iterator[None]:
-    """Websocket servers that begin meanwhile refuse the pages of others, with 403.
+    """Websocket servers that begin meanwhile refuse the pages of others, with 403, and frames in pages of others.
 
     Raises:
         PageError: none began in the way that is known here.
@@ -64,10 +68,16 @@ def same_origin() -> Iterator[None]:
         nonlocal guarded
         guarded += 1
 
-        def look(connection: Any, request: Any) -> Any:
+        async def look(connection: Any, request: Any) -> Any:
             if "Upgrade" in request.headers and not is_own(request.headers.get("Origin"), request.headers.get("Host")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "a page of another site\n")
-            return process_request(connection, request) if process_request is not None else None
+            answer = process_request(connection, request) if process_request is not None else None
+            if inspect.isawaitable(answer):
+                answer = await answer
+            if answer is not None:
+                for name, value in _NO_FRAMES.items():
+                    answer.headers[name] = value
+            return answer
 
         return serve(*args, process_request=look, **kwargs)
 

@@ -1,0 +1,74 @@
+"""The entry points of setup.py: nodes, and commands.
+
+A node needs a second for its imports. A SIGINT meanwhile would end it with a traceback, so signals wait until the node
+can take them: from the first instruction where the process was started with them blocked, as by ``up`` and by the
+scripts that colcon installs, else from here on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+def hold_signals() -> None:
+    """Let SIGINT and SIGTERM wait; also across ``exec``, by which the client library from PyPI starts Python anew."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+
+
+def release_signals() -> None:
+    """Take those that have come meanwhile, each once, and all later ones."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+
+
+@contextlib.contextmanager
+def signals_held() -> Iterator[None]:
+    """Within it, processes are started with these signals blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def start(name: str) -> None:
+    """Run the node of this name; where it is to end before it has begun, that is the end."""
+    hold_signals()
+    imported = threading.Event()
+    threading.Thread(target=_leave_unless, args=(imported,), daemon=True).start()
+    module = importlib.import_module(f"body_tracking.nodes.{name}")
+    imported.set()
+    module.main()
+
+
+def _leave_unless(imported: threading.Event) -> None:
+    while not imported.wait(0.05):
+        if signal.sigpending() & set(ENDING):
+            os._exit(0)
+
+
+def command(module: str) -> int:
+    """Run the command in a module of the package; its exit code."""
+    try:
+        release_signals()
+        code: int = importlib.import_module(f"body_tracking.{module}").main()
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+_COMMANDS = {"body_tracking": "cli", "kinect_sender": "sensors.kinect_sender"}
+
+
+def __getattr__(name: str) -> Callable[[], int | None]:
+    """``body_tracking.executables:fusion`` is the entry point of ``fusion``."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    return partial(command, _COMMANDS[name]) if name in _COMMANDS else partial(start, name)

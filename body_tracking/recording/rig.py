@@ -1,0 +1,35 @@
+"""The recording of one rig, whatever the namespace in which it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from body_tracking import names
+from body_tracking.recording.rosbag2 import BagReader, RawMessage
+
+
+class RigReader(BagReader):
+    """A bag whose topics have the names that they have in the root namespace.
+
+    Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one that the rig
+    has too.
+
+    Attributes:
+        namespace: in which the rig was recorded; ``/`` too where the bag holds several rigs.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(path)
+        self.namespace = names.rig_namespace(self.topics)
+        found = [(names.within(name, self.namespace), name) for name in self.topics]
+        found.sort(key=lambda each: each[0] is not None)  # the rig's own override others of the same name
+        self._recorded = {topic or name: name for topic, name in found}
+        self._names = {name: topic for topic, name in self._recorded.items()}
+        self.topics = {topic: self.topics[name] for topic, name in sorted(self._recorded.items())}
+
+    def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None) -> Iterator[RawMessage]:
+        """As of :class:`BagReader`, by the names in :attr:`topics`."""
+        wanted = self._names if topics is None else {self._recorded[each] for each in topics if each in self._recorded}
+        for message in super().messages(wanted, start_ns):
+            yield message._replace(topic=self._names[message.topic])
