@@ -135,7 +135,8 @@ def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skel
     sensors = tuple(sensor.pose.sensor for sensor in recording.sensors)
     settings = ReplaySettings(sensors, filter_name=filter_name)
     collector = _Collector(settings)
-    upstream = Upstream(settings, collector)
+    upstream = Upstream(settings)
+    upstream.sink = collector
     upstream.start(recording.frames[0].received_ns)
     for frame in recording.frames:
         cdr = encode_skeletons(frame.skeletons)

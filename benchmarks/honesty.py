@@ -66,7 +66,8 @@ AFTER = 1.0
 
 def new_filter(parameters: dict[str, float]) -> ExtendedKalmanFilter:
     """The filter under test; the only place that knows how to make it."""
-    return ExtendedKalmanFilter(EkfParameters(**parameters))
+    # its people take poses at random over their ranges of motion: no posture is known of them
+    return ExtendedKalmanFilter(EkfParameters(**({"posture": False} | parameters)))
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,8 @@ class Chain:
     """
 
     def __init__(self, settings: ReplaySettings) -> None:
-        self.upstream = Upstream(settings, self)
+        self.upstream = Upstream(settings)
+        self.upstream.sink = self
         self.rest = FilterAndAngles(settings, self._published)
         self.states: list[tuple[int, FloatArray, FloatArray]] = []
         self.oriented = 0

@@ -104,17 +104,24 @@ def parameters() -> str:
     return "\n".join(parts)
 
 
-def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for choice in action._choices_actions:
-                below = list(_commands(action.choices[choice.dest]))
-                yield from below or [(f"`{parser.prog} {choice.dest}`", choice.help or "")]
+def _below(parser: argparse.ArgumentParser) -> Iterator[argparse._SubParsersAction[argparse.ArgumentParser]]:
+    return (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+
+
+def _commands() -> Iterator[tuple[str, str]]:
+    for name, (_, text) in cli.SUBCOMMANDS.items():
+        (top,) = _below(cli.parser(name))
+        verbs = [
+            (f"`body_tracking {name} {verb.dest}`", verb.help or "")
+            for action in _below(top.choices[name])
+            for verb in action._choices_actions
+        ]
+        yield from verbs or [(f"`body_tracking {name}`", text)]
 
 
 def commands() -> str:
     """The subcommands of ``body_tracking``."""
-    return table(("command", "what it does"), _commands(cli.parser()))
+    return table(("command", "what it does"), _commands())
 
 
 WRITERS = {
