@@ -24,10 +24,10 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench docs clean
+.PHONY: help setup demo test test-all lint ros2-workspace bench docs clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 setup: $(STAMP) ## create .venv with everything in it
 
@@ -50,20 +50,38 @@ $(STAMP): setup.py setup.cfg
 demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording
 	@rm -rf $(DEMO) && mkdir $(DEMO)
 	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording --log-dir $(DEMO)/log
-	$(BIN)/body_tracking show $(DEMO)/recording --output $(DEMO)/joint_angles.png
+	$(BIN)/body_tracking show $(DEMO)/recording --truth $(DEMO_BAG) --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
 
-# The tests that compute share the cores; then those that start processes and mostly wait for them; and one at a time
-# those that say how soon something happens.
-test: lint ## formatting, lint, types and all tests
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not processes" --numprocesses 2 --dist loadfile
-	$(BIN)/python -m pytest -m "processes and not alone" --numprocesses 2 --dist loadfile
-	$(BIN)/python -m pytest -m alone
+# The tests that compute share the cores, and lint runs besides; then those that start processes and mostly wait for
+# them; and one at a time those that say how soon something happens. All of it runs, whatever fails. What test/ros2 needs
+# is made before, and is no time of the tests.
+test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
+	@$(call tests,not slow)
+
+test-all: export TEST_DRAWS = all
+test-all: $(STAMP) ## the same with the longer draws and recordings, in half an hour
+	@$(call tests,slow or not slow)
+
+define tests
+failed=; $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspace of ros2"; export TEST_ROS2=failed; }; \
+$(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
+phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
+phase "tests that compute" -m "($(1)) and not processes" --numprocesses 2 --dist worksteal; \
+phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 3 --dist loadscope; \
+phase "tests of time" -m "($(1)) and alone"; \
+echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
+[ -z "$$failed" ] || { echo "make: failed:$${failed#,}" >&2; exit 1; }
+endef
 
 lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+
+# Two minutes the first time; a step of its own, since it would count as time of the tests that need it.
+ros2-workspace: ## the real ros2 for test/ros2, where its sources are present
+	@test/ros2/workspace || [ $$? = 77 ]
 
 bench: $(STAMP) ## every benchmark, one after the other; fails at the end where one missed its bar (two hours)
 	@data=$${BODY_TRACKING_DATA:-../shared/data}; missed=; \
@@ -79,6 +97,7 @@ bench: $(STAMP) ## every benchmark, one after the other; fails at the end where 
 	run benchmarks/thesis.py; \
 	run benchmarks/honesty.py --runs 40; \
 	run benchmarks/robustness.py --runs 100; \
+	run benchmarks/ablation.py --seeds 1 --layouts 2,4; \
 	with kinect_pairs benchmarks/real_pairs.py; \
 	with kinect_pairs benchmarks/real_people.py; \
 	with kinect_pairs benchmarks/simulated_pairs.py; \
@@ -100,5 +119,5 @@ docs: $(STAMP) ## rewrite what the code defines: tables of README.md, config/
 	$(BIN)/python docs/update.py
 
 clean: ## remove everything that make and colcon made
-	rm -rf $(VENV) $(DEMO) build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

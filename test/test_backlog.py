@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from body_tracking.backlog import AT_ONCE, INTERVAL, TARGET, Backlog, Sequences
+from body_tracking.backlog import AT_ONCE, INTERVAL, MAX_AGE, TARGET, Backlog, Sequences, Standstill
 from body_tracking.skeleton import NANOSECONDS
 
 PERIOD_NS = NANOSECONDS // 30
@@ -86,3 +86,39 @@ def test_lost_messages_are_counted_by_their_numbers() -> None:
     for number in (1, 2, 100_000, 3, 100_001, 4, 100_003):
         sequences.note("one", number)
     assert sequences.lost == {"one": 3}
+
+
+def test_two_publishers_that_take_turns_are_noticed_and_a_restarted_one_once() -> None:
+    sequences = Sequences()
+    for number in (5, 6, 9, 10, 1, 2, 3):
+        sequences.note("one", number)
+    assert sequences.switched["one"] == 1
+    for first, second in zip(range(1000, 1100), range(5, 105), strict=True):
+        sequences.note("two", first)
+        sequences.note("two", second)
+    assert sequences.switched["two"] == 100
+    for number in (7, 7, 8, 8, 9, 9):  # of the same age
+        sequences.note("three", number)
+    assert sequences.switched["three"] == 3
+    for _ in range(3):
+        sequences.note("four", 2**64 - 1)  # a middleware that gives no numbers
+    assert sequences.switched["four"] == sequences.lost["four"] == 0
+
+
+@pytest.mark.parametrize("stood_s", [0.5, 2.0, 60.0])
+def test_after_a_standstill_what_was_sent_before_is_left_out_and_nothing_else(stood_s: float) -> None:
+    standstill, now_ns = Standstill(), 10**18
+    for _ in range(90):
+        now_ns += PERIOD_NS
+        assert not standstill.is_stale("one", now_ns - 2 * PERIOD_NS, now_ns)
+    begin_ns = now_ns
+    now_ns += round(stood_s * NANOSECONDS)
+    for sent_ns in range(begin_ns, now_ns, PERIOD_NS):
+        now_ns += 10_000
+        assert standstill.is_stale("one", sent_ns, now_ns) == (now_ns - sent_ns > MAX_AGE * NANOSECONDS)
+    assert standstill.left_out["one"] == pytest.approx((stood_s - MAX_AGE) * 30, abs=2)
+    # of another computer, whose clock is wrong
+    for _ in range(90):
+        now_ns += PERIOD_NS
+        left_out = standstill.is_stale("two", now_ns - 5 * NANOSECONDS, now_ns)
+    assert not left_out

@@ -37,12 +37,12 @@ from body_tracking.messages.model import (
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
-from body_tracking.skeleton import Skeleton
+from body_tracking.skeleton import MAX_STAMP_NS, Skeleton
 
 MODEL = UpperBody()
 CLOUD, STATES = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/JointState"
 FRAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=30)
-STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
+STAMPS = st.integers(0, MAX_STAMP_NS)
 
 
 def skeletons(seed: int, stamp_ns: int, frame_id: str, count: int, kind: int) -> list[Skeleton]:

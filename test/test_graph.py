@@ -14,10 +14,12 @@ import yaml
 
 from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
-from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.filters import FILTERS
 from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
 from body_tracking.kinematics.positional import ANGLE_NAMES
+from body_tracking.parameters import ParameterError
 from body_tracking.recording.rosbag2 import is_known
+from body_tracking.up import parameters_for
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH = ROOT / "launch" / "two_kinects.launch.py"
@@ -74,11 +76,11 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
     assert set(graph.ROLES) == set(FILTERS)
     for name, role in graph.ROLES.items():
         specs = named(nodes_for(GraphOptions(bag="bag", record="r", filter_name=name)))
+        # The angles follow what the filter publishes.
         angles = specs["joint_angles"].parameters
-        assert (angles["input"], angles["convention"]) == (role.angles_input, role.convention)
-        # A node of its own, asked for nothing, goes by the default filter.
-        if name == DEFAULT_FILTER:
-            assert graph.angles_for(graph.AUTO, graph.AUTO) == (role.convention, role.angles_input)
+        assert "input" not in angles
+        asked = str(angles.get("convention", graph.AUTO))
+        assert graph.angles_for(asked, role.angles_input) == (role.convention, role.angles_input)
         # Calibration, fusion, recorder, and the filter where it listens to sensors.
         listeners = 4 if role.input == graph.SENSORS_INPUT else 3
         wanted = specs["bag_player"].parameters["wait_for_subscribers"]
@@ -88,7 +90,11 @@ def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
         listened = (
             (graph.MODEL_STATE, graph.MODEL_COVARIANCE) if role.angles_input == "model_state" else (graph.FILTERED,)
         )
-        assert all(after[topic] == 2 for topic in listened)
+        # The recorder leaves the model's covariance out.
+        assert all(after[topic] == (1 if topic == graph.MODEL_COVARIANCE else 2) for topic in listened)
+        whole = named(nodes_for(GraphOptions(bag="bag", record="r", record_covariance=True, filter_name=name)))
+        assert whole["bag_recorder"].parameters["model_covariance"] is True
+        assert all(whole["bag_player"].after[topic] == 2 for topic in listened)
         assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
 
 
@@ -113,6 +119,27 @@ def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path
     assert graph.with_file(GraphOptions(), file).bodies == graph.bodies(4)
     assert graph.with_file(GraphOptions(subject="first", people=3), file).people == 3
     assert graph.with_file(GraphOptions(subject="first"), file).bodies == ()
+
+
+def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="ROS is not installed")
+    file = tmp_path / "parameters.yaml"
+    file.write_text(
+        "/lab/fusion: {ros__parameters: {silence: 0.3}}\n"
+        "fusion: {ros__parameters: {silence: 0.2, max_wait: 0.01}}\n"
+        "skeleton_filter: {ros__parameters: {filter: ekf}}\n"
+        "/**: {ros__parameters: {silence: 0.1, gate: 4.0}}\n"
+    )
+    for namespace, prefix in (("/", "/"), ("/lab", "/lab/")):
+        options = graph.with_file(GraphOptions(namespace=namespace), file)
+        assert options.filter_name == "ekf"
+        assert {spec.full_name for spec in nodes_for(options)} == {
+            f"{prefix}{spec.name}" for spec in nodes_for(options)
+        }
+    found = parameters_for(nodes_for(options), file)["fusion"]
+    assert [found[name] for name in ("silence", "max_wait", "gate")] == [0.3, 0.01, 4.0]
+    with pytest.raises(ParameterError, match="/lab/fusion: no such node"):
+        parameters_for(nodes_for(GraphOptions()), file)
 
 
 def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
@@ -144,6 +171,22 @@ def test_a_bag_waits_for_those_who_show_it_and_a_page_has_a_recorder_for_its_but
     assert recorded.parameters == {"folder": "r", "use_sim_time": False}
 
 
+def test_whether_the_covariance_is_recorded_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/bag_recorder: {ros__parameters: {model_covariance: true}}\n")
+    assert graph.with_file(GraphOptions(), file).record_covariance
+    assert not graph.with_file(GraphOptions(), None).record_covariance
+    assert graph.with_file(GraphOptions(record_covariance=True), None).record_covariance
+
+
+def test_covariances_of_models_are_known_among_topics_in_every_namespace() -> None:
+    topics = [graph.model_topics("body1"), graph.model_topics("body2", several=True)]
+    for namespace in ("", "/lab", "/lab/left"):
+        for each in topics:
+            assert graph.is_model_covariance(f"{namespace}{each.covariance}")
+            assert not any(map(graph.is_model_covariance, (each.state, each.stddev, each.segments, each.urdf)))
+
+
 def test_persons_are_found_among_topics() -> None:
     topics = ["/humans/bodies/b/joint_states", "/humans/bodies/a/joint_states", "/humans/bodies/a/joint_states_stddev"]
     assert graph.bodies_among(topics) == ("a", "b")
@@ -151,7 +194,8 @@ def test_persons_are_found_among_topics() -> None:
 
 def test_angles_of_positions_need_no_model() -> None:
     options = GraphOptions(filter_name="ekf", convention="positional")
-    assert named(nodes_for(options))["joint_angles"].parameters["input"] == "skeleton"
+    assert named(nodes_for(options))["joint_angles"].parameters["convention"] == "positional"
+    assert named(nodes_for(options))["kinect1_skeleton"].after[graph.FILTERED] == 1
     assert graph.angles_for("positional", "model_state") == ("positional", "skeleton")
     assert graph.angles_for(graph.AUTO, "model_state") == ("model", "model_state")
 

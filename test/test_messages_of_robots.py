@@ -45,8 +45,12 @@ def test_what_does_not_go_together_is_refused(types: MessageTypes) -> None:
             setattr(deviations, name, value)
         return values, deviations
 
-    with pytest.raises(MessageError, match="other names or stamps"):
+    with pytest.raises(MessageError, match="other names, stamps or frames"):
         joint_states_to_angles(*pair(name=["elbow_flexion_left_body1"]), "body1")
+    values, _ = pair()
+    _, deviations = angles_to_joint_states(ANGLES, "body1", "isb", types)
+    with pytest.raises(MessageError, match="other names, stamps or frames"):
+        joint_states_to_angles(values, deviations, "body1")
     with pytest.raises(MessageError, match="does not end in _body2"):
         joint_states_to_angles(*pair(), "body2")
     with pytest.raises(MessageError, match="2, 2, 0, 2 numbers of 2 names"):

@@ -59,7 +59,7 @@ def files_under(folder: Path) -> set[str]:
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the project as a clone would be, so that builds leave nothing in the real one."""
     copy = tmp_path_factory.mktemp("workspace") / "src" / "body_tracking"
-    wanted = ("body_tracking", "resource", *SHARED_FOLDERS)
+    wanted = ("body_tracking", "resource", "scripts", *SHARED_FOLDERS)
     skip = shutil.ignore_patterns("__pycache__", "*.pyc")
     for folder in wanted:
         if (ROOT / folder).is_dir():
@@ -213,9 +213,17 @@ def test_installed_nodes_load_from_the_install_prefix(prefix: Path, node_names: 
     assert all(line.startswith(str(prefix)) and line.endswith("True") for line in loaded), loaded
 
 
-def test_installed_command_runs(prefix: Path) -> None:
-    out = in_workspace(prefix, f'"{prefix}/lib/body_tracking/body_tracking" --help')
-    assert {"import", "replay", "up", "calibrate"} <= set(re.findall(r"\w+", out))
+def test_commands_are_on_the_path_of_a_sourced_workspace(prefix: Path) -> None:
+    out = in_workspace(
+        prefix, "command -v body_tracking && command -v kinect_sender && body_tracking --help && kinect_sender --help"
+    )
+    assert out.splitlines()[:2] == [str(prefix / "bin" / name) for name in ("body_tracking", "kinect_sender")]
+    assert {"import", "replay", "up", "calibrate", "HOST"} <= set(re.findall(r"\w+", out))
+
+
+def test_pips_own_commands_are_the_only_ones_in_a_wheel(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        assert not [name for name in archive.namelist() if ".data/data/bin/" in name]
 
 
 # --- make and CI

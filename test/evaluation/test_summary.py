@@ -18,7 +18,9 @@ from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
+from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter
+from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import N_JOINTS, Skeleton, TrackingState
@@ -65,6 +67,19 @@ def series(values: list[float], stddev: list[float], name: str = "knee") -> Angl
     return AngleSeries(stamps, (name,), np.radians(values)[:, None], np.radians(stddev)[:, None])
 
 
+def bare(folder: Path) -> Path:
+    """A bag of angles without deviations, skeletons or truth."""
+    topic = "/humans/bodies/body1/joint_states"
+    rng = np.random.default_rng(0)
+    with BagWriter(folder) as bag:
+        bag.add_topic(topic, JOINT_STATE)
+        for k in range(5):
+            states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+            angles = positional_angles(Skeleton(1 + k, "world", rng.normal(size=(N_JOINTS, 3)), states))
+            bag.write_message(topic, angles_to_joint_states(angles, "body1", "world", BAG_MESSAGES)[0], 1 + k)
+    return folder
+
+
 def test_a_summary_leaves_out_what_is_unknown() -> None:
     (row,) = summaries(series([10.0, 170.0, 30.0, 20.0], [1.0, np.inf, 2.0, 3.0]))
     assert (row.min, row.max, row.last) == pytest.approx((10.0, 30.0, 20.0))
@@ -104,15 +119,7 @@ def test_a_bag_becomes_a_table_and_a_picture(tracked_bag: Path, tmp_path: Path) 
 
 
 def test_a_bag_without_truth_or_skeletons_is_shown_all_the_same(tmp_path: Path) -> None:
-    folder, topic = tmp_path / "bare", "/humans/bodies/body1/joint_states"
-    rng = np.random.default_rng(0)
-    with BagWriter(folder) as bag:
-        bag.add_topic(topic, JOINT_STATE)
-        for k in range(5):
-            states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-            angles = positional_angles(Skeleton(1 + k, "world", rng.normal(size=(N_JOINTS, 3)), states))
-            bag.write_message(topic, angles_to_joint_states(angles, "body1", "world", BAG_MESSAGES)[0], 1 + k)
-    rows = summarise(folder, tmp_path / "bare.png")
+    rows = summarise(bare(tmp_path / "bare"), tmp_path / "bare.png")
     assert all(row.known == 0.0 and np.isinf(row.stddev) for row in rows)
     assert (tmp_path / "bare.png").read_bytes().startswith(PNG)
 
@@ -135,3 +142,14 @@ def test_the_command_prints_the_table(tracked_bag: Path, tmp_path: Path, capsys:
     assert all(name in shown for name in ANGLE_NAMES) and "wave.png" in shown and "rms err" in shown
     assert main(["show", str(BAGS / "tpose_wave")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_truth_may_be_in_the_bag_that_was_played(tmp_path: Path) -> None:
+    """Recordings of the live graph hold angles, not what a simulation knew."""
+    replay(BAGS / "tpose_wave", tmp_path / "out", ReplaySettings(()))
+    rows = summarise(tmp_path / "out", truth=BAGS / "tpose_wave")
+    assert rows == summarise(tmp_path / "out")  # replay takes the truth along
+    elbow = next(row for row in rows if row.name == "elbow_flexion_left")
+    assert elbow.rms_error < elbow.max_error and elbow.true_min < 30.0 and elbow.true_max > 80.0
+    with pytest.raises(EvaluationError, match="holds no truth"):
+        summarise(tmp_path / "out", truth=bare(tmp_path / "bare"))

@@ -92,6 +92,7 @@ def feed(
     parameters: TrackingParameters | None = None,
     meddle: Callable[[float, InertialTracker, ImuSample], ImuSample] | None = None,
     camera_stddev: float | None = None,
+    seconds: float = np.inf,
 ) -> Fed:
     """All readings and frames in the order of receipt; the camera's truly placed.
 
@@ -101,6 +102,7 @@ def feed(
             orientations.
         meddle: what becomes of a reading, at seconds from the beginning.
         camera_stddev: metres, of a camera with white noise in the place of the simulated one.
+        seconds: how much of the recording is fed.
     """
     stated = tuple(imu.name for imu, _ in recording.imus)
     tracker = InertialTracker(
@@ -133,6 +135,8 @@ def feed(
     begin = events[0][0]
     for received_ns, name, what in events:
         now = (received_ns - begin) / NANOSECONDS
+        if now > seconds:
+            break
         if isinstance(what, Skeleton):
             tracker.see(what, received_ns)
         else:

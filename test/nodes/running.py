@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from node_process import NodeProcess
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
@@ -23,6 +24,7 @@ from std_srvs.srv import Trigger
 from body_tracking.graph import PARENT_VARIABLE
 from body_tracking.messages.diagnostics import statuses
 from domains import domain
+from spinning import spin_until
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -37,7 +39,7 @@ def environment() -> dict[str, str]:
     }
 
 
-def stop(process: subprocess.Popen[Any]) -> int:
+def stop(process: subprocess.Popen[Any] | NodeProcess) -> int:
     """End a process as Ctrl-C does; its exit code. One that does not end prints where it is."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
@@ -49,13 +51,22 @@ def stop(process: subprocess.Popen[Any]) -> int:
         raise
 
 
+def refusal(folder: Path, executable: str, *arguments: str) -> str:
+    """The one line in which a node says why it does not start."""
+    process = NodeProcess(executable, ["--ros-args", *arguments], folder / "refusal.log", environment())
+    assert process.wait(60.0) == 2, process.output()
+    (line,) = process.output().splitlines()
+    assert line.startswith(f"{executable}: ")
+    return line
+
+
 class Running:
     """Processes and a node."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.environment = environment()
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.processes: dict[str, subprocess.Popen[bytes] | NodeProcess] = {}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=int(self.environment["ROS_DOMAIN_ID"]))
@@ -76,23 +87,32 @@ class Running:
             except subprocess.TimeoutExpired as error:
                 error.add_note(self.log(name))
                 raise
+        # else publishers of this node would be there still when the domain's turn comes again
+        self.executor.shutdown()
+        self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in statuses(message):
             self.diagnostics[status.node] = {**status.values, "": status.text}
 
-    def start(self, executable: str, **parameters: object) -> subprocess.Popen[bytes]:
-        """Start a node; its output goes to a file."""
-        arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+    def start(self, executable: str, name: str = "", **parameters: object) -> NodeProcess:
+        """Start a node, under another name where one is given; its output goes to a file."""
+        words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+        if name:
+            words = ["-r", f"__node:={name}", *words]
+        log = self.folder / f"{name or executable}.log"
+        process = NodeProcess(executable, ["--ros-args", *words], log, self.environment)
+        self.processes[name or executable] = process
+        return process
+
+    def start_interpreter(self, executable: str, **parameters: object) -> subprocess.Popen[bytes]:
+        """Start a node that imports for itself, where what is installed is another."""
+        words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+        command = [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *words]
+        variables = {**self.environment, PARENT_VARIABLE: str(os.getpid())}  # no node outlives the tests
         with (self.folder / f"{executable}.log").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *arguments],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                # whatever happens to the tests, no node stays to be heard by others
-                env={**self.environment, PARENT_VARIABLE: str(os.getpid())},
-            )
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=variables)
         self.processes[executable] = process
         return process
 
@@ -148,12 +168,7 @@ class Running:
 
     def until(self, condition: Callable[[], object], timeout: float = 20.0) -> bool:
         """Spin until something is so; whether it became so in time."""
-        end = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > end:
-                return False
-            self.executor.spin_once(timeout_sec=0.05)
-        return True
+        return spin_until(self.executor, condition, timeout)
 
     def collect(self, kind: type[Any], topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """A list into which the messages of a topic come."""

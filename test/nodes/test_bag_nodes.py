@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -19,6 +16,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from nav_msgs.msg import Goals  # noqa: E402
+from node_process import NodeProcess  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
@@ -29,6 +27,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from body_tracking.graph import MODEL_COVARIANCE  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize, serialize  # noqa: E402
@@ -94,7 +93,7 @@ class Bench:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain()))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self.folder = folder
-        self.processes: list[subprocess.Popen[str]] = []
+        self.processes: list[NodeProcess] = []
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = Node("bench", context=self.context)
@@ -107,19 +106,17 @@ class Bench:
         environment: dict[str, str] | None = None,
         file_size_limit: int | None = None,
         **parameters: Any,
-    ) -> subprocess.Popen[str]:
+    ) -> NodeProcess:
         """Start a node."""
         arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={_text(value)}")]
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"body_tracking.nodes.{executable}", "--ros-args", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            cwd=self.folder,
-            env={**os.environ, **(environment or {})},
-            preexec_fn=None
-            if file_size_limit is None
-            else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_size_limit, resource.RLIM_INFINITY)),
+        log = self.folder / f"{executable}{len(self.processes)}.log"
+        process = NodeProcess(
+            executable,
+            ["--ros-args", *arguments],
+            log,
+            {**os.environ, **(environment or {})},
+            self.folder,
+            file_size_limit,
         )
         self.processes.append(process)
         return process
@@ -153,22 +150,20 @@ class Bench:
     def trigger(self, name: str) -> Any:
         return self.call(Trigger, name, Trigger.Request())
 
-    def wait_for(self, process: subprocess.Popen[str], seconds: float = 30.0) -> str:
+    def wait_for(self, process: NodeProcess, seconds: float = 30.0) -> str:
         """The output of a process that ends by itself, properly."""
-        output, _ = process.communicate(timeout=seconds)
-        assert process.returncode == 0, output
-        return output
+        assert process.wait(seconds) == 0, process.output()
+        return process.output()
 
-    def stop(self, process: subprocess.Popen[str], how: signal.Signals = signal.SIGINT) -> str:
+    def stop(self, process: NodeProcess, how: signal.Signals = signal.SIGINT) -> str:
         """End a process as a user does."""
         process.send_signal(how)
         return self.wait_for(process)
 
     def close(self) -> None:
         for process in self.processes:
-            if process.poll() is None:
-                process.kill()
-            process.communicate()
+            process.kill()
+            process.wait(30.0)
         self.executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
@@ -341,7 +336,8 @@ def test_what_cannot_be_played_is_one_line(bench, tmp_path, parameters, text):
     write_bag(tmp_path / "bag", 9)
     (tmp_path / "empty.mcap").touch()
     process = bench.run("bag_player", **parameters)
-    output, _ = process.communicate(timeout=30)
+    process.wait(30.0)
+    output = process.output()
     assert process.returncode == 2 and text in output and len(output.strip().splitlines()) == 1, output
 
 
@@ -422,6 +418,20 @@ def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
     with BagReader(folder) as reader:
         # What is there by itself (all but /clock, /rosout, /parameter_events) was recorded too.
         assert "/talk" in reader.topics and "/diagnostics" in reader.topics and "/rosout" not in reader.topics
+
+
+@pytest.mark.parametrize(
+    "parameters", [{}, {"model_covariance": True}, {"topics": (MODEL_COVARIANCE, "/talk")}], ids=str
+)
+def test_the_covariance_of_a_model_is_recorded_only_where_asked_for(bench, tmp_path, parameters):
+    publishers = [bench.node.create_publisher(String, topic, RELIABLE_QOS) for topic in (MODEL_COVARIANCE, "/talk")]
+    bench.node.create_timer(0.01, lambda: [publisher.publish(String(data="x")) for publisher in publishers])
+    recorder = bench.run("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.05, **parameters)
+    bench.until(lambda: (tmp_path / "bag").exists(), "a bag")
+    bench.until(lambda: len(of_topic(read_bag(tmp_path / "bag"), "/talk")) > 30, "the other topic")
+    bench.stop(recorder)
+    with BagReader(tmp_path / "bag") as reader:
+        assert (MODEL_COVARIANCE in reader.topics) == bool(parameters)
 
 
 def test_a_type_that_is_not_known_is_counted_and_the_rest_recorded(bench, tmp_path):

@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from body_tracking import graph
+from body_tracking.kinematics.tracking import angle_names
 from body_tracking.parameters import ParameterError
 
 BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_wave"
@@ -161,6 +162,38 @@ def test_the_calibration_warns_by_another_limit(running: Graph) -> None:
     assert running.until(lambda: "roughly calibrated" in running.diagnostics["calibration"][""])
     assert running.set("calibration", max_rotation_stddev=0.05) == [(True, "")]
     assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated")
+
+
+def test_the_angles_follow_the_filter(running: Graph) -> None:
+    """To the state of a model where the filter has one, and back to skeletons."""
+    for name, convention in (("ekf", "model"), ("lkf_zero_velocity", "positional"), ("ekf", "model")):
+        first = f"{angle_names(convention)[1]}_body1"
+        assert running.set("skeleton_filter", filter=name) == [(True, "")]
+        assert running.until(lambda first=first: running.angles and first in running.angles[-1].name, 60.0), (
+            name,
+            running.diagnostics["joint_angles"],
+        )
+
+
+def test_another_convention_holds_for_every_filter(running: Graph) -> None:
+    assert running.set("joint_angles", convention="isb") == [(True, "")]
+    for name, source in (("lkf_constant_velocity", "skeleton"), ("ekf", "model_state")):
+        assert running.set("skeleton_filter", filter=name) == [(True, "")]
+        assert running.until(lambda s=source: running.diagnostics["joint_angles"][""] == f"isb angles of {s}", 60.0)
+        running.angles.clear()
+        assert running.until(lambda: running.angles and "thorax_extension_body1" in running.angles[-1].name, 60.0)
+    assert running.set("joint_angles", convention="auto") == [(True, "")]
+
+
+def test_an_input_that_the_filter_does_not_publish_is_reported(running: Graph) -> None:
+    assert running.set("skeleton_filter", filter="lkf_zero_velocity") == [(True, "")]
+    assert running.set("joint_angles", input="model_state") == [(True, "")]
+    assert running.until(
+        lambda: "no filter publishes /filtered/model_covariance" in running.diagnostics["joint_angles"][""]
+    )
+    assert running.set("joint_angles", input="auto") == [(True, "")]
+    running.angles.clear()
+    assert running.until(lambda: running.angles, 60.0)
 
 
 def test_filter_and_angles_become_others(running: Graph) -> None:

@@ -305,6 +305,7 @@ def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> 
     tracking.cut_short()
     # With the poses that the filter had before: they do not come again.
     assert tracking.play_until(lambda: tracking.angles and "waist_body1" in tracking.angles[-1].name)
+    assert tracking.angles[-1].header.frame_id == "rep155"  # so that a subscriber can tell
     # A linear filter takes what the fusion makes; nobody makes anything here.
     linear = ParameterValue(type=4, string_value="lkf_constant_velocity")
     assert tracking.set_parameter("skeleton_filter", "filter", linear)[0]

@@ -20,7 +20,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from running import RELIABLE, Running, environment, stop  # noqa: E402
+from running import RELIABLE, Running, environment, refusal, stop  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -70,34 +70,19 @@ def recorded(sensor: str) -> list[Skeleton]:
         ("bag_recorder", "chunk_seconds:=-1.0", "parameter 'chunk_seconds'"),
     ],
 )
-def test_a_node_refuses_a_bad_parameter_in_one_line(executable: str, parameter: str, said: str) -> None:
-    command = [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", "-p", parameter]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=30, env=environment())
-    lines = result.stderr.strip().splitlines()
-    assert result.returncode == 2
-    assert len(lines) == 1
-    assert lines[0].startswith(f"{executable}: ")
-    assert said in lines[0]
+def test_a_node_refuses_a_bad_parameter_in_one_line(tmp_path: Path, executable: str, parameter: str, said: str) -> None:
+    assert said in refusal(tmp_path, executable, "-p", parameter)
 
 
 def test_a_section_for_all_nodes_may_hold_what_only_some_know(tmp_path: Path) -> None:
-    def run(name: str) -> subprocess.CompletedProcess[str]:
+    def reason(name: str) -> str:
         file = tmp_path / f"{name}.yaml"
         file.write_text(f"/**:\n  ros__parameters:\n    {name}: map\n")
-        command = [
-            sys.executable,
-            "-m",
-            "body_tracking.nodes",
-            "kinect_skeleton",
-            "--ros-args",
-            "--params-file",
-            str(file),
-        ]
-        return subprocess.run(command, capture_output=True, text=True, timeout=30, env=environment())
+        return refusal(tmp_path, "kinect_skeleton", "--params-file", str(file))
 
     # The node gets past its parameters, to the recording that it was not given.
-    assert "needs the parameter 'file'" in run("world_frame").stderr
-    assert "unknown parameter 'wurld_frame'" in run("wurld_frame").stderr
+    assert "needs the parameter 'file'" in reason("world_frame")
+    assert "unknown parameter 'wurld_frame'" in reason("wurld_frame")
 
 
 # --- messages
@@ -232,7 +217,7 @@ def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Runni
     elbow = angles[-1].name.index("elbow_flexion_left_body1")
     assert np.isfinite(angles[-1].position[elbow])
     assert 0.0 < stddevs[-1].position[elbow] < 1.0
-    assert angles[-1].header.frame_id == "world"
+    assert angles[-1].header.frame_id == stddevs[-1].header.frame_id == "positional"
     assert to_nanoseconds(angles[0].header.stamp) == start  # the capture time, to the nanosecond
 
     send(start + 20 * FRAME_NS, unseen=True)
@@ -366,7 +351,7 @@ def installed(folder: Path, entry: str) -> dict[str, str]:
 def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Camera")
-        process = running.start("kinect_skeleton", backend="mine")
+        process = running.start_interpreter("kinect_skeleton", backend="mine")
         told = "OSError: the cable was pulled"
         assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == told, 60.0)
         assert running.diagnostics["kinect_skeleton"]["published"] == "3"
@@ -378,7 +363,7 @@ def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Pa
 def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Mute")
-        process = running.start("kinect_skeleton", backend="mine")
+        process = running.start_interpreter("kinect_skeleton", backend="mine")
         assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("published") == "3", 60.0)
         assert running.diagnostics["kinect_skeleton"][""] == "streaming; counters: KeyError: 'temperature'"
         assert "in counters" in running.log("kinect_skeleton")
@@ -392,7 +377,7 @@ def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
 ) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, entry)
-        assert running.start("kinect_skeleton", backend="mine").wait(60.0) == 2
+        assert running.start_interpreter("kinect_skeleton", backend="mine").wait(60.0) == 2
         (line,) = running.log("kinect_skeleton").splitlines()
         assert line.startswith("kinect_skeleton: backend 'mine': ")
         assert said in line

@@ -21,6 +21,7 @@ from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.sensors.mvnx import MvnxRecording
 from body_tracking.skeleton import JOINT_NAMES, Skeleton
+from draws import some
 
 COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
 
@@ -53,7 +54,7 @@ def write_ntu(path: Path, n_frames: int) -> Path:
 
 
 def test_the_real_pairs_are_imported_as_they_are(shared_data, tmp_path):
-    for path in sorted((shared_data / "kinect_pairs").glob("p*.csv.gz")):
+    for path in some(sorted((shared_data / "kinect_pairs").glob("p*.csv.gz")), 2):
         with gzip.open(path, "rt") as file:
             rows = list(csv.DictReader(file))
         report = import_files([path], tmp_path / path.name)
@@ -136,15 +137,10 @@ def test_a_bad_file_leaves_no_bag_and_costs_none(tmp_path):
     assert len(skeletons(tmp_path / "bag")["/kinect1/skeleton"]) == 3000
 
 
-def test_receipt_before_time_0_is_refused(tmp_path):
-    with pytest.raises(BodyTrackingError, match="-500000000 ns"):
-        import_files([write_csv(tmp_path / "a.csv", [{"stamp": 1, "received": -0.5}])], tmp_path / "bag")
-
-
-def test_a_negative_stamp_is_kept(tmp_path):
-    import_files([write_csv(tmp_path / "a.csv", [{"stamp": -1.5, "received": 0}])], tmp_path / "bag")
-    ((at, (body,)),) = skeletons(tmp_path / "bag")["/kinect1/skeleton"]
-    assert (at, body.stamp_ns) == (0, -1_500_000_000)
+def test_a_stamp_or_receipt_before_time_0_is_refused(tmp_path):
+    for row in ({"stamp": 1, "received": -0.5}, {"stamp": -1.5, "received": 0}):
+        with pytest.raises(BodyTrackingError, match=r"line 2: .* is not a time in seconds"):
+            import_files([write_csv(tmp_path / "a.csv", [row])], tmp_path / "bag")
 
 
 # --- the command

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
+import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from body_tracking import cli, graph
@@ -32,6 +37,7 @@ from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from draws import some
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
@@ -54,14 +60,21 @@ def seconds() -> float:
         return (bag.end_ns - bag.start_ns) / NANOSECONDS
 
 
-def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "body_tracking.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs a command in this process; its exit code, and what it printed."""
+
+    def run(*arguments: str | Path) -> tuple[int, str, str]:
+        try:
+            code = cli.main([str(word) for word in arguments])
+        except SystemExit as end:  # of argparse
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +100,7 @@ def test_the_same_bag_gives_the_same_messages(replayed: Path, tmp_path: Path) ->
     assert contents(tmp_path / "again") == contents(replayed)
 
 
-@pytest.mark.parametrize("filter_name", [DEFAULT_FILTER, "ekf"])
+@pytest.mark.parametrize("filter_name", some([DEFAULT_FILTER, "ekf"]))
 def test_one_process_and_two_give_the_same_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
 ) -> None:
@@ -146,7 +159,7 @@ def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytes
         stage.finish()
 
 
-MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.MODEL_COVARIANCE, graph.segments_topic("body1"))
+MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.segments_topic("body1"))
 
 
 @pytest.fixture(scope="module")
@@ -160,18 +173,30 @@ def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed: Pa
     with BagReader(extended) as bag, BagReader(replayed) as linear:
         counts = {topic: info.count for topic, info in bag.topics.items()}
         assert not set(MODEL_TOPICS) & set(linear.topics)
+        assert graph.MODEL_COVARIANCE not in bag.topics
         first = deserialize(JOINT_STATE, next(iter(bag.messages([ANGLES]))).cdr)
         frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
     for topic in (*MODEL_TOPICS, ANGLES, f"{ANGLES}_stddev"):
         assert counts[topic] == counts["/filtered/skeleton"] > reference_frames()
     assert 1 <= counts[graph.urdf_topic("body1")] <= 1 + seconds()  # at most once a second
     assert tuple(first.name) == tuple(f"{name}_body1" for name in convention("isb", UpperBody()).names)
+    assert first.header.frame_id == "isb"
     # Two sensors out of step, each frame at its own time: more than the reference sensor has, and in order.
     stamps = np.array([each.stamp_ns for each in frames])
     assert (np.diff(stamps) > 0).all()
 
 
-@pytest.mark.parametrize("filter_name", ["lkf_constant_velocity", "schlagenhauf_ekf"])
+def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else_changes(
+    extended: Path, tmp_path: Path
+) -> None:
+    settings = ReplaySettings((), filter_name="ekf", convention="isb", model_covariance=True)
+    report = replay(BAG, tmp_path / "whole", settings)
+    whole = contents(tmp_path / "whole")
+    assert sum(raw.topic == graph.MODEL_COVARIANCE for raw in whole) == report.frames
+    assert [raw for raw in whole if raw.topic != graph.MODEL_COVARIANCE] == contents(extended)
+
+
+@pytest.mark.parametrize("filter_name", some(["schlagenhauf_ekf", "lkf_constant_velocity"]))
 def test_every_filter_gives_the_angles_of_a_model(tmp_path: Path, filter_name: str) -> None:
     report = replay(BAG, tmp_path / "out", ReplaySettings((), filter_name=filter_name, convention="model"))
     with BagReader(tmp_path / "out") as bag:
@@ -197,6 +222,8 @@ def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Pa
         for raw in bag.messages(topics):
             if not start <= raw.log_time_ns < end:
                 writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+            if raw.log_time_ns > end + 2 * NANOSECONDS:
+                break
     report = replay(tmp_path / "gap", tmp_path / "out", ReplaySettings((), filter_name="ekf"))
     with BagReader(tmp_path / "out") as bag:
         frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
@@ -237,20 +264,23 @@ def test_the_angles_follow_the_truth(replayed: Path, tmp_path: Path) -> None:
         assert np.corrcoef(found[known], truth[known])[0, 1] > 0.8
 
 
-def test_the_command_ends_with_what_it_did(tmp_path: Path) -> None:
-    done = command("replay", BAG, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
+def test_the_command_ends_with_what_it_did(tmp_path: Path, command: Command) -> None:
+    words = ("replay", BAG, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
+    done = subprocess.run(
+        [sys.executable, "-m", "body_tracking.cli", *map(str, words)], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["frames"] > 0.9 * reference_frames()
     assert report["recording_s"] == pytest.approx(seconds(), abs=0.1)
     assert 0.0 < report["elapsed_s"] < 60.0
-    again = command("replay", BAG, "-o", tmp_path / "out")
-    assert again.returncode == 2
-    assert again.stderr.count("\n") == 1
-    assert command("replay", BAG, "-o", tmp_path / "out", "--overwrite").returncode == 0
+    code, _, error = command("replay", BAG, "-o", tmp_path / "out")
+    assert code == 2
+    assert error.count("\n") == 1
+    assert command("replay", BAG, "-o", tmp_path / "out", "--overwrite")[0] == 0
 
 
-def test_calibrate_prints_poses_and_clocks(tmp_path: Path) -> None:
+def test_calibrate_prints_poses_and_clocks(tmp_path: Path, command: Command) -> None:
     with BagReader(BAG) as bag:
         transforms = [deserialize(TRANSFORM, raw.cdr) for raw in bag.messages([graph.TRUE_CALIBRATION])]
         references = [deserialize(TIME_REFERENCE, raw.cdr) for raw in bag.messages([graph.TRUE_CLOCK])]
@@ -262,9 +292,9 @@ def test_calibrate_prints_poses_and_clocks(tmp_path: Path) -> None:
     ahead = true.rotation[:, 2]
     yaw_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
     for method in ("thesis", "robust"):
-        done = command("calibrate", BAG, "--method", method, "--json", "-o", tmp_path / f"{method}.yaml")
-        assert done.returncode == 0, done.stderr
-        result = json.loads(done.stdout)
+        code, out, error = command("calibrate", BAG, "--method", method, "--json", "-o", tmp_path / f"{method}.yaml")
+        assert code == 0, error
+        result = json.loads(out)
         assert result["reference"] == "kinect1"
         sensor = result["sensors"]["kinect2"]
         assert np.allclose(sensor["translation"], true.translation, atol=0.25)
@@ -272,12 +302,13 @@ def test_calibrate_prints_poses_and_clocks(tmp_path: Path) -> None:
         assert sensor["relative_yaw_deg"] == pytest.approx(yaw_deg, abs=6.0)
         assert sensor["clock_offset_s"] == pytest.approx(offset_s, abs=0.06)
         assert sensor["residual_mm"] < 100.0
-    text = command("calibrate", BAG).stdout
-    assert "kinect2: at (" in text
+    assert "kinect2: at (" in command("calibrate", BAG, "--method", "thesis")[1]
     # A saved calibration can be used from the first frame on.
-    done = command("replay", BAG, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json")
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["counters"].get("fusion uncalibrated", 0) == 0
+    code, out, error = command(
+        "replay", BAG, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json"
+    )
+    assert code == 0, error
+    assert json.loads(out)["counters"].get("fusion uncalibrated", 0) == 0
 
 
 @pytest.mark.parametrize(
@@ -289,7 +320,9 @@ def test_calibrate_prints_poses_and_clocks(tmp_path: Path) -> None:
         ("malformed", "no frame"),
     ],
 )
-def test_a_bag_without_skeletons_is_named_in_one_line(tmp_path: Path, make: str, message: str) -> None:
+def test_a_bag_without_skeletons_is_named_in_one_line(
+    tmp_path: Path, command: Command, make: str, message: str
+) -> None:
     bag = tmp_path / "bag"
     if make != "nothing":
         with BagWriter(bag) as writer:
@@ -301,11 +334,11 @@ def test_a_bag_without_skeletons_is_named_in_one_line(tmp_path: Path, make: str,
                 writer.add_topic("/kinect1/skeleton", "sensor_msgs/msg/PointCloud2")
                 writer.write("/kinect1/skeleton", b"\x00\x01\x00\x00 no such message", 1)
     for words in (("replay", bag, "-o", tmp_path / "out"), ("calibrate", bag)):
-        done = command(*words)
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
+        code, _, error = command(*words)
+        assert code == 2
+        assert error.count("\n") == 1
         if words[0] == "replay":
-            assert message in done.stderr
+            assert message in error
     assert not (tmp_path / "out").exists()
 
 
@@ -324,7 +357,69 @@ def test_a_failure_of_the_second_stage_is_told_and_leaves_no_bag(tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
-def test_parameters_are_checked_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--reference", "kinect9"), "kinect9"),
+        (("--calibration", "absent.yaml"), "absent.yaml"),
+    ],
+)
+def test_an_error_of_the_first_stage_ends_both_processes_and_leaves_no_bag(
+    tmp_path: Path, command: Command, arguments: tuple[str, str], message: str
+) -> None:
+    code, _, error = command("replay", BAG, "-o", tmp_path / "out", *arguments)
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_error_of_the_first_stage_leaves_the_bag_that_was_to_be_replaced(tmp_path: Path, replayed: Path) -> None:
+    shutil.copytree(replayed, tmp_path / "out")
+    with pytest.raises(BodyTrackingError, match="kinect9"):
+        replay(BAG, tmp_path / "out", ReplaySettings((), reference="kinect9"), overwrite=True)
+    assert contents(tmp_path / "out") == contents(replayed)
+
+
+def test_an_error_while_frames_come_ends_both_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: object, *frame: object) -> None:
+        raise ReplayError("no more")
+
+    monkeypatch.setattr(replay_module, "start_downstream", ForkedDownstream)
+    monkeypatch.setattr(stages.Upstream, "push", fail)
+    with pytest.raises(ReplayError, match="no more"):
+        replay(BAG, tmp_path / "out", ReplaySettings(()))
+    assert not (tmp_path / "out").exists()
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("victim", ["writer", "reader"])
+def test_where_one_process_is_killed_the_other_ends_and_leaves_no_bag(tmp_path: Path, victim: str) -> None:
+    out = tmp_path / "out"
+    arguments = [sys.executable, "-m", "body_tracking.cli", "replay", str(BAG), "-o", str(out)]
+    reader = psutil.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    writers: list[psutil.Process] = []
+    deadline = time.monotonic() + 60.0
+    try:
+        while not out.exists() or not writers:
+            assert time.monotonic() < deadline
+            writers = reader.children()
+            time.sleep(0.01)
+        (writers[0] if victim == "writer" else reader).kill()
+        _, said = reader.communicate(timeout=60.0)
+        while out.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        for process in (*writers, reader):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+    if victim == "writer":
+        assert reader.returncode == 2
+        assert said.count(b"\n") == 1
+
+
+def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Command) -> None:
     for text, message in (
         ("fusion: {ros__parameters: {gait: 3.0}}", "did you mean 'gate'"),
         ("calibration: {ros__parameters: {method: best}}", "method"),
@@ -336,14 +431,12 @@ def test_parameters_are_checked_before_anything_runs(tmp_path: Path, capsys: pyt
     ):
         file = tmp_path / "parameters.yaml"
         file.write_text(text)
-        arguments = ("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
-        assert cli.main([str(word) for word in arguments]) == 2
-        said = capsys.readouterr().err
+        code, _, said = command("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
+        assert code == 2
         assert message in said
         assert said.count("\n") == 1
-    assert command("replay", BAG, "-o", tmp_path / "out", "--filter", "ukf").returncode == 2
-    done = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")
-    assert "kinect7" in done.stderr
+    assert command("replay", BAG, "-o", tmp_path / "out", "--filter", "ukf")[0] == 2
+    assert "kinect7" in command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")[2]
 
 
 def test_errors_have_one_base() -> None:

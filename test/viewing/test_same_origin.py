@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import urllib.request
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from io import StringIO
@@ -67,6 +68,13 @@ def test_the_server_refuses_the_handshake_of_another_sites_page(port: int) -> No
     assert handshake(port, "https://example.com") == 403
     assert handshake(port, f"http://127.0.0.1:{port}") == 101
     assert handshake(port, None) == 101
+
+
+def test_no_page_of_another_site_may_show_it_in_a_frame(port: int) -> None:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10.0) as answer:
+        assert answer.status == 200
+        assert answer.headers["X-Frame-Options"] == "DENY"
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
 
 
 def test_what_serves_afterwards_is_not_touched() -> None:

@@ -1,0 +1,76 @@
+"""Ctrl-C ends a node with exit code 0 and without a word at every moment of its life, however often it comes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from running import Running, environment
+
+from body_tracking.executables import signals_held
+
+NODES = ("calibration", "joint_angles", "skeleton_filter", "fusion")
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Nodes that have just been started, as ``up`` and the scripts of a colcon workspace start them."""
+    processes = []
+    for name in NODES:
+        with signals_held(), (tmp_path / f"{name}.log").open("wb") as log:
+            command = [sys.executable, "-m", "body_tracking.nodes", name]
+            processes.append(subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment()))
+    yield processes
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def said(folder: Path) -> dict[str, str]:
+    """What nodes have printed that was no information."""
+    texts = {name: (folder / f"{name}.log").read_text() for name in NODES}
+    return {name: text for name, text in texts.items() if any("[INFO]" not in line for line in text.splitlines())}
+
+
+@pytest.mark.parametrize("after", [0.0, 0.05, 0.3, 0.7, 1.2, 2.0])
+def test_a_node_that_starts_ends_at_once(started: list[subprocess.Popen[bytes]], tmp_path: Path, after: float) -> None:
+    time.sleep(after)
+    for process in started:
+        process.send_signal(signal.SIGINT)
+    assert [process.wait(timeout=60.0) for process in started] == [0] * len(NODES)
+    assert not said(tmp_path)
+
+
+def test_ctrl_c_again_and_again_is_as_once(started: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
+    """From the first instruction until nothing is left of the process, shutdown of Python included."""
+    end = time.monotonic() + 60.0
+    while any(process.poll() is None for process in started):
+        assert time.monotonic() < end
+        for process in started:
+            process.send_signal(signal.SIGINT)
+        time.sleep(0.002)
+    assert [process.returncode for process in started] == [0] * len(NODES)
+    assert not said(tmp_path)
+
+
+def test_a_node_that_runs_takes_any_number_of_them(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        for name in NODES:
+            running.start(name)
+        assert running.until(lambda: set(NODES) <= running.diagnostics.keys(), 120.0)
+        end = time.monotonic() + 60.0
+        while any(process.poll() is None for process in running.processes.values()):
+            assert time.monotonic() < end
+            for process in running.processes.values():
+                process.send_signal(signal.SIGINT)
+            time.sleep(0.002)
+        assert {process.returncode for process in running.processes.values()} == {0}
+    assert not said(tmp_path)

@@ -1,0 +1,30 @@
+"""``--help`` of a node says what it is and what may be set, and starts nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from node_process import NodeProcess
+from running import environment
+
+from body_tracking import graph
+from body_tracking.parameters import check_all, read_file
+
+
+@pytest.mark.parametrize("executable", graph.EXECUTABLES)
+def test_help_ends_with_a_parameters_file_of_all_defaults(executable: str, tmp_path: Path) -> None:
+    process = NodeProcess(executable, ["--help"], tmp_path / "log", environment())
+    try:
+        assert process.wait(60.0) == 0
+    finally:
+        process.kill()
+    text, _, file = process.output().partition("as a parameters file:\n")
+    assert text.startswith(f"usage: ros2 run body_tracking {executable} ")
+    (tmp_path / "parameters.yaml").write_text(file)
+    (values,) = read_file(tmp_path / "parameters.yaml").values()
+    table = graph.parameters_of(executable)
+    assert check_all(table, values) == {parameter.name: parameter.default for parameter in table}

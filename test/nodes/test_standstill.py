@@ -1,0 +1,84 @@
+"""A node that was stopped and goes on publishes no old angles: real processes, SIGSTOP and SIGCONT."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from running import RELIABLE, Running  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from body_tracking import dds, graph  # noqa: E402
+from body_tracking.backlog import MAX_AGE  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.skeleton import NANOSECONDS  # noqa: E402
+
+BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
+STOPPED = 2.5
+"""Seconds for which a node is stopped."""
+
+
+class Live(Running):
+    """The nodes from one sensor on the network, whose stamps are ROS time, to the angles."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        # as below ``up``: over UDP, whose buffers keep what comes while a process is stopped
+        del self.environment["ROS_AUTOMATIC_DISCOVERY_RANGE"]
+        with patch.dict(os.environ, self.environment, clear=True):
+            dds.stay_on_this_machine()
+            self.environment = dict(os.environ)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        for name in ("calibration", "fusion", "skeleton_filter"):
+            self.start(name, sensors="[kinect1]")
+        self.start("joint_angles")
+        self.start("kinect_skeleton", sensor="kinect1", backend="network", port=port)
+        command = [sys.executable, "-m", "body_tracking.sensors.kinect_sender", "--loop", "--replay", str(BAG)]
+        self.processes["kinect_sender"] = subprocess.Popen(
+            [*command, "--to", f"127.0.0.1:{port}"], stderr=subprocess.DEVNULL, env=self.environment
+        )
+        self.stamps: list[tuple[int, int]] = []
+        """Capture and arrival of the angles, nanoseconds."""
+        self.node.create_subscription(JointState, graph.joint_states_topic("body1"), self.note, RELIABLE)
+
+    def note(self, angles: JointState) -> None:
+        """Angles came."""
+        self.stamps.append((to_nanoseconds(angles.header.stamp), time.time_ns()))
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    with Live(tmp_path_factory.mktemp("live")) as running:
+        assert running.until(lambda: len(running.stamps) > 30, 60.0), running.diagnostics
+        yield running
+
+
+@pytest.mark.parametrize("name", ["kinect_skeleton", "fusion", "skeleton_filter", "joint_angles"])
+def test_after_a_standstill_no_old_angles_are_published(live: Live, name: str) -> None:
+    process = live.processes[name]
+    process.send_signal(signal.SIGSTOP)
+    live.until(lambda: False, STOPPED)
+    before = live.stamps[-60:]
+    live.stamps.clear()
+    continued_ns = time.time_ns()
+    process.send_signal(signal.SIGCONT)
+    assert live.until(lambda: sum(stamp > continued_ns for stamp, _ in live.stamps) > 60, 30.0)
+    # A message is left out where it was sent so long before; to which the nodes add what they need on a busy machine.
+    undisturbed = [*before, *(each for each in live.stamps if each[0] > continued_ns)]
+    delay = max(arrival - stamp for stamp, arrival in undisturbed)
+    oldest = continued_ns - min(stamp for stamp, _ in live.stamps)
+    assert oldest / NANOSECONDS < MAX_AGE + max(0.2, delay / NANOSECONDS)
+    assert delay / NANOSECONDS < STOPPED / 2  # or the test would say nothing

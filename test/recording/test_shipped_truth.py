@@ -1,0 +1,60 @@
+"""The shipped recordings against the truth in them: what a new user sees first is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from body_tracking.evaluation.summary import Tracked, nearest, read
+from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.recording.replay import replay
+from body_tracking.recording.stages import ReplaySettings
+from body_tracking.simulation.bags import SHIPPED
+from body_tracking.skeleton import FloatArray
+from draws import some
+
+_BAGS = Path(__file__).resolve().parents[2] / "bags"
+
+
+def tracked(name: str, filter_name: str, folder: Path) -> Tracked:
+    """A shipped recording through the whole graph, offline."""
+    replay(_BAGS / name, folder / "out", ReplaySettings((), filter_name=filter_name))
+    return read(folder / "out")
+
+
+def errors(found: Tracked) -> tuple[FloatArray, FloatArray, list[str]]:
+    """(n, m) errors of the angles that the truth has, and their stated standard deviations, degrees; the names."""
+    angles, truth = found.angles, found.true_angles
+    assert truth is not None
+    names = [name for name in angles.names if name in truth.names]
+    matches = nearest(truth.stamps_ns, angles.stamps_ns)
+    here = matches >= 0
+    assert here.mean() > 0.95 and names
+    own = [angles.names.index(name) for name in names]
+    true = truth.position[matches[here]][:, [truth.names.index(name) for name in names]]
+    away = np.remainder(angles.position[here][:, own] - true + np.pi, 2.0 * np.pi) - np.pi
+    return np.degrees(away), np.degrees(angles.stddev[here][:, own]), names
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_no_angle_of_the_default_filter_is_wrong_by_what_it_does_not_say(name: str, tmp_path: Path) -> None:
+    away, stddev, names = errors(tracked(name, DEFAULT_FILTER, tmp_path))
+    known = np.isfinite(stddev)
+    assert (np.abs(away)[known] <= 3.0 * stddev[known]).all()
+    trunk = [name.startswith("trunk") for name in names]
+    assert sum(trunk) == 3
+    assert np.nanmax(np.abs(np.where(known, away, np.nan))[:, trunk]) < 25.0
+
+
+@pytest.mark.parametrize("name", some(list(SHIPPED)))
+def test_the_extended_filter_states_every_angle_and_folds_nobody(name: str, tmp_path: Path) -> None:
+    """Upright people: trunk and spine within 15 degrees RMS, and a finite deviation on all in 99 % of the frames."""
+    found = tracked(name, "ekf", tmp_path)
+    assert np.isfinite(found.angles.stddev).all(axis=1).mean() > 0.99
+    assert found.true_angles is not None
+    away, _, names = errors(found)
+    assert len(names) == len(found.angles.names)
+    trunk = [name.startswith(("trunk", "lumbar", "thoracic")) for name in names]
+    assert np.sqrt((away[:, trunk] ** 2).mean(axis=0)).max() < 15.0

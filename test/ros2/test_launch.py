@@ -1,0 +1,96 @@
+"""``ros2 launch`` as README.md says it."""
+
+from __future__ import annotations
+
+from sensor_msgs.msg import JointState
+from tools import NO_DAEMON, Tools
+
+from body_tracking import graph
+from body_tracking.names import WHOLE_DOMAIN
+from body_tracking.recording.rosbag2 import BagReader
+
+ANGLES = graph.joint_states_topic("body1")
+SOON = 60.0
+"""Seconds within which angles come, on a machine with much else to do."""
+
+
+def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhile(tools: Tools) -> None:
+    angles = tools.bench.collect(JointState, ANGLES)
+    launch = tools.launch(f"bag:={tools.bag('tpose_torso_twist')}", "record:=live", "filter:=ekf", "rate:=0.5")
+
+    def comes(convention: str) -> bool:
+        """From now on."""
+        angles.clear()
+        return tools.bench.until(lambda: [each for each in angles if each.header.frame_id == convention], SOON)
+
+    assert comes("model"), launch.text()
+    assert "lumbar_flexion_body1" in tools.ask("topic", "echo", "--once", ANGLES, NO_DAEMON, "--spin-time", "3")
+    for node, parameter, value, convention in (
+        ("/skeleton_filter", "filter", "lkf_zero_velocity", "positional"),
+        ("/skeleton_filter", "filter", "ekf", "model"),
+        ("/joint_angles", "convention", "isb", "isb"),
+    ):
+        assert "successful" in tools.ask("param", "set", node, parameter, value, NO_DAEMON, "--timeout", "20")
+        assert comes(convention), launch.text()
+    angles.clear()
+    assert not tools.bench.until(lambda: [each for each in angles if each.header.frame_id != "isb"], 1.0)
+    assert angles
+    launch.interrupt()
+    assert launch.ended() == 0, launch.text()
+    assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
+    with BagReader(tools.folder / "live") as bag:
+        assert bag.whole and bag.topics[ANGLES].count > 0
+
+
+def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools: Tools) -> None:
+    angles = tools.bench.collect(JointState, f"/lab{ANGLES}")
+    launch = tools.launch(f"bag:={tools.bag()}", "namespace:=lab", "record:=live", "rate:=1.5")
+    assert tools.bench.until(lambda: angles, SOON), launch.text()
+    names = {name for name, _ in tools.bench.node.get_topic_names_and_types()}
+    assert {f"/lab{graph.FUSED}", f"/lab{graph.FILTERED}", f"/lab{graph.CALIBRATION}"} <= names
+    assert not [name for name in names - WHOLE_DOMAIN if not name.startswith("/lab/")]
+    assert "success=True" in tools.ask("service", "call", "/lab/calibration/start", "std_srvs/srv/Trigger")
+    assert launch.ended() == 0, launch.text()
+    assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
+    with BagReader(tools.folder / "live") as bag:
+        assert bag.whole and f"/lab{ANGLES}" in bag.topics
+
+
+WRONG = {
+    ("filter:=kalman", "bag:={bag}"): "filter: invalid choice: 'kalman'",
+    ("viewer:=yes", "bag:={bag}"): "viewer:=yes: expected true or false",
+    ("sensors:=kinect1,kinect7", "bag:={bag}"): "no topic /kinect7/skeleton; its sensors are kinect1, kinect2",
+    ("bag:=nowhere",): "nowhere: no such recording",
+    (): "nothing to read: give a bag, or a parameters file",
+    ("bag:={bag}", "record:=there"): "there: exists already",
+    ("bag:={bag}", "namespace:=1st"): "1st",
+    ("bag:={bag}", "rate:=fast"): "rate: invalid float value: 'fast'",
+    ("bag:={bag}", "params_file:=nowhere.yaml"): "nowhere.yaml",
+}
+
+
+def test_wrong_values_end_it_in_one_line(tools: Tools) -> None:
+    (tools.folder / "there").mkdir()
+    (tools.folder / "there" / "file").touch()
+    launches = {
+        text: tools.launch(*(argument.format(bag=tools.bag()) for argument in arguments))
+        for arguments, text in WRONG.items()
+    }
+    for text, launch in launches.items():
+        assert launch.ended() == 1
+        lines = [line for line in launch.text().splitlines() if "[INFO]" not in line]
+        assert len(lines) == 1 and text in lines[0], lines
+
+
+def test_what_a_node_finds_wrong_ends_it_too(tools: Tools) -> None:
+    """Instead of starting the node again for ever."""
+    (tools.folder / "calibration.yaml").write_text("[" * 10)
+    launch = tools.launch(f"bag:={tools.bag()}", "calibration:=calibration.yaml")
+    assert launch.ended() == 1, launch.text()
+    assert [line for line in launch.text().splitlines() if "calibration.yaml" in line], launch.text()
+    assert "Traceback" not in launch.text()
+
+
+def test_its_arguments_are_shown(tools: Tools) -> None:
+    text = tools.ask("launch", "body_tracking", "two_kinects.launch.py", "--show-args")
+    assert "'bag':" in text and "'namespace':" in text

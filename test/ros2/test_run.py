@@ -1,0 +1,80 @@
+"""``ros2 run`` of every node at once, and every service of README.md, as somebody types them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from tools import Tool, Tools
+
+from body_tracking import graph
+from draws import some
+
+LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
+"""Nodes that do nothing without a parameter."""
+
+
+class Everybody:
+    """All nodes in one domain, each started by itself."""
+
+    def __init__(self, tools: Tools) -> None:
+        self.tools = tools
+        bag, mapping = tools.bag(), tools.share / "config" / "robots" / "iiwa7.yaml"
+        parameters: dict[str, dict[str, object]] = {
+            "kinect_skeleton": {"sensor": "kinect1", "file": bag, "loop": "true"},
+            "imu_skeleton": {"segments": "[forearm_left]"},
+            "robot_commands": {"mapping": mapping},
+            "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
+            "bag_recorder": {"folder": "recording", "start_recording": "false"},
+            "viewer": {"port": 0},
+        }
+        self.tools_of: dict[str, Tool] = {
+            executable: tools.run(executable, **parameters.get(executable, {})) for executable in graph.EXECUTABLES
+        }
+
+    def text(self) -> str:
+        """What they have printed."""
+        return "\n".join(f"{name}: {tool.text()}" for name, tool in self.tools_of.items())
+
+
+@pytest.fixture(scope="module")
+def everybody(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Everybody]:
+    with Tools(workspace, tmp_path_factory.mktemp("everybody")) as tools:
+        yield Everybody(tools)
+
+
+def test_every_node_tells_of_itself(everybody: Everybody) -> None:
+    seen = everybody.tools.bench.diagnostics
+    wanted = set(graph.EXECUTABLES)
+    assert everybody.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), everybody.text())
+
+
+def test_every_service_answers(everybody: Everybody) -> None:
+    calls = [("service", "call", f"/{name}", "std_srvs/srv/Trigger") for name, _, _ in graph.SERVICES]
+    # The recorder is to start before it stops.
+    first, later = [call for call in calls if "start" in call[2]], [call for call in calls if "start" not in call[2]]
+    for text in (*everybody.tools.all(first), *everybody.tools.all(later)):
+        answer = text.partition("response:")[2]
+        assert "success=True" in answer or ("success=False" in answer and "message=''" not in answer), text
+
+
+def test_ctrl_c_ends_every_node_in_order(everybody: Everybody) -> None:
+    assert [tool.process.poll() for tool in everybody.tools_of.values()] == [None] * len(graph.EXECUTABLES)
+    for tool in everybody.tools_of.values():
+        tool.interrupt()
+    codes = {name: tool.ended() for name, tool in everybody.tools_of.items()}
+    assert set(codes.values()) == {0}, (codes, everybody.text())
+    assert "Traceback" not in everybody.text()
+
+
+def test_what_a_node_cannot_do_without_is_said(tools: Tools) -> None:
+    for name, tool in {name: tools.run(name) for name in some(LACKING)}.items():
+        assert tool.ended() == 2
+        said, of_ros2_run = tool.text().splitlines()
+        assert said.startswith(f"{name}: ") and "exit" in of_ros2_run
+
+
+def test_help_of_nodes_and_commands(tools: Tools) -> None:
+    names = (*some(graph.EXECUTABLES), "body_tracking", "kinect_sender")
+    for text in tools.all([("run", "body_tracking", name, "--help") for name in names]):
+        assert text.startswith("usage: ")

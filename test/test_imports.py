@@ -1,0 +1,44 @@
+"""What is imported, and so how soon something starts: heavy libraries only where they are used."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+LIGHT = ("numpy", "scipy", "rclpy", "matplotlib", "rosbags")
+
+
+def loaded_by(statement: str) -> set[str]:
+    """All modules in a new Python after a statement."""
+    command = [sys.executable, "-c", f"{statement}; import json, sys; print(json.dumps(sorted(sys.modules)))"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_help_needs_none_of_the_commands() -> None:
+    loaded = loaded_by("from body_tracking import cli; cli.parser().format_help()")
+    assert loaded.isdisjoint(LIGHT)
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("up", {"scipy", "matplotlib", "rclpy"}),
+        ("nodes.graph_monitor", {"scipy", "matplotlib"}),
+        ("nodes.joint_angles", {"scipy", "matplotlib", "filterpy"}),
+        ("nodes.fusion", {"scipy.optimize", "scipy.stats", "matplotlib", "filterpy"}),
+        ("nodes.skeleton_filter", {"scipy.optimize", "scipy.stats", "matplotlib", "filterpy"}),
+        ("nodes.bag_player", {"scipy", "matplotlib"}),
+        ("nodes.bag_recorder", {"scipy", "matplotlib"}),
+        ("nodes.robot_commands", {"scipy", "matplotlib"}),
+        ("nodes.kinect_skeleton", {"scipy", "matplotlib"}),
+        ("nodes.viewer", {"scipy", "matplotlib"}),
+    ],
+)
+def test_modules_that_many_processes_import_leave_out_what_they_do_not_use(module: str, absent: set[str]) -> None:
+    if module.startswith("nodes."):
+        pytest.importorskip("rclpy", reason="ROS is not installed")
+    assert loaded_by(f"import body_tracking.{module}").isdisjoint(absent)
