@@ -53,9 +53,9 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking show $(DEMO)/recording --truth $(DEMO_BAG) --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
 
-# The tests that compute share the cores, and lint runs besides; then those that start processes and mostly wait for
-# them; and one at a time those that say how soon something happens. All of it runs, whatever fails. What test/ros2 needs
-# is made before, and is no time of the tests.
+# The tests that compute, and lint, take what is left of the processors by those that start processes and mostly wait; the
+# latter run several at a time, and one at a time where they state how soon something happens. All of it runs, whatever
+# fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
 test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
 
@@ -65,11 +65,12 @@ test-all: $(STAMP) ## the same with the longer draws and recordings, in half an 
 
 define tests
 failed=; $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspace of ros2"; export TEST_ROS2=failed; }; \
-$(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
-phase "tests that compute" -m "($(1)) and not processes" --numprocesses 2 --dist worksteal; \
+nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
+nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
 phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 3 --dist loadscope; \
 phase "tests of time" -m "($(1)) and alone"; \
+echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
 [ -z "$$failed" ] || { echo "make: failed:$${failed#,}" >&2; exit 1; }
 endef

@@ -417,7 +417,7 @@ class Supervisor:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 env=environment,
-                start_new_session=True,
+                process_group=0,
             )
         child.started, child.due = time.monotonic(), None
         child.reader = threading.Thread(target=self._read, args=(child, child.process), daemon=True)

@@ -87,7 +87,7 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
                 stderr=subprocess.STDOUT,
                 cwd=tmp_path,
                 env=environment,
-                start_new_session=True,
+                process_group=0,
             )
             try:
                 code = process.wait(TIMEOUT)

@@ -264,7 +264,7 @@ class Fusion:
         if source.pose(stamp) is None:
             self.counters["uncalibrated"] += 1
         elif self._last_ns is not None and stamp <= self._last_ns:
-            self.counters["late"] += sensor == self.reference
+            self.counters["late" if sensor == self.reference else "missed"] += 1
         else:
             deadline = now_ns + round(self.parameters.max_wait * NANOSECONDS)
             insort(self._pending, (stamp, sensor != self.reference, deadline))

@@ -87,7 +87,9 @@ class BagPlayer(GraphNode):
         )
         self.clock_topic = None
         if given["clock_rate"]:
-            self.clock_topic = self.make_publisher(Clock, graph.CLOCK_TOPIC, to_profile(RELIABLE))
+            depth = graph.RELIABLE_SKELETON.depth if given["reliable"] else RELIABLE.depth
+            qos = Qos(RELIABLE.reliability, RELIABLE.durability, depth)
+            self.clock_topic = self.make_publisher(Clock, graph.CLOCK_TOPIC, to_profile(qos))
         self.clock_ns = self.reader.start_ns
         self.warned = 0
         self.warn_of_damage()

@@ -289,15 +289,18 @@ class GraphNode(Node):
         self._several_since: dict[str, float] = {}
         self.simulated = bool(self.get_parameter("use_sim_time").value)
         self._simulated_ns = 0
+        self._sent_ns = 0  # wall time at which the newest message that was handled had been sent
         self._alarms: list[Alarm] = []
         self.arrived_ns = 0
         """ROS time at which the message in hand came; nanoseconds."""
         self.arrived_waiting_ns = 0
         """The same by :meth:`waiting_ns`."""
-        if self.simulated:
-            qos = to_profile(Qos(SENSOR_DATA.reliability, SENSOR_DATA.durability, _TICKS))
-            self.create_subscription(ClockMessage, graph.CLOCK_TOPIC, self._on_clock, qos)
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
+        if self.simulated:
+            # a tick that is lost makes the next message seem to come earlier, which a clock's least delay is sensitive to
+            transport = RELIABLE_QOS if self.values.get("reliable") else SENSOR_DATA
+            qos = to_profile(Qos(transport.reliability, transport.durability, _TICKS))
+            self.create_subscription(ClockMessage, graph.CLOCK_TOPIC, self._on_clock, qos)
         self.configure(self.values)
         self.add_on_set_parameters_callback(self._on_set)
         self._diagnostics = self.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, to_profile(RELIABLE_QOS))
@@ -396,12 +399,16 @@ class GraphNode(Node):
         """Note when the message in hand came, which may be well before it is handled."""
         if self.simulated:
             self.arrived_ns = self.arrived_waiting_ns = self._simulated_ns
+            self._sent_ns = max(self._sent_ns, info["source_timestamp"])
             return
         now_ns = time.time_ns()
         self.arrived_ns = info["received_timestamp"] or now_ns  # not every RMW tells
         self.arrived_waiting_ns = time.monotonic_ns() - max(0, now_ns - self.arrived_ns)
 
-    def _on_clock(self, clock: ClockMessage) -> None:
+    def _on_clock(self, clock: ClockMessage, info: Mapping[str, int]) -> None:
+        self.sequences.note(graph.CLOCK_TOPIC, info["publication_sequence_number"])
+        if info["source_timestamp"] < self._sent_ns:
+            self.monitor.totals["late ticks"] += 1
         self._simulated_ns = to_nanoseconds(clock.clock)
         for alarm in self._alarms:
             alarm.look()

@@ -198,6 +198,7 @@ class Follower:
         self._since_ns = self._approached_ns = 0
         self._good_since_ns: int | None = None
         self._reason = self._wrong
+        self._last_fault = self._wrong
         n = len(mapping.joints)
         self._known_since_ns: IntArray = np.full(n, -1, dtype=np.intp)
         self._used = mapping.matrix != 0.0
@@ -337,7 +338,7 @@ class Follower:
         fault = fault or self._fault(steady_ns, elapsed, expected)
         self._refused = ""
         if fault:
-            self._good_since_ns = None
+            self._good_since_ns, self._last_fault = None, fault
         elif self._good_since_ns is None:
             self._good_since_ns = steady_ns
         self._known_since_ns[~known] = -1
@@ -499,7 +500,8 @@ class Follower:
                 self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
                 self._astray = ""
             else:
-                self._reason = fault or f"everything is good for {good:.2f} s, {limits.recover_after:g} s are needed"
+                waits = f"good for {good:.2f} of {limits.recover_after:g} s"
+                self._reason = fault or (f"{waits} since: {self._last_fault}" if self._last_fault else waits)
         elif self.state == State.APPROACHING and since >= limits.approach:
             self._enter(State.FOLLOWING, "the rates have reached their limits", steady_ns)
 

@@ -159,7 +159,13 @@ class Bench:
         self.frames = self.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), 10)
         self.node.create_timer(1.0 / 30.0, self._tell)
         self.running: dict[RobotCommands, tuple[LeanExecutor, threading.Thread]] = {}
-        self.robots = {name: Robot(self, name, self.start(name)) for name in ROBOTS}
+        self._robots = {name: Robot(self, name, self.start(name)) for name in ROBOTS}
+        self._active: Robot | None = None
+
+    def robot(self, name: str) -> Robot:
+        """A robot that receives angles from now on, instead of the one before."""
+        self._active = self._robots[name]
+        return self._active
 
     def start(self, name: str) -> RobotCommands:
         """A node of this name, in a thread of its own."""
@@ -182,8 +188,8 @@ class Bench:
         now_ns = time.time_ns()
         body = Skeleton(now_ns, "kinect1_optical_frame", np.ones((25, 3)), np.full(25, 2, np.uint8))
         self.frames.publish(encode_skeletons([body]))
-        for robot in self.robots.values():
-            robot.tell(now_ns)
+        if self._active is not None:
+            self._active.tell(now_ns)
 
     def until(self, condition: Callable[[], object], timeout: float = 30.0) -> bool:
         return spin_until(self.executor, condition, timeout)
@@ -213,7 +219,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 def test_angles_of_ros_time_are_stale_however_old_they_are_at_the_start(bench: Bench) -> None:
-    robot = bench.robots["stale"]
+    robot = bench.robot("stale")
     for age in (12.0, 600.0):
         robot.age = age
         robot.until_it_says("stopped", f"angles are {age:.0f}")
@@ -224,7 +230,7 @@ def test_angles_of_ros_time_are_stale_however_old_they_are_at_the_start(bench: B
 
 
 def test_another_clock_than_at_the_start_stops_the_robot(bench: Bench) -> None:
-    robot = bench.robots["clock"]
+    robot = bench.robot("clock")
     robot.until_it_follows()
     robot.age = time.time() - 40.0  # from now on stamps count from a start, as a Kinect's do
     robot.angle = 1.5
@@ -240,7 +246,7 @@ def test_another_clock_than_at_the_start_stops_the_robot(bench: Bench) -> None:
 
 
 def test_another_convention_is_not_followed(bench: Bench) -> None:
-    robot = bench.robots["convention"]
+    robot = bench.robot("convention")
     robot.until_it_follows()
     robot.convention, robot.names, robot.angle = "positional", angle_names("positional"), -0.5
     robot.until_it_says("stopped", "convention 'positional'", "'isb'")
@@ -253,7 +259,7 @@ def test_another_convention_is_not_followed(bench: Bench) -> None:
 
 
 def test_another_list_of_names_is_not_followed(bench: Bench) -> None:
-    robot = bench.robots["names"]
+    robot = bench.robot("names")
     robot.until_it_follows()
     robot.names, robot.angle = angle_names("isb")[:-1], -0.5
     robot.until_it_says("stopped", angle_names("isb")[-1])
@@ -268,7 +274,7 @@ def test_another_list_of_names_is_not_followed(bench: Bench) -> None:
 
 
 def test_of_two_that_command_one_robot_neither_does(bench: Bench) -> None:
-    robot = bench.robots["doubled"]
+    robot = bench.robot("doubled")
     robot.until_it_follows()
     second = bench.start("second")
     assert bench.until(lambda: "another publisher of /doubled/commands" in robot.said()), robot.said()
@@ -280,7 +286,7 @@ def test_of_two_that_command_one_robot_neither_does(bench: Bench) -> None:
 
 
 def test_angles_of_two_in_turn_are_not_followed(bench: Bench) -> None:
-    robot = bench.robots["angles"]
+    robot = bench.robot("angles")
     robot.until_it_follows()
     robot.doubled = True
     robot.until_it_says("stopped", "two publishers in turn")
@@ -298,7 +304,7 @@ def largest_lead(robot: Robot) -> float:
 
 
 def test_commands_do_not_run_on_while_the_robot_stands_still(bench: Bench) -> None:
-    robot = bench.robots["standstill"]
+    robot = bench.robot("standstill")
     robot.until_it_follows()
     robot.released = False
     stood = robot.position
@@ -321,7 +327,7 @@ def test_commands_do_not_run_on_while_the_robot_stands_still(bench: Bench) -> No
 
 
 def test_without_a_state_of_the_robot_a_person_has_to_say_that_it_is_at_home(bench: Bench) -> None:
-    robot = bench.robots["unknown"]
+    robot = bench.robot("unknown")
     robot.until_it_says("stopped", "waits for a person", "enable", "home")
     bench.go_on(2.0)
     assert robot.commands == []
