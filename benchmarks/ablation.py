@@ -7,11 +7,16 @@ People, motions, layouts and seeds are none that anything was tuned on.
 1. Left and right (``fusion.sides`` and the gate of ``fusion.fusion``), fused skeletons: RMS error of the twist of
    shoulders against hips (deg), share of the frames in which it is wrong by more than 60 deg (%), share of frames with
    shoulders or hips reversed (%), mean error of the ten joints of the thesis (mm).
-2. The posture prior (``kinematics.posture``), filter ``ekf``: RMS error of trunk, lumbar and thoracic flexion, shoulder
+2. The same on the real pairs of Kinects (no truth; ``--data``), filtered skeletons: reversals of shoulders or hips
+   between two frames, turns of them by more than 30 deg between two frames, share of the frames in which shoulders are
+   twisted against hips by more than 60 deg (%).
+3. The same on the shipped recordings, default filter: greatest error of a trunk angle (deg), frames in which an angle
+   is off by more than 3 stated deviations.
+4. The posture prior (``kinematics.posture``), filter ``ekf``: RMS error of trunk, lumbar and thoracic flexion, shoulder
    abduction and elbow flexion (deg), and the share of errors within 1.96 stated deviations (%); with the prior's
    deviations halved and doubled, too.
 
-  python benchmarks/ablation.py                        24 people: about half an hour on two cores
+  python benchmarks/ablation.py                        24 people: about 40 minutes on two cores
   python benchmarks/ablation.py --seeds 1 --parts sides
 """
 
@@ -36,6 +41,7 @@ from unittest.mock import patch
 
 import numpy as np
 from accuracy import TEN, Run, run_ours
+from real_pairs import reversals, skeletons
 from scipy.stats import t as student
 
 from body_tracking.evaluation.metrics import Curve
@@ -43,10 +49,13 @@ from body_tracking.evaluation.summary import nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion
+from body_tracking.graph import FILTERED
 from body_tracking.kinematics import posture
+from body_tracking.measurement import left_right_axes
+from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import replay
 from body_tracking.recording.stages import ReplaySettings
-from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.bags import SHIPPED, write_bag
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint
 
 ALL = "all mechanisms"
@@ -54,6 +63,7 @@ _SHOULDERS, _HIPS = (
     (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT),
     (Joint.HIP_LEFT, Joint.HIP_RIGHT),
 )
+_ROOT = Path(__file__).resolve().parent.parent
 _FIRST_SEED = 5000
 """Far from the seeds of every other benchmark."""
 
@@ -158,12 +168,58 @@ def of_posture(run: Run, name: str) -> dict[str, float]:
     return figures
 
 
-def _measure(job: tuple[str, Run, str]) -> dict[str, float]:
+def of_real(file: Path, name: str) -> dict[str, float]:
+    """The figures of part 2, of one recording."""
+    with tempfile.TemporaryDirectory() as folder, SIDES[name]():
+        import_files([file], Path(folder) / "in")
+        replay(Path(folder) / "in", Path(folder) / "out", ReplaySettings(()))
+        filtered = np.stack([each.positions for each in skeletons(Path(folder) / "out", FILTERED)])
+    axes = left_right_axes(filtered)
+    headings = np.arctan2(axes[..., 1], axes[..., 0])
+    twist = np.abs(_off(headings[:, 0], headings[:, 1]))
+    turns = np.abs(_off(headings[1:], headings[:-1]))
+    return {
+        "reversals": float(sum(reversals(axes[:, half]) for half in (0, 1))),
+        "turns over 30": float((turns > np.pi / 6).sum()),
+        "beyond 60": 100.0 * float((twist > np.pi / 3).sum() / np.isfinite(twist).sum()),
+    }
+
+
+def of_shipped(bag: Path, name: str) -> dict[str, float]:
+    """The figures of part 3, of one recording."""
+    with tempfile.TemporaryDirectory() as folder, SIDES[name]():
+        replay(bag, Path(folder) / "out", ReplaySettings(()))
+        tracked = read(Path(folder) / "out")
+    angles, truth = tracked.angles, tracked.true_angles
+    assert truth is not None
+    matches = nearest(truth.stamps_ns, angles.stamps_ns)
+    here = matches >= 0
+    names = [each for each in angles.names if each in truth.names]
+    own = [angles.names.index(each) for each in names]
+    true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
+    away, stddev = _off(angles.position[here][:, own], true), angles.stddev[here][:, own]
+    trunk = [each.startswith("trunk") for each in names]
+    known = np.isfinite(stddev)
+    return {
+        "trunk": float(np.degrees(np.nanmax(np.where(known, np.abs(away), np.nan)[:, trunk]))),
+        "beyond 3": float((np.abs(away)[known] > 3.0 * stddev[known]).sum()),
+    }
+
+
+_FIGURES: Mapping[str, Callable[[Any, str], dict[str, float]]] = {
+    "sides": of_sides,
+    "real": of_real,
+    "shipped": of_shipped,
+    "posture": of_posture,
+}
+
+
+def _measure(job: tuple[str, Any, str]) -> dict[str, float]:
     part, run, name = job
-    return of_sides(run, name) if part == "sides" else of_posture(run, name)
+    return _FIGURES[part](run, name)
 
 
-def table(part: str, names: Sequence[str], runs: Sequence[Run], workers: int) -> None:
+def table(part: str, names: Sequence[str], runs: Sequence[Any], workers: int) -> None:
     """Measure one part and print it."""
     jobs = [(part, run, name) for run in runs for name in names]
     began, results = time.monotonic(), {}
@@ -174,7 +230,7 @@ def table(part: str, names: Sequence[str], runs: Sequence[Run], workers: int) ->
             print(f"\r{number} of {len(jobs)}, {left / 60:.0f} min left ", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     columns = list(next(iter(results.values())))
-    print(f"\n{part}: {len(runs)} people\n{'without':24}" + "".join(f"{each:>20}" for each in columns))
+    print(f"\n{part}: {len(runs)} recordings\n{'without':24}" + "".join(f"{each:>20}" for each in columns))
     for name in names:
         cells = []
         for column in columns:
@@ -194,7 +250,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="people for each motion and layout")
     parser.add_argument("--layouts", default="2,3,4", help="of the sensors")
     parser.add_argument("--motions", default="squat,punching,torso_twist,walking_and_turning", help="of the people")
-    parser.add_argument("--parts", default="sides,posture", help="which tables")
+    parser.add_argument("--parts", default=",".join(_FIGURES), help="which tables (default: %(default)s)")
+    data = Path(os.environ.get("BODY_TRACKING_DATA", _ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     args = parser.parse_args()
     runs = [
@@ -203,8 +261,13 @@ def main() -> None:
         for number in args.layouts.split(",")
         for seed in range(args.seeds)
     ]
+    pairs = sorted((args.data / "kinect_pairs").glob("p??_*.csv.gz"))
+    of_part = {"real": pairs, "shipped": [_ROOT / "bags" / name for name in SHIPPED]}
     for part in args.parts.split(","):
-        table(part, list(SIDES if part == "sides" else POSTURE), runs, args.workers)
+        if not of_part.get(part, runs):
+            print(f"{part}: left out, no recordings in {args.data}")
+            continue
+        table(part, list(POSTURE if part == "posture" else SIDES), of_part.get(part, runs), args.workers)
 
 
 if __name__ == "__main__":
