@@ -12,6 +12,8 @@ DEMO := demo_output
 # would not look, and with its libraries on the path they might load the wrong ones.
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE VIRTUAL_ENV PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH
 unexport ROS_LOCALHOST_ONLY ROS_STATIC_PEERS ROS_DISCOVERY_SERVER FASTRTPS_DEFAULT_PROFILES_FILE FASTDDS_DEFAULT_PROFILES_FILE
+# Every node and test process would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 ifdef LD_LIBRARY_PATH
 export LD_LIBRARY_PATH := $(shell printf %s "$$LD_LIBRARY_PATH" | tr : '\n' | grep -v -e '/ros_[^/]*\.libs/*$$' -e '^/opt/ros/' | paste -s -d : -)
 endif
@@ -69,7 +71,7 @@ phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || 
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
 phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 3 --dist loadscope; \
-phase "tests of time" -m "($(1)) and alone"; \
+phase "tests of time" -m "($(1)) and processes and alone"; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
 [ -z "$$failed" ] || { echo "make: failed:$${failed#,}" >&2; exit 1; }

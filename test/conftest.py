@@ -11,11 +11,14 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
 from body_tracking import dds
 
 ROOT = Path(__file__).resolve().parent.parent
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 dds.prepare()  # what tests send is sent again as soon as what nodes send
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # so a shell without job control starts what it runs in the background, and every process would inherit it
@@ -23,10 +26,22 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 PROCESSES = ("nodes", "ros2", "test_cli.py", "test_docs.py", "test_package.py", "test_up.py")
 
 
+def _starts_processes(path: Path) -> bool:
+    return path.relative_to(ROOT / "test").parts[0] in PROCESSES
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file that the marker expression of a phase leaves out as a whole: all of them take 8 s to import."""
+    expression = str(config.getoption("markexpr"))
+    if collection_path.suffix != ".py" or "processes" not in expression:
+        return None
+    return True if _starts_processes(collection_path) == ("not processes" in expression) else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that start processes, which run in a phase of their own."""
     for item in items:
-        if item.path.relative_to(ROOT / "test").parts[0] in PROCESSES:
+        if _starts_processes(item.path):
             item.add_marker(pytest.mark.processes)
         if item.path.parent.name == "ros2":
             item.add_marker(pytest.mark.ros2)
@@ -51,4 +66,31 @@ def shared_data() -> Path:
     folder = Path(os.environ.get("BODY_TRACKING_DATA", ROOT.parent / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"real recordings are absent ({folder}): set BODY_TRACKING_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first 7 s of ``bags/tpose_wave``: the T-pose and some of the wave, for laws that do not need all of it."""
+    from body_tracking.recording.rosbag2 import BagReader, BagWriter
+
+    folder = tmp_path_factory.mktemp("excerpt") / "wave"
+    with BagReader(ROOT / "bags" / "tpose_wave") as bag, BagWriter(folder) as writer:
+        for topic, info in bag.topics.items():
+            writer.add_topic(topic, info.type_name, info.offered)
+        for raw in bag.messages():
+            if raw.log_time_ns > bag.start_ns + 7 * 10**9:
+                break
+            writer.write(raw.topic, raw.cdr, raw.log_time_ns, raw.publish_time_ns)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
+    """The bag that the offline graph makes of ``wave`` with its default settings."""
+    from body_tracking.recording.replay import replay
+    from body_tracking.recording.stages import ReplaySettings
+
+    folder = tmp_path_factory.mktemp("replayed") / "wave"
+    replay(wave, folder, ReplaySettings(()))
     return folder

@@ -297,7 +297,7 @@ class GraphNode(Node):
         """The same by :meth:`waiting_ns`."""
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         if self.simulated:
-            # a tick that is lost makes the next message seem to come earlier, which a clock's least delay is sensitive to
+            # after a lost tick the next message would seem to come earlier, which a clock's least delay is sensitive to
             transport = RELIABLE_QOS if self.values.get("reliable") else SENSOR_DATA
             qos = to_profile(Qos(transport.reliability, transport.durability, _TICKS))
             self.create_subscription(ClockMessage, graph.CLOCK_TOPIC, self._on_clock, qos)

@@ -138,7 +138,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 context,
             )
             # what the middleware cannot make a message of is left out
-            takes = [self._guarded(each.topic_name, each.handle.take_message) for each in subscriptions]
+            takes = [self._guarded(f"taking {each.topic_name}", each.handle.take_message) for each in subscriptions]
             looked_ns = 0
             ready_since_ns: int | None = None
             while not self._changed:
