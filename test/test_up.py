@@ -296,7 +296,7 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
 ) -> None:
     killed = some(NODES, 2)
     rate = "0.5" if len(killed) > 2 else "1"  # the bag has to last as long
-    graph_up = up("--bag", BAGS / "tpose_torso_twist", "--rate", rate, "--record", tmp_path / "recording")
+    graph_up = up("--bag", BAG, "--rate", rate, "--record", tmp_path / "recording")
     assert graph_up.until(lambda: len(graph_up.received) > 30, timeout=40.0), graph_up.text()
     for name in killed:
         before = graph_up.nodes()
@@ -329,7 +329,7 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
         reader.verify()
         assert reader.topics[ANGLES].count > 200
     stamps = sorted(angles_in(tmp_path / "recording", ANGLES))
-    with BagReader(BAGS / "tpose_torso_twist") as reader:
+    with BagReader(BAG) as reader:
         first_ns, last_ns = reader.start_ns, reader.end_ns
     # The player went on where it was, not from the beginning: one pass over the bag, to its end.
     assert stamps[-1] - stamps[0] < last_ns - first_ns

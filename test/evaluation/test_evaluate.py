@@ -18,25 +18,15 @@ from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.report import tables
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
-from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 
 @pytest.fixture(scope="module")
-def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the graph makes of the wave; the truth is beside it."""
-    folder = tmp_path_factory.mktemp("evaluate") / "wave"
-    replay(BAGS / "tpose_wave", folder, ReplaySettings(()))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def result(replayed: Path) -> Evaluation:
-    return evaluate(read_estimate(replayed), read_truth(BAGS / "tpose_wave"))
+def result(replayed_wave: Path, wave: Path) -> Evaluation:
+    return evaluate(read_estimate(replayed_wave), read_truth(wave))
 
 
 def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind: str = POINT_CLOUD) -> Path:
@@ -70,8 +60,10 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_table_says_what_was_found(replayed: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(replayed), "--truth", str(BAGS / "tpose_wave")]) == 0
+def test_the_table_says_what_was_found(
+    replayed_wave: Path, wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(replayed_wave), "--truth", str(wave)]) == 0
     shown = capsys.readouterr().out
     wrist = JOINT_NAMES.index("WristLeft")
     line = next(line for line in shown.splitlines() if line.startswith("WristLeft "))
@@ -85,10 +77,10 @@ def test_the_table_says_what_was_found(replayed: Path, result: Evaluation, capsy
 
 
 def test_csv_json_and_tables_agree(
-    replayed: Path, result: Evaluation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    replayed_wave: Path, result: Evaluation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     numbers = tmp_path / "new" / "numbers.csv"
-    assert main(["evaluate", str(replayed), "--csv", str(numbers), "--json"]) == 0
+    assert main(["evaluate", str(replayed_wave), "--csv", str(numbers), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     with numbers.open(encoding="utf-8") as file:
         rows = {(row["table"], row["row"], row["column"]): row for row in csv.DictReader(file)}
@@ -108,9 +100,9 @@ def test_csv_json_and_tables_agree(
     assert set(said["tables"]) == {table.key for table in tables(result)}
 
 
-def test_the_report_is_one_whole_page_that_needs_no_other_file(replayed: Path, tmp_path: Path) -> None:
+def test_the_report_is_one_whole_page_that_needs_no_other_file(replayed_wave: Path, tmp_path: Path) -> None:
     report = tmp_path / "report.html"
-    assert main(["evaluate", str(replayed), "--html", str(report)]) == 0
+    assert main(["evaluate", str(replayed_wave), "--html", str(report)]) == 0
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert not page.open
@@ -120,17 +112,19 @@ def test_the_report_is_one_whole_page_that_needs_no_other_file(replayed: Path, t
     assert all(name in text for name in JOINT_NAMES)
 
 
-def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(replayed: Path, tmp_path: Path) -> None:
-    fused = read_estimate(replayed, "/fused/skeleton")
+def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
+    replayed_wave: Path, tmp_path: Path
+) -> None:
+    fused = read_estimate(replayed_wave, "/fused/skeleton")
     assert fused.topic == "/fused/skeleton" and fused.frame_id == "world"
     alone = read_estimate(bag_of(tmp_path / "fused", 3, "/fused/skeleton"))
     assert alone.topic == "/fused/skeleton" and alone.angles is None and len(alone.stamps_ns) == 3
 
 
 def test_a_joint_is_off_track_by_the_distance_that_is_given(
-    replayed: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
+    replayed_wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["evaluate", str(replayed), "--off-track", "30", "--json"]) == 0
+    assert main(["evaluate", str(replayed_wave), "--off-track", "30", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["tables"]["joints_as_it_is"]["rows"]
     assert (100.0 * result.comparisons[0].off_track.mean()) < rows["all (25)"]["off_track"] < 95.0
 
@@ -158,12 +152,12 @@ def test_a_joint_is_off_track_by_the_distance_that_is_given(
     ],
 )
 def test_bad_input_is_told_in_one_line(
-    arguments: list[str], message: str, replayed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], message: str, replayed_wave: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("no recording")
     places = {
-        "wave": replayed,
+        "wave": replayed_wave,
         "twist": BAGS / "tpose_torso_twist",
         "text": text,
         "nowhere": tmp_path / "nowhere",

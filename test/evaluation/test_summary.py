@@ -18,9 +18,7 @@ from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
-from body_tracking.recording.replay import replay
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import N_JOINTS, Skeleton, TrackingState
@@ -33,7 +31,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wave as one sensor at its true place would track it, which has white noise only, with the truth beside."""
     noisy = replace(KinectErrors.none(), white=0.001)
-    recording = simulate(Setup("two_handed_wave", standard=True, errors=noisy))
+    recording = simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=noisy))
     sensor = recording.sensors[0]
     tracker = make_filter("lkf_constant_velocity")
     folder = tmp_path_factory.mktemp("evaluation") / "wave"
@@ -144,12 +142,11 @@ def test_the_command_prints_the_table(tracked_bag: Path, tmp_path: Path, capsys:
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_the_truth_may_be_in_the_bag_that_was_played(tmp_path: Path) -> None:
+def test_the_truth_may_be_in_the_bag_that_was_played(replayed_wave: Path, wave: Path, tmp_path: Path) -> None:
     """Recordings of the live graph hold angles, not what a simulation knew."""
-    replay(BAGS / "tpose_wave", tmp_path / "out", ReplaySettings(()))
-    rows = summarise(tmp_path / "out", truth=BAGS / "tpose_wave")
-    assert rows == summarise(tmp_path / "out")  # replay takes the truth along
+    rows = summarise(replayed_wave, truth=wave)
+    assert rows == summarise(replayed_wave)  # replay takes the truth along
     elbow = next(row for row in rows if row.name == "elbow_flexion_left")
     assert elbow.rms_error < elbow.max_error and elbow.true_min < 30.0 and elbow.true_max > 80.0
     with pytest.raises(EvaluationError, match="holds no truth"):
-        summarise(tmp_path / "out", truth=bare(tmp_path / "bare"))
+        summarise(replayed_wave, truth=bare(tmp_path / "bare"))

@@ -15,7 +15,7 @@ from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.posture import PosturePrior
-from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.simulation.random_people import (
@@ -65,6 +65,12 @@ def measured(truth: Truth, noise: float = NOISE, seed: int = 0, **errors: object
 
 def run(estimator: ExtendedKalmanFilter, skeletons: Iterable[Skeleton], sensor: str = "") -> list[Skeleton | None]:
     return [estimator.update(skeleton, sensor) for skeleton in skeletons]
+
+
+def feed(estimator: ExtendedKalmanFilter, skeletons: Iterable[Skeleton]) -> None:
+    """Like :func:`run` without the outputs, which take a third of its time."""
+    for skeleton in skeletons:
+        estimator.take(skeleton)
 
 
 def errors_of(outputs: Sequence[Skeleton | None], truth: Truth, after: float = SETTLED) -> FloatArray:
@@ -118,7 +124,7 @@ def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFi
 
 @pytest.mark.parametrize("noise", [0.005, 0.02, 0.05])
 def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -> None:
-    truth = somebody(1, 6.0)
+    truth = somebody(1, 3.0)
     observation = measured(truth, noise)
     estimator = ExtendedKalmanFilter()
     outputs = run(estimator, observation.skeletons)
@@ -141,7 +147,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
     near = np.array([k for k in OBSERVED if not MODEL.coordinate_names[k].startswith(("forearm", "wrist"))])
     told, hidden = [], []
     for seed in range(draws(8, 25)):
-        truth = somebody(100 + seed, 1.0)
+        truth = somebody(100 + seed, 1.0, rate=15.0)
         offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
         frames = [
             replace(frame, positions=frame.positions + offsets, covariances=stated)
@@ -150,7 +156,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
         estimates = []
         for parameters in (EkfParameters(posture=False), EkfParameters(posture=False, offset_scale=0.0)):
             estimator = ExtendedKalmanFilter(parameters)
-            run(estimator, frames)
+            feed(estimator, frames)
             estimates.append(known(estimator))
         assert_array_equal(estimates[0].q, estimates[1].q)
         for estimate, found in zip(estimates, (told, hidden), strict=True):
@@ -164,7 +170,7 @@ def test_where_a_sensor_takes_the_joints_to_be_is_in_the_uncertainty_that_is_han
 def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
     """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
     rng = np.random.default_rng(3)
-    truth = somebody(3, 5.0)
+    truth = somebody(3, 3.0)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
     offsets = {name: 0.04 * rng.normal(size=(N_JOINTS, 3)) for name in "abcd"}
     estimator = ExtendedKalmanFilter()
@@ -173,13 +179,13 @@ def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again(
             stamp_ns = frame.stamp_ns + place * 8_000_000
             moved = replace(frame, stamp_ns=stamp_ns, positions=frame.positions + offset, covariances=stated)
             estimator.update(moved, name)
-    assert estimator.counters["restarts"] <= 2  # looked for every quarter of a second it was 12
+    assert estimator.counters["restarts"] <= 1  # looked for every quarter of a second it was 12 in 5 s
 
 
 def test_its_uncertainty_is_true() -> None:
     """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees."""
     for_angles, for_points, for_lengths = [], [], []
-    for seed in range(draws(3, 10)):
+    for seed in range(draws(2, 10)):
         truth = somebody(20 + seed, 6.0)
         observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
         estimator = ExtendedKalmanFilter()
@@ -277,7 +283,7 @@ def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
         for each, time in zip(skeletons, truth.times, strict=True)
     ]
     estimator = ExtendedKalmanFilter()
-    run(estimator, turned)
+    feed(estimator, turned)
     assert estimator.counters["restarts"] >= 1
     assert np.abs(known(estimator).lengths - truth.lengths).max() < 0.02
 
@@ -289,7 +295,7 @@ def test_another_person_of_another_size_is_learnt_anew() -> None:
         for each, time in zip(measured(truth).skeletons, truth.times, strict=True)
     ]
     estimator = ExtendedKalmanFilter()
-    run(estimator, skeletons)
+    feed(estimator, skeletons)
     assert_allclose(known(estimator).lengths, 0.65 * truth.lengths, rtol=0.0, atol=0.02)
 
 
@@ -327,7 +333,7 @@ def test_two_sensors_are_better_than_either_and_the_better_one_counts_more() -> 
     for seed in range(draws(2, 4)):
         rng = np.random.default_rng(40 + seed)
         person, motion = RandomPerson.draw(rng), RandomMotion(rng, 5.0)
-        times = capture_times(5.0, rng, 25.0)
+        times = capture_times(3.0, rng, 25.0)
         sensors: dict[str, tuple[Skeleton, ...]] = {}
         true: dict[int, FloatArray] = {}
         for name, delay, noise in (("good", 0.0, 0.02), ("poor", 0.013, 0.04)):
@@ -368,7 +374,7 @@ def test_late_frames_count_as_if_they_had_come_in_order() -> None:
     skeletons = measured(truth, outliers=0.03).skeletons
     shuffled = delayed(skeletons, 0.19, 1)
     in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(in_order, skeletons)
+    feed(in_order, skeletons)
     outputs = run(late, shuffled)
     assert late.counters["late_frames"] > 20 and late.counters["too_late"] == 0
     assert sum(output is None for output in outputs[START_FRAMES:]) == late.counters["late_frames"]
@@ -409,7 +415,7 @@ def stalled(seed: int, held: int = 6) -> tuple[list[tuple[Skeleton, str]], int]:
     return in_time + burst, len(in_time)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(1, 1 + draws(1, 3)))
 def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: int) -> None:
     frames, in_time = stalled(seed)
     together, one_by_one, in_order = ExtendedKalmanFilter(), ExtendedKalmanFilter(), ExtendedKalmanFilter()
@@ -460,7 +466,7 @@ def test_what_is_too_late_is_dropped_and_counted() -> None:
     skeletons = measured(somebody(7, 2.0)).skeletons
     held, others = skeletons[40], [*skeletons[:40], *skeletons[41:50]]
     estimator = ExtendedKalmanFilter()
-    run(estimator, others)
+    feed(estimator, others)
     before = known(estimator)
     assert estimator.update(held) is None  # 0.3 s after its time
     assert estimator.counters["too_late"] == 1
@@ -470,7 +476,7 @@ def test_what_is_too_late_is_dropped_and_counted() -> None:
 def test_a_repeated_frame_counts_once() -> None:
     skeletons = measured(somebody(8, 1.0)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(once, skeletons)
+    feed(once, skeletons)
     outputs = run(twice, [skeleton for skeleton in skeletons for _ in (0, 1)])
     assert twice.counters["repeated_stamps"] == len(skeletons)
     assert all(output is None for output in outputs[2 * START_FRAMES - 1 :: 2])
@@ -479,10 +485,10 @@ def test_a_repeated_frame_counts_once() -> None:
 
 @pytest.mark.parametrize("after", range(4, 12))
 def test_the_frame_that_it_was_started_by_counts_once(after: int) -> None:
-    skeletons = measured(somebody(8, 1.0)).skeletons
+    skeletons = measured(somebody(8, 0.6)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(once, skeletons)
-    run(twice, [*skeletons[:after], skeletons[0], *skeletons[after:]])
+    feed(once, skeletons)
+    feed(twice, [*skeletons[:after], skeletons[0], *skeletons[after:]])
     assert twice.counters["repeated_stamps"] == 1
     assert_same(known(once), known(twice), 1e-12)
 
@@ -490,17 +496,17 @@ def test_the_frame_that_it_was_started_by_counts_once(after: int) -> None:
 def test_a_start_in_another_order_is_the_same_start() -> None:
     skeletons = measured(somebody(8, 1.0)).skeletons
     in_order, shuffled = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(in_order, skeletons)
-    run(shuffled, [skeletons[k] for k in (1, 0, 3, 2)] + list(skeletons[4:]))
+    feed(in_order, skeletons)
+    feed(shuffled, [skeletons[k] for k in (1, 0, 3, 2)] + list(skeletons[4:]))
     assert_same(known(in_order), known(shuffled), 1e-9)
 
 
 def test_a_jump_back_in_time_starts_anew_and_is_counted_once() -> None:
     skeletons = measured(somebody(9, 4.0)).skeletons
     estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(estimator, skeletons[60:])
+    feed(estimator, skeletons[60:])
     outputs = run(estimator, skeletons[:30])
-    run(fresh, skeletons[:30])
+    feed(fresh, skeletons[:30])
     assert estimator.counters["backward_jumps"] == 1
     assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(30)]
     assert_same(known(estimator), known(fresh), 1e-12)
@@ -526,7 +532,7 @@ def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
 def test_another_frame_of_reference_starts_anew() -> None:
     skeletons = measured(somebody(11, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
-    run(estimator, skeletons[:30])
+    feed(estimator, skeletons[:30])
     moved = [
         replace(skeleton, frame_id="odom", positions=skeleton.positions + [10.0, 0.0, 0.0]) for skeleton in skeletons
     ]
@@ -541,12 +547,12 @@ def test_a_reset_forgets_the_person_but_not_the_counters() -> None:
     skeletons = measured(somebody(12, 1.0)).skeletons
     estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     assert estimator.estimate is None and estimator.predict(START_NS) is None
-    run(estimator, measured(somebody(13, 1.0)).skeletons)
+    feed(estimator, measured(somebody(13, 1.0)).skeletons)
     counted = dict(estimator.counters)
     estimator.reset()
     assert estimator.estimate is None and estimator.counters == counted
-    run(estimator, skeletons)
-    run(fresh, skeletons)
+    feed(estimator, skeletons)
+    feed(fresh, skeletons)
     assert_same(known(estimator), known(fresh), 0.0)
 
 
@@ -691,7 +697,7 @@ def pose(estimator: ExtendedKalmanFilter) -> FloatArray:
 
 @pytest.mark.parametrize("noise", [0.006, 0.013, 0.025])
 def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: float) -> None:
-    for seed, truth, side in bent_hands(draws(4, 10), 1.2):
+    for seed, truth, side in bent_hands(draws(2, 10), 1.2):
         estimator = ExtendedKalmanFilter()
         estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
         hands = []
@@ -705,7 +711,7 @@ def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: flo
 @pytest.mark.parametrize("noise", [0.006, 0.02])
 def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
     """As if a movement that nobody saw had ended in the wrong pose: at the latest after a second and a half."""
-    for seed, truth, side in bent_hands(draws(3, 6), 2.5, 0.7):
+    for seed, truth, side in bent_hands(draws(2, 6), 2.5, 0.7):
         estimator = ExtendedKalmanFilter()
         hands = []
         for skeleton, time in zip(measured(truth, noise).skeletons, truth.times, strict=True):
@@ -721,7 +727,7 @@ def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
     """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
-    for seed in range(320, 320 + draws(3, 12)):
+    for seed in range(320, 320 + draws(2, 12)):
         truth = somebody(seed, 2.4, tempo=1.6)
         for arm in ARMS.values():
             estimator = ExtendedKalmanFilter()
@@ -733,7 +739,7 @@ def test_outliers_hardly_matter() -> None:
     """5 % of the points are off by up to 1 m."""
     clean: list[float] = []
     bad: list[float] = []
-    for seed in range(2):
+    for seed in range(draws(1, 2)):
         truth = somebody(60 + seed, 5.0)
         for errors, share in ((clean, 0.0), (bad, 0.05)):
             estimator = ExtendedKalmanFilter()
@@ -791,7 +797,7 @@ def damaged(skeleton: Skeleton, damage: str, rng: np.random.Generator) -> Skelet
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_numbers_do_no_harm(damage: str) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
-    truth = somebody(70, 2.5)
+    truth = somebody(70, 1.8)
     rng = np.random.default_rng(1)
     estimator = ExtendedKalmanFilter()
     skeletons = [
@@ -841,51 +847,72 @@ def test_parameters_out_of_range_are_refused(name: str) -> None:
 def test_an_older_frame_that_is_repeated_counts_once() -> None:
     skeletons = measured(somebody(8, 1.0)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    run(once, skeletons)
-    run(twice, skeletons)
+    feed(once, skeletons)
+    feed(twice, skeletons)
     assert twice.update(skeletons[-3]) is None
     assert twice.counters["repeated_stamps"] == 1
     assert_same(known(once), known(twice), 1e-12)
 
 
 def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
-    """Ten minutes take too long here; benchmarks/real_people.py has them."""
+    """Unobserved angles stay where they are, and keep the deviation of the posture prior, which alone knows them.
+
+    Points that are known exactly leave two directions, along which the prior decides. The filter applies it to its
+    state and once more to its output, so the stated deviation is at least that of a prior that counts twice, less 5 %
+    as it is evaluated at the estimate. It is never more than the prior's deviation before any measurement.
+    Ten minutes take too long here; benchmarks/real_people.py has them.
+    """
     seed = 0
     rng = np.random.default_rng(seed)
     lengths = RandomPerson.draw(rng).lengths
-    times = capture_times(40.0, rng, 30.0)
+    times = capture_times(float(draws(8, 40)), rng, 30.0)
     tangent = np.zeros(MODEL.nv)
     tangent[[MODEL.coordinate_names.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(25.0)
     tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
     q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
     positions = MODEL.forward(q, lengths).positions
     truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
-    prior = PosturePrior(MODEL, Ranges(MODEL))
+    least, most = posture_stddev(q[0], lengths)
     estimator = ExtendedKalmanFilter()
     angles, learnt = [], []
     for skeleton in measured(truth, seed=seed).skeletons:
-        if estimator.update(skeleton) is None:
+        if not estimator.take(skeleton):
             continue
         estimate = known(estimator)
         told = angles_of(estimate, MODEL, "model")
         columns = [told.names.index(name) for name in UNOBSERVED]
         angles.append(told.position[columns])
         learnt.append(estimate.lengths)
-        tangents = np.array([MODEL.coordinate_names.index(name) for name in UNOBSERVED])
-        # what nothing observes is nearly as unsure as it is before anything is seen, and never more
-        share = told.position_stddev[columns] / prior.stddev[tangents - 6]
-        assert (share > 0.3).all() and (share < 1.05).all()
+        assert (told.position_stddev[columns] > 0.95 * least).all()
+        assert (told.position_stddev[columns] < most).all()
     # averages over a second: the noise of one frame is no drift
     averages = np.stack(angles)[: len(angles) // 30 * 30].reshape(-1, 30, len(UNOBSERVED)).mean(axis=1)
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0
-    # of perfectly white noise the lengths are known well enough to be settled by then
-    assert np.abs(np.stack(learnt[910:]) - learnt[-1]).max() < 1e-9
+    if times[-1] > 35.0:  # of perfectly white noise the lengths are known well enough to be settled after 30 s
+        assert np.abs(np.stack(learnt[910:]) - learnt[-1]).max() < 1e-9
+
+
+def posture_stddev(q: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(4,) radians: deviations of the unobserved angles by the posture prior.
+
+    First where it counts twice and all points are known exactly, then by the prior alone.
+    """
+    prior, lines = PosturePrior(MODEL, Ranges(MODEL)), MODEL.linearise(q, lengths)
+    tells = np.append(prior.postural, [True] * 3)
+    stddev = np.concatenate([prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], prior.tilt_stddev])
+    rows = prior.rows(q, lines).gradients[tells] / stddev[tells, None]
+    _, singular, axes = np.linalg.svd(lines.jacobian.reshape(-1, MODEL.nv), full_matrices=False)
+    free = axes[singular < 1e-6 * singular[0]].T
+    assert free.shape[1] == 2
+    covariance = free @ np.linalg.inv(2.0 * (rows @ free).T @ (rows @ free)) @ free.T
+    columns = np.array([MODEL.coordinate_names.index(name) for name in UNOBSERVED])
+    return np.sqrt(covariance.diagonal()[columns]), prior.stddev[columns - 6]
 
 
 def test_a_covariance_that_is_none_any_more_starts_the_pose_anew() -> None:
     skeletons = measured(somebody(8, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
-    run(estimator, skeletons[:20])
+    feed(estimator, skeletons[:20])
     assert estimator._state is not None
     estimator._state = replace(estimator._state, covariance=-estimator._state.covariance)
     outputs = run(estimator, skeletons[20:])

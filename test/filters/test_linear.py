@@ -26,6 +26,7 @@ from body_tracking.filters.linear import (
 )
 from body_tracking.kinematics.motion import joint_densities
 from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from draws import draws
 
 FRAME_NS = NANOSECONDS // 30
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
@@ -81,7 +82,7 @@ def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
     singles = [KalmanFilter(dim_x=3 * order, dim_z=3) for _ in range(N_JOINTS)]
     stamp_ns, position = 1, BODY.copy()
     seen_before = np.ones(N_JOINTS, dtype=bool)
-    for frame in range(120):
+    for frame in range(draws(50, 120)):
         step = 0.0 if frame == 0 else float(rng.uniform(0.01, 0.2))
         stamp_ns += round(step * NANOSECONDS)
         step = round(step * NANOSECONDS) / NANOSECONDS
@@ -348,7 +349,7 @@ def test_time_that_stands_still_runs_back_or_leaps(model: str) -> None:
     covariance=arrays(np.float64, (3, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
 )
 @example(np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.uint8), np.full((3, 3), 1.28326561e-16))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=draws(25, 60), deadline=None)
 def test_no_number_whatever_gets_into_the_state(
     model: str, positions: FloatArray, states: np.ndarray, covariance: FloatArray
 ) -> None:

@@ -260,7 +260,7 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
     observed = np.array([name not in weak for name in MODEL.coordinate_names])
     errors: dict[str, list[FloatArray]] = {"filter": [], "lag": [], "full": []}
     inside = []
-    for seed in range(11, 11 + draws(2, 4)):  # the ratio of two smoothers trembles by 5 % from one to the other
+    for seed in range(11, 11 + draws(1, 4)):  # of ten recordings at 5 mm: 0.69-0.75, 0.68-0.74 and 0.97-0.99
         truth, frames = recorded(seed, 4.0, noise)
         for name, told in (
             ("filter", filtered(frames)),
@@ -294,7 +294,7 @@ def test_bridges_a_dropout_from_both_sides() -> None:
     arm = ARMS["LEFT"]
     dropout = Dropout(2.0, 2.5, arm)
     errors: dict[str, list[FloatArray]] = {"filter": [], "full": []}
-    for seed in range(20, 20 + draws(2, 5)):
+    for seed in range(20, 20 + draws(1, 5)):
         truth, frames = recorded(seed, 3.5, 0.005, MeasurementErrors(0.005, dropouts=(dropout,)))
         for name, told in (("filter", filtered(frames)), ("full", lagged(frames, LONG))):
             for skeleton, _ in told:
@@ -311,9 +311,9 @@ def test_bridges_a_dropout_from_both_sides() -> None:
 
 def test_a_gap_splits() -> None:
     """What lies before it is smoothed as if nothing came after."""
-    _, frames = recorded(8, 4.0, 0.01, MeasurementErrors(0.01, gaps=((1.0, 3.0),)))
+    _, frames = recorded(8, 3.4, 0.01, MeasurementErrors(0.01, gaps=((0.7, 2.7),)))
     result = smooth(frames, learn=False)
-    before = [pair for pair in frames if pair[1].stamp_ns < START_NS + NANOSECONDS]
+    before = [pair for pair in frames if pair[1].stamp_ns < START_NS + 0.7 * NANOSECONDS]
     assert_array_equal(np.unique(result.stretches[: len(before)]), [-1, 0])
     assert_array_equal(np.unique(result.stretches[len(before) :]), [1])
     assert result.counters["gaps"] == 1

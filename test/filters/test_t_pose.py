@@ -15,6 +15,7 @@ from body_tracking.filters.smoother import Smoothed, smooth
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.skeleton import FloatArray, Joint, Skeleton
+from draws import draws
 from walkers import TRACKED, frame, performed
 
 FILTERS = ("lkf_constant_velocity", "ekf")
@@ -23,7 +24,8 @@ ELBOWS, ARMS = (
     for angle in ("elbow_flexion", "shoulder_elevation")
 )
 RATE = 30.0
-HOLDING, MOVING = range(70, 88), range(150, 480)
+SECONDS = draws(8, 16)
+HOLDING, MOVING = range(70, 88), range(150, round(SECONDS * RATE))
 """Frames in which the pose is held and known, and in which the person is at it."""
 GAP = 1.5
 """Seconds: longer than a linear filter goes on for, shorter than the other one."""
@@ -32,7 +34,7 @@ GAP = 1.5
 @cache
 def reaching() -> FloatArray:
     """A T-pose of three seconds, then arms in many directions."""
-    return performed("reaching")[: round(16.0 * RATE)]
+    return performed("reaching")[: MOVING.stop]
 
 
 @cache
@@ -81,6 +83,13 @@ def run(
 
 
 @cache
+def taught(name: str) -> tuple[SkeletonFilter, FloatArray, FloatArray]:
+    """A filter that has seen all of it, the errors of the elbows and their stated deviations."""
+    tested = make_filter(name)
+    return tested, *run(tested)
+
+
+@cache
 def untaught(name: str) -> FloatArray:
     """Errors of the elbows without what a T-pose says."""
     tested = make_filter(name, t_pose=False)
@@ -95,8 +104,7 @@ def rms(errors: FloatArray) -> float:
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_elbows_are_bent_as_they_are_after_a_t_pose(name: str) -> None:
-    with_it = make_filter(name)
-    errors, stddev = run(with_it)
+    with_it, errors, stddev = taught(name)
     assert with_it.counters["t_poses"] == 1
     assert rms(untaught(name)) > 12.0
     assert rms(errors) < 0.4 * rms(untaught(name))
@@ -135,8 +143,7 @@ def test_somebody_else_has_other_joints(name: str) -> None:
 
 
 def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
-    ekf = make_filter("ekf")
-    run(ekf)
+    ekf, _, _ = taught("ekf")
     lengths = ekf.estimate.lengths  # type: ignore[attr-defined]
     true = reaching()[0]
     for name, start, end in (("upper_arm", "SHOULDER", "ELBOW"), ("forearm", "ELBOW", "WRIST")):
@@ -154,24 +161,37 @@ def elbows_off(smoothed: Smoothed) -> FloatArray:
 
 @pytest.mark.slow
 def test_in_a_recording_what_a_t_pose_tells_holds_before_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pose is known after 21 frames. Live, all before is as it was seen; the smoother corrects the first 15, too.
+
+    The bound is a share of the error without the pose, which was above 12 degrees until a posture prior replaced the
+    centre of the ranges of motion, and is 10 degrees since.
+    """
     monkeypatch.setattr(smoother, "_SECTION", 60)
     frames = [("kinect1", each) for each in skeletons()[:240]]
     off = elbows_off(smooth(frames))
-    # the pose is known after 21 frames; live, all before is as it was seen
-    assert rms(off[:15]) < 6.0
-    assert rms(off[150:]) < 6.0
-    assert rms(elbows_off(smooth(frames, EkfParameters(t_pose=False)))[:15]) > 9.0
+    without = elbows_off(smooth(frames, EkfParameters(t_pose=False)))
+    assert rms(off[:15]) < min(5.0, 0.45 * rms(without[:15]))
+    assert rms(off[150:]) < min(5.0, 0.4 * rms(without[150:]))
 
 
-def test_a_recording_is_smoothed_in_sections_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = [("kinect1", each) for each in skeletons()[:120]]
-    whole = smooth(frames, learn=False)
+@pytest.mark.parametrize(("posture", "tolerance"), [(False, 1e-9), pytest.param(True, 1e-5, marks=pytest.mark.slow)])
+def test_a_recording_is_smoothed_in_sections_as_in_one(
+    monkeypatch: pytest.MonkeyPatch, posture: bool, tolerance: float
+) -> None:
+    """The recursion is the same to rounding errors.
+
+    What is handed out of a state takes the uncertainty of the joints' centres as it is known at the end of the section,
+    and posture weighs by it: that moves the output by up to 9 micrometres.
+    """
+    frames = [("kinect1", each) for each in skeletons()[:90]]
+    parameters = EkfParameters(posture=posture)
+    whole = smooth(frames, parameters, learn=False)
     monkeypatch.setattr(smoother, "_SECTION", 25)
-    parts = smooth(frames, learn=False)
+    parts = smooth(frames, parameters, learn=False)
     for one, other in zip(whole.skeletons, parts.skeletons, strict=True):
         assert (one is None) == (other is None)
         if one is not None and other is not None:
-            np.testing.assert_allclose(one.positions, other.positions, atol=1e-5)
+            np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from body_tracking.fusion.sides import HOLD
 from body_tracking.measurement import left_right_axes
 from body_tracking.sensors.csv_recording import CsvRecording
 from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Joint, Skeleton
-from draws import some
+from draws import draws, some
 from walkers import OPTICAL_FROM_LEVEL, TRACKED, about_y, frame, walk
 
 FRAME = 1 / 30
@@ -49,6 +50,7 @@ def truth(times: FloatArray) -> FloatArray:
     return walk(times) @ OPTICAL_FROM_LEVEL
 
 
+@cache
 def frames(seconds: float, noise: float = 0.0, phase: float = 0.013, start: float = 0.0) -> list[Frame]:
     """Both sensors' frames in order of capture; the time of arrival is that of capture."""
     rng = np.random.default_rng(0)
@@ -104,9 +106,12 @@ def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
 def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
     alone = run(fusion(["kinect1"]), [each for each in frames(8.0, 0.02) if each[0] == "kinect1"])
     together = run(fusion(), frames(8.0, 0.02))
-    assert np.nanmean(errors(together)[30:90]) < 0.8 * np.nanmean(
-        errors(alone)[30:90]
-    )  # NaN: a hip was elsewhere at once
+    one, both = errors(alone)[30:90], errors(together)[30:90]
+    # With 20 mm of noise the axis of the hips jumps in some frames. Alone, a sensor has no legs then; they return soon.
+    compared = np.isfinite(one)
+    assert np.isfinite(both).all()
+    assert compared.mean() > 0.99
+    assert both[compared].mean() < 0.8 * one[compared].mean()
     for each, other in zip(alone[30:], together[30:], strict=True):
         assert each.covariances is not None
         assert other.covariances is not None
@@ -132,7 +137,7 @@ def test_disagreement_makes_uncertain() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(6, 15), deadline=None)
 def test_arrival_a_few_milliseconds_earlier_or_later_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     orderly = frames(4.0, 0.01, phase=0.004)

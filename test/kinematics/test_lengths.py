@@ -246,6 +246,7 @@ def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> Non
     assert_allclose(told.lengths, lengths, rtol=0.005)
 
 
+@pytest.mark.slow
 def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
     import_files([shared_data / "kinect_pairs" / "p02_45deg.csv.gz"], tmp_path / "in")
     replay(tmp_path / "in", tmp_path / "out", ReplaySettings(()))

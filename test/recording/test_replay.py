@@ -49,14 +49,14 @@ def contents(bag: Path) -> list[RawMessage]:
         return list(reader.messages())
 
 
-def reference_frames() -> int:
+def reference_frames(recording: Path) -> int:
     """How many frames of the reference sensor there are to be fused."""
-    with BagReader(BAG) as bag:
+    with BagReader(recording) as bag:
         return bag.topics["/kinect1/skeleton"].count
 
 
-def seconds() -> float:
-    with BagReader(BAG) as bag:
+def seconds(recording: Path) -> float:
+    with BagReader(recording) as bag:
         return (bag.end_ns - bag.start_ns) / NANOSECONDS
 
 
@@ -77,38 +77,32 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return run
 
 
-@pytest.fixture(scope="module")
-def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("replay") / "out"
-    replay(BAG, out, ReplaySettings(()))
-    return out
-
-
-def test_everything_that_the_graph_publishes_is_in_the_new_bag(replayed: Path) -> None:
-    with BagReader(replayed) as bag, BagReader(BAG) as original:
+def test_everything_that_the_graph_publishes_is_in_the_new_bag(replayed_wave: Path, wave: Path) -> None:
+    with BagReader(replayed_wave) as bag, BagReader(wave) as original:
         counts = {topic: info.count for topic, info in bag.topics.items()}
         for topic in ("/kinect1/skeleton", "/kinect2/skeleton", graph.TRUE_SKELETON):
             assert counts[topic] == original.topics[topic].count
-        assert counts["/fused/skeleton"] == counts["/filtered/skeleton"] == counts[ANGLES] > 0.9 * reference_frames()
+        assert counts["/fused/skeleton"] == counts["/filtered/skeleton"] == counts[ANGLES]
+        assert counts[ANGLES] > 0.9 * reference_frames(wave)
         assert counts[f"{ANGLES}_stddev"] == counts[ANGLES]
         assert counts["/calibration"] >= 2
         assert counts["/calibration/clock"] >= 1
 
 
-def test_the_same_bag_gives_the_same_messages(replayed: Path, tmp_path: Path) -> None:
-    replay(BAG, tmp_path / "again", ReplaySettings(()))
-    assert contents(tmp_path / "again") == contents(replayed)
+def test_the_same_bag_gives_the_same_messages(replayed_wave: Path, wave: Path, tmp_path: Path) -> None:
+    replay(wave, tmp_path / "again", ReplaySettings(()))
+    assert contents(tmp_path / "again") == contents(replayed_wave)
 
 
 @pytest.mark.parametrize("filter_name", some([DEFAULT_FILTER, "ekf"]))
 def test_one_process_and_two_give_the_same_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
+    wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
 ) -> None:
     settings = ReplaySettings((), filter_name=filter_name)
     reports = {}
     for stage in (Downstream, ForkedDownstream):
         monkeypatch.setattr(replay_module, "start_downstream", stage)
-        reports[stage] = replay(BAG, tmp_path / stage.__name__, settings)
+        reports[stage] = replay(wave, tmp_path / stage.__name__, settings)
     assert contents(tmp_path / "Downstream") == contents(tmp_path / "ForkedDownstream")
     assert reports[Downstream].counters == reports[ForkedDownstream].counters
 
@@ -124,7 +118,9 @@ class Owner:
             file.write(f"{os.getpid()}\n")
 
 
-def test_the_other_process_does_not_take_down_what_it_inherits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_other_process_does_not_take_down_what_it_inherits(
+    wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Collecting(Downstream):
         def finish(self) -> stages.Written:
             gc.collect()
@@ -137,7 +133,7 @@ def test_the_other_process_does_not_take_down_what_it_inherits(tmp_path: Path, m
     gc.set_threshold(10**9)  # the garbage is still there at the fork
     try:
         Owner(notes)
-        replay(BAG, tmp_path / "out", ReplaySettings(()))
+        replay(wave, tmp_path / "out", ReplaySettings(()))
     finally:
         gc.set_threshold(*thresholds)
     assert gc.isenabled()
@@ -163,22 +159,22 @@ MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.segments_topi
 
 
 @pytest.fixture(scope="module")
-def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extended(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     out = tmp_path_factory.mktemp("extended") / "out"
-    replay(BAG, out, ReplaySettings((), filter_name="ekf", convention="isb"))
+    replay(wave, out, ReplaySettings((), filter_name="ekf", convention="isb"))
     return out
 
 
-def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed: Path) -> None:
-    with BagReader(extended) as bag, BagReader(replayed) as linear:
+def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed_wave: Path, wave: Path) -> None:
+    with BagReader(extended) as bag, BagReader(replayed_wave) as linear:
         counts = {topic: info.count for topic, info in bag.topics.items()}
         assert not set(MODEL_TOPICS) & set(linear.topics)
         assert graph.MODEL_COVARIANCE not in bag.topics
         first = deserialize(JOINT_STATE, next(iter(bag.messages([ANGLES]))).cdr)
         frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
     for topic in (*MODEL_TOPICS, ANGLES, f"{ANGLES}_stddev"):
-        assert counts[topic] == counts["/filtered/skeleton"] > reference_frames()
-    assert 1 <= counts[graph.urdf_topic("body1")] <= 1 + seconds()  # at most once a second
+        assert counts[topic] == counts["/filtered/skeleton"] > reference_frames(wave)
+    assert 1 <= counts[graph.urdf_topic("body1")] <= 1 + seconds(wave)  # at most once a second
     assert tuple(first.name) == tuple(f"{name}_body1" for name in convention("isb", UpperBody()).names)
     assert first.header.frame_id == "isb"
     # Two sensors out of step, each frame at its own time: more than the reference sensor has, and in order.
@@ -187,25 +183,23 @@ def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed: Pa
 
 
 def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else_changes(
-    extended: Path, tmp_path: Path
+    extended: Path, wave: Path, tmp_path: Path
 ) -> None:
     settings = ReplaySettings((), filter_name="ekf", convention="isb", model_covariance=True)
-    report = replay(BAG, tmp_path / "whole", settings)
+    report = replay(wave, tmp_path / "whole", settings)
     whole = contents(tmp_path / "whole")
     assert sum(raw.topic == graph.MODEL_COVARIANCE for raw in whole) == report.frames
     assert [raw for raw in whole if raw.topic != graph.MODEL_COVARIANCE] == contents(extended)
 
 
 @pytest.mark.parametrize("filter_name", some(["schlagenhauf_ekf", "lkf_constant_velocity"]))
-def test_every_filter_gives_the_angles_of_a_model(tmp_path: Path, filter_name: str) -> None:
-    report = replay(BAG, tmp_path / "out", ReplaySettings((), filter_name=filter_name, convention="model"))
+def test_every_filter_gives_the_angles_of_a_model(wave: Path, tmp_path: Path, filter_name: str) -> None:
+    report = replay(wave, tmp_path / "out", ReplaySettings((), filter_name=filter_name, convention="model"))
     with BagReader(tmp_path / "out") as bag:
-        assert (
-            bag.topics[ANGLES].count
-            == bag.topics["/filtered/skeleton"].count
-            == report.frames
-            > 0.75 * reference_frames()
-        )
+        assert bag.topics[ANGLES].count == bag.topics["/filtered/skeleton"].count == report.frames
+        calibrating = report.counters.get("filter calibrating", 0)  # frames from which a filter learns the person
+        assert calibrating <= 50
+        assert report.frames + calibrating > 0.9 * reference_frames(wave)
         last = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([ANGLES])][-1]
         stddev = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([f"{ANGLES}_stddev"])][-1]
     known = dict(zip(last.name, stddev.position, strict=True))
@@ -216,13 +210,13 @@ def test_every_filter_gives_the_angles_of_a_model(tmp_path: Path, filter_name: s
 def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Path) -> None:
     with BagReader(BAG) as bag, BagWriter(tmp_path / "gap") as writer:
         topics = [topic for topic in bag.topics if topic.startswith("/kinect")]
-        start, end = bag.start_ns + 8 * NANOSECONDS, bag.start_ns + 9 * NANOSECONDS
+        start, end = bag.start_ns + 4 * NANOSECONDS, bag.start_ns + 5 * NANOSECONDS
         for topic in topics:
             writer.add_topic(topic, bag.topics[topic].type_name)
         for raw in bag.messages(topics):
             if not start <= raw.log_time_ns < end:
                 writer.write(raw.topic, raw.cdr, raw.log_time_ns)
-            if raw.log_time_ns > end + 2 * NANOSECONDS:
+            if raw.log_time_ns > end + NANOSECONDS // 2:
                 break
     report = replay(tmp_path / "gap", tmp_path / "out", ReplaySettings((), filter_name="ekf"))
     with BagReader(tmp_path / "out") as bag:
@@ -251,36 +245,34 @@ def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
     return found, right
 
 
-def test_the_angles_follow_the_truth(replayed: Path, tmp_path: Path) -> None:
+def test_the_angles_follow_the_truth(replayed_wave: Path, tmp_path: Path) -> None:
     """Exactly where sensors only lose frames and their clocks differ; up and down with it where they err as they do."""
     errors = KinectErrors()
     clean = replace(KinectErrors.none(), white=errors.white, lost=errors.lost, delay=errors.delay)
-    write_bag(simulate(Setup("two_handed_wave", standard=True, errors=clean)), tmp_path / "clean")
+    write_bag(simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=clean)), tmp_path / "clean")
     replay(tmp_path / "clean", tmp_path / "out", ReplaySettings(()))
     found, truth = elbows(tmp_path / "out")
     assert np.degrees(np.sqrt(np.nanmean((found - truth) ** 2, axis=1))).max() < 3.0
-    for found, truth in zip(*elbows(replayed), strict=True):
+    for found, truth in zip(*elbows(replayed_wave), strict=True):
         known = np.isfinite(found)
         assert np.corrcoef(found[known], truth[known])[0, 1] > 0.8
 
 
-def test_the_command_ends_with_what_it_did(tmp_path: Path, command: Command) -> None:
-    words = ("replay", BAG, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
-    done = subprocess.run(
-        [sys.executable, "-m", "body_tracking.cli", *map(str, words)], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["frames"] > 0.9 * reference_frames()
-    assert report["recording_s"] == pytest.approx(seconds(), abs=0.1)
+def test_the_command_ends_with_what_it_did(wave: Path, tmp_path: Path, command: Command) -> None:
+    words = ("replay", wave, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
+    code, shown, error = command(*words)
+    assert code == 0, error
+    report = json.loads(shown)
+    assert report["frames"] > 0.9 * reference_frames(wave)
+    assert report["recording_s"] == pytest.approx(seconds(wave), abs=0.1)
     assert 0.0 < report["elapsed_s"] < 60.0
-    code, _, error = command("replay", BAG, "-o", tmp_path / "out")
+    code, _, error = command("replay", wave, "-o", tmp_path / "out")
     assert code == 2
     assert error.count("\n") == 1
-    assert command("replay", BAG, "-o", tmp_path / "out", "--overwrite")[0] == 0
+    assert command("replay", wave, "-o", tmp_path / "out", "--overwrite")[0] == 0
 
 
-def test_calibrate_prints_poses_and_clocks(tmp_path: Path, command: Command) -> None:
+def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: Command) -> None:
     with BagReader(BAG) as bag:
         transforms = [deserialize(TRANSFORM, raw.cdr) for raw in bag.messages([graph.TRUE_CALIBRATION])]
         references = [deserialize(TIME_REFERENCE, raw.cdr) for raw in bag.messages([graph.TRUE_CLOCK])]
@@ -305,7 +297,7 @@ def test_calibrate_prints_poses_and_clocks(tmp_path: Path, command: Command) -> 
     assert "kinect2: at (" in command("calibrate", BAG, "--method", "thesis")[1]
     # A saved calibration can be used from the first frame on.
     code, out, error = command(
-        "replay", BAG, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json"
+        "replay", wave, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json"
     )
     assert code == 0, error
     assert json.loads(out)["counters"].get("fusion uncalibrated", 0) == 0
@@ -374,11 +366,13 @@ def test_an_error_of_the_first_stage_ends_both_processes_and_leaves_no_bag(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_error_of_the_first_stage_leaves_the_bag_that_was_to_be_replaced(tmp_path: Path, replayed: Path) -> None:
-    shutil.copytree(replayed, tmp_path / "out")
+def test_an_error_of_the_first_stage_leaves_the_bag_that_was_to_be_replaced(
+    tmp_path: Path, replayed_wave: Path
+) -> None:
+    shutil.copytree(replayed_wave, tmp_path / "out")
     with pytest.raises(BodyTrackingError, match="kinect9"):
         replay(BAG, tmp_path / "out", ReplaySettings((), reference="kinect9"), overwrite=True)
-    assert contents(tmp_path / "out") == contents(replayed)
+    assert contents(tmp_path / "out") == contents(replayed_wave)
 
 
 def test_an_error_while_frames_come_ends_both_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

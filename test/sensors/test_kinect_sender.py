@@ -91,12 +91,12 @@ def test_a_recording_comes_through_as_it_is_and_the_sender_survives_the_receiver
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen([*COMMAND, *arguments], stderr=log)
     try:
-        first = received(source, 30)
+        first = received(source, 15)
         source.close()
         source.read(0.0)
         time.sleep(0.3)
         source = NetworkSource(SourceSettings("left", device="kinect1", port=port, key_file=str(file)))
-        second = received(source, 30)
+        second = received(source, 15)
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(20.0) == 0

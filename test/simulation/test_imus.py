@@ -34,6 +34,7 @@ from body_tracking.simulation.imus import (
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, FloatArray
+from draws import some
 
 UP = np.array([0.0, 0.0, 1.0])
 AT_ORIGIN = Mounting(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -665,7 +666,7 @@ def test_iron_turns_the_heading_to_its_field_while_it_is_there() -> None:
     assert heading[-1] == pytest.approx(0.0, abs=degrees(0.1))
 
 
-@pytest.mark.parametrize("errors", [CONSUMER, GOOD])
+@pytest.mark.parametrize("errors", some([CONSUMER, GOOD]))
 def test_the_stated_heading_deviation_grows_with_the_drift_and_covers_it(errors: ImuErrors) -> None:
     errors = replace(errors, stated_heading=0.0, tissue_sag=0.0, lost=0.0, outages=0.0)
     normalised, stated = [], []

@@ -25,6 +25,7 @@ from body_tracking.simulation.scene import (
     simulate,
 )
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from draws import draws
 
 SHORT = 12.0
 """Seconds: enough for a repetition of most motions, with their T-poses."""
@@ -63,7 +64,7 @@ def test_other_errors_leave_people_clocks_and_captures_as_they_are() -> None:
     assert [sensor.clock for sensor in one.sensors] == [sensor.clock for sensor in other.sensors]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 @given(seed=st.integers(0, 1000), number=st.sampled_from(NUMBERS))
 def test_without_errors_the_sensors_tell_where_the_joints_are(seed: int, number: int) -> None:
     recording = simulate(Setup("two_handed_wave", layout(number), seconds=SHORT, seed=seed, errors=KinectErrors.none()))
