@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -366,42 +366,30 @@ def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
 # --- the whole of it
 
 
-def true_joints(mapping: RobotMapping, stamps: FloatArray) -> FloatArray:
-    """(n, joints) where a mapping would have a robot stand by the true pose of the person in the recording.
+def joints_of(mapping: RobotMapping, angles: Sequence[tuple[float, JointState]], when: FloatArray) -> FloatArray:
+    """(n, joints) where a mapping would have a robot stand by the angles that the graph published.
 
     Args:
         mapping: the robot's.
-        stamps: (n,) seconds of the recording's clock.
+        angles: with the wall times at which they came, seconds.
+        when: (n,) wall times.
     """
-    model = UpperBody()
-    covariance = 1e-6 * np.eye(2 * model.nv)
-    times, joints = [], []
-    with BagReader(BAG) as reader:
-        for raw in reader.messages([graph.TRUE_MODEL_STATE]):
-            state = joint_state_to_model(deserialize("sensor_msgs/msg/JointState", raw.cdr), model)
-            angles = angles_of(state_estimate(model, *state, covariance), model, "isb")
-            person = np.array([angles.position[angles.names.index(name)] for name in mapping.angles])
-            times.append(raw.log_time_ns / NANOSECONDS)
-            joints.append(mapping.matrix @ person + mapping.offset)
-    whole = np.unwrap(np.array(joints), axis=0)
+    names = angles[0][1].name
+    places = [names.index(f"{name}_body1") for name in mapping.angles]
+    person = np.array([np.array(each.position)[places] for _, each in angles])
+    whole = np.unwrap(person @ mapping.matrix.T + mapping.offset, axis=0)
     whole += 2.0 * np.pi * np.round((mapping.home - whole[0]) / (2.0 * np.pi))
-    return np.stack([np.interp(stamps, times, column) for column in whole.T], axis=1)
-
-
-WINDOW = (6.0, 9.5)
-"""Seconds of the recording in which the arm is compared with the person."""
-
-
-def first_stamp() -> float:
-    """Seconds of the recording's clock at its beginning."""
-    with BagReader(BAG) as reader:
-        return next(iter(reader.messages([graph.TRUE_MODEL_STATE]))).log_time_ns / NANOSECONDS
+    times = [came for came, _ in angles]
+    return np.stack([np.interp(when, times, column) for column in whole.T], axis=1)
 
 
 @pytest.mark.alone
 def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_die(tmp_path: Path) -> None:
     with Robots(tmp_path) as robots:
         arm = robots.arms["two_joint_arm"]
+        angles: list[tuple[float, JointState]] = []
+        topic = graph.joint_states_topic("body1")
+        robots.node.create_subscription(JointState, topic, lambda each: angles.append((time.time(), each)), RELIABLE)
         words = ["--bag", BAG, "--filter", "ekf", "--robot", mapping_file("two_joint_arm"), "--log-dir", tmp_path]
         with (tmp_path / "up.log").open("wb") as log:
             up = robots.processes["up"] = subprocess.Popen(
@@ -415,25 +403,24 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
             return robots.diagnostics.get("robot_commands", {}).get("state")
 
         assert robots.until(lambda: state() == State.FOLLOWING, 60.0), (robots.log("up"), robots.diagnostics)
-        # a window of the recording, so that what is compared does not depend on how soon the robot followed
-        begin, end = (first_stamp() + second for second in WINDOW)
-        assert robots.until(lambda: arm.told[-1][1] > end and arm.moving(), 60.0), robots.log("up")
+        begun = len(arm.told)
+        assert robots.until(lambda: len(arm.told) > begun + 350 and arm.moving(), 60.0), robots.log("up")
         (player,) = [each for each in psutil.Process(up.pid).children() if "bag_player" in each.cmdline()]
         killed = time.time()
         player.kill()
         assert robots.until(lambda: state() == State.HOLDING), robots.log("up")
-        followed = [each for each in arm.told if each[1] > begin and each[0] < killed]
+        followed = [each for each in arm.told[begun:] if each[0] < killed]
         after = [each for each in arm.told if each[0] >= killed]
         assert robots.until(lambda: state() == State.FOLLOWING), robots.log("up")
         assert robots.until(lambda: "| robot following: " in robots.log("up"), 10.0)  # the status line, every 5 s
         assert stop(up) == 0, robots.log("up")
-    told, stamps = np.array([each[2] for each in followed]), np.array([each[1] for each in followed])
-    true = true_joints(arm.mapping, stamps)
-    off = np.degrees(np.sqrt(np.mean(np.square(told - true), axis=0)))
-    assert len(told) > 250 and np.ptp(told[:, 1]) > np.radians(50.0)
-    # two Kinects know where a shoulder is raised to; an elbow that is nearly straight they see bent
-    assert off[0] < 5.0 and off[1] < 20.0, off
-    assert np.corrcoef(told[:, 1], true[:, 1])[0, 1] > 0.9
+    told, came = np.array([each[2] for each in followed]), np.array([each[0] for each in followed])
+    # how late a command is depends on the machine, where it leads does not
+    late = [joints_of(arm.mapping, angles, came - delay) for delay in np.arange(0.0, 0.5, 0.02)]
+    wanted = min(late, key=lambda each: float(np.square(told - each).mean()))
+    off = np.degrees(np.sqrt(np.mean(np.square(told - wanted), axis=0)))
+    assert np.ptp(told[:, 1]) > np.radians(50.0)
+    assert (off < 8.0).all(), off  # a waving elbow is faster than the robot's limits: 5 deg are theirs
     # up to when diagnostics said that it held, its commands changed for a tenth of a second
     last = max((k for k in range(1, len(after)) if (after[k][2] != after[k - 1][2]).any()), default=0)
     assert len(after) > last + 1
