@@ -289,6 +289,8 @@ ROLES: Final[Mapping[str, FilterRole]] = {
     "lkf_zero_velocity": FilterRole(),
     "lkf_constant_velocity": FilterRole(),
     "ekf": FilterRole(SENSORS_INPUT, MODEL_INPUT, "model"),
+    "thesis_lkf1": FilterRole(),
+    "thesis_lkf2": FilterRole(),
     "schlagenhauf_ekf": FilterRole(convention="model"),
 }
 """Of each filter in ``filters.FILTERS``."""
