@@ -46,7 +46,7 @@ class ThesisResult:
 def run_thesis(
     frames: Sequence[RecordedFrame], sensors: Sequence[str], methods: Sequence[str] = (LKF1, LKF2, EKF)
 ) -> ThesisResult:
-    """Her pipeline over frames in the order of receipt.
+    """Her pipeline (figure 5.1) over frames in the order of receipt.
 
     Args:
         frames: of all sensors.

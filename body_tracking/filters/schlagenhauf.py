@@ -109,6 +109,8 @@ class SchlagenhaufParameters:
 class SchlagenhaufKalmanFilter:
     """Her filter on her model, one step of ``filterpy.kalman.ExtendedKalmanFilter`` a frame.
 
+    The model of eq. 3.22-3.26 is that of eq. 5.13-5.16: f is linear, h the model's forward kinematics (eq. 5.19).
+
     Attributes:
         parameters: the settings.
         model: her model, placed where the subject stood; at the origin until calibrated.
@@ -223,7 +225,10 @@ class SchlagenhaufKalmanFilter:
         self._t_pose.clear()
 
     def _filter(self, positions: FloatArray, measured: BoolArray) -> None:
-        """Predict (lines 2-3) and update (lines 5-9) with (10, 3) metres, of which (10,) are measured."""
+        """Predict (lines 2-3) and update (lines 5-9) with (10, 3) metres, of which (10,) are measured.
+
+        A joint that is not measured has neither innovation nor gain (section 5.5.2, eq. 5.21-5.22).
+        """
         kalman, n = self._kalman, self.model.nq
         kalman.predict()
         here = self.model.linearise(kalman.x[:n], self.lengths)

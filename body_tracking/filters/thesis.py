@@ -91,6 +91,9 @@ class ThesisLkfParameters:
 class _ThesisLinearFilter(ABC):
     """Algorithm 1 for 25 joints at once: stacks of the thesis's vectors and matrices, one of each joint.
 
+    The model is s(k+1) = F s(k) + w(k) and z(k) = H s(k) + v(k): eq. 3.12-3.13 without an input u, and eq. 3.6-3.7,
+    where F and H are called A and C.
+
     Attributes:
         parameters: the settings.
         F: (n, n) state transition, n = 3 or 6.
@@ -157,9 +160,9 @@ class _ThesisLinearFilter(ABC):
     def _step(self, z: FloatArray, measured: BoolArray) -> None:
         """Predict and update all joints, with (25, 3) metres, of which (25,) are measured; unknown ones do not matter.
 
-        The gain is zero where a joint is missing (section 5.5.2), so that lines 7 and 8 leave the prediction (eq.
-        5.21-5.22). Line 8 is computed in Joseph's form, which is the same matrix: as printed it loses its digits where
-        a joint is measured again that was hidden for long, and may come out negative.
+        Eq. 3.16-3.21. The gain is zero where a joint is missing (section 5.5.2), so that lines 7 and 8 leave the
+        prediction (eq. 5.21-5.22). Line 8 is computed in Joseph's form, which is the same matrix: as printed it loses
+        its digits where a joint is measured again that was hidden for long, and may come out negative.
         """
         F, H, Q, R = self.F, self.H, self.Q, self.R
         self.s = self.s @ F.T  # line 2, eq. 3.16
@@ -191,7 +194,7 @@ class _ThesisLinearFilter(ABC):
 
 
 class ThesisLkf1(_ThesisLinearFilter):
-    """LKF1: the zero-velocity model (eq. 5.11; 3.6-3.9), whose state is a joint's position, s = [x y z]."""
+    """LKF1: the zero-velocity model (eq. 3.8-3.9, 5.11), whose state is a joint's position, s = [x y z]."""
 
     @staticmethod
     def _model(time_step: float) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +203,7 @@ class ThesisLkf1(_ThesisLinearFilter):
 
 
 class ThesisLkf2(_ThesisLinearFilter):
-    """LKF2: the constant-velocity model (eq. 5.12; 3.10-3.11), s = [x y z vx vy vz]."""
+    """LKF2: the constant-velocity model (eq. 3.10-3.11, 5.12), s = [x y z vx vy vz]."""
 
     @staticmethod
     def _model(time_step: float) -> tuple[FloatArray, FloatArray]:
