@@ -1,9 +1,9 @@
 """Our filters against the thesis's on the project's own recordings, of which the truth is known.
 
 Each recording in ``bags/`` goes through the offline graph, which calibrates the two sensors and fuses them. The fused
-skeletons then go through the thesis's filter, through the linear one and through ``ekf``, and the sensors' own frames,
-unpaired, through ``ekf`` as the graph runs it; all at default settings. What is compared begins when all of them have
-begun: the thesis's filter takes 50 frames in the T-pose.
+skeletons then go through the thesis's filters, the linear ones and ``ekf``, and the sensors' own frames, unpaired,
+through ``ekf`` as the graph runs it; all at default settings. What is compared begins when all of them have begun: the
+thesis's extended filter takes 50 frames in the T-pose.
 
 position  distance of the ten joints of the thesis's model from the truth in ``world``, RMS and mean, mm. "fitted":
           after the rigid transform that brings all of them closest to the truth over the whole recording (Umeyama
@@ -59,7 +59,7 @@ BAGS = Path(__file__).parent.parent / "bags"
 TWIST = "tpose_torso_twist"
 BAR = 0.6
 THESIS, EKF = "schlagenhauf_ekf", "ekf"
-FUSED_FILTERS = (THESIS, "lkf_constant_velocity", EKF)
+FUSED_FILTERS = (THESIS, "thesis_lkf1", "thesis_lkf2", "lkf_zero_velocity", "lkf_constant_velocity", EKF)
 BY_SENSOR = "ekf, both sensors"
 
 TEN = Schlagenhauf26().joints

@@ -289,6 +289,8 @@ ROLES: Final[Mapping[str, FilterRole]] = {
     "lkf_zero_velocity": FilterRole(),
     "lkf_constant_velocity": FilterRole(),
     "ekf": FilterRole(SENSORS_INPUT, MODEL_INPUT, "model"),
+    "thesis_lkf1": FilterRole(),
+    "thesis_lkf2": FilterRole(),
     "schlagenhauf_ekf": FilterRole(convention="model"),
 }
 """Of each filter in ``filters.FILTERS``."""
@@ -626,6 +628,8 @@ class GraphOptions:
 
 def nodes_for(options: GraphOptions) -> tuple[NodeSpec, ...]:
     """The nodes of a graph; sources last, so that those who listen are there first.
+
+    With two sensors and a filter it is the process of Schlagenhauf (2017), figure 5.1.
 
     Raises:
         GraphError: no sensor, or one twice; a filter was asked for what it cannot do.

@@ -33,7 +33,7 @@ class SkeletonError(BodyTrackingError):
 
 
 class Joint(IntEnum):
-    """The joints of the Kinect v2 SDK (``JointType``), in its order."""
+    """The joints of the Kinect v2 SDK (``JointType``), in its order; Schlagenhauf (2017), table 4.2, counts from 1."""
 
     SPINE_BASE = 0
     SPINE_MID = 1

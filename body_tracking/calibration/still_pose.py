@@ -69,6 +69,8 @@ def still_pose_registration(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Average what two sensors saw of one pose, and register the averages on every joint that both track.
 
+    Schlagenhauf 2017, section 5.3.1; she takes all 25 joints of a T-pose.
+
     Args:
         reference: positions (n, 25, 3) metres and states (n, 25) of the reference sensor.
         sensor: the same of the other.

@@ -125,7 +125,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """What takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation``.
+    """What takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation`` (thesis, eq. 4.1).
 
     Attributes:
         delay: s by which the estimate follows the truth.
@@ -145,7 +145,7 @@ class Alignment:
 
 
 def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: float = 0.0) -> float:
-    """The constant time by which an estimate follows the truth, by least squares.
+    """The constant time by which an estimate follows the truth, by least squares (thesis, sections 4.3.2 and 5.7.1).
 
     The delay with which ``R e_j(t) + b_j - truth_j(t - delay)`` has the least mean square over times and joints, where
     the rotation R and an offset b_j of each joint are free: for a delay both have a closed form (Umeyama 1991, each
@@ -199,7 +199,9 @@ def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: 
 
 
 def align(estimate: Trajectory, truth: Curve, delay: float) -> Alignment:
-    """The rigid transform over the whole recording with the least squares over all joints (thesis eq. 5.1-5.7).
+    """The rigid transform over the whole recording with the least squares over all joints (thesis, section 5.7.1).
+
+    The registration is that of the thesis, eq. 5.1-5.7.
 
     Args:
         estimate: at its own times.
@@ -228,12 +230,12 @@ def grid(first: float, last: float, rate: float = RATE) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointErrors:
-    """Differences of k joints over time; metres.
+    """Differences of k joints over time; metres. The thesis's MAE and MAD are those of its tables 5.2-5.3 and E.1.
 
     Attributes:
         frames: (k,) instants at which both are known.
-        mae: (k, 3) mean absolute error along each axis (the thesis's MAE).
-        largest: (k, 3) the largest (the thesis's MAD).
+        mae: (k, 3) mean absolute error along each axis.
+        largest: (k, 3) the largest (MAD).
         mean: (k,) mean distance.
         rms: (k,) root mean square distance.
         farthest: (k,) largest distance.
@@ -402,7 +404,7 @@ class AngleErrors:
 
 
 def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None = None) -> AngleErrors:
-    """Compare angles at the same instants; 359 deg and 1 deg are 2 deg apart.
+    """Compare angles at the same instants; 359 deg and 1 deg are 2 deg apart. RMSE: thesis, eq. 4.2.
 
     Args:
         found: (n, m) radians.

@@ -3,7 +3,7 @@
 Source: Vicon, "Plug-in Gait Reference Guide" (marker placement, joint centres by the chord function, segments, angles);
 Davis, Ounpuu, Tyburski and Gage, Human Movement Science 10 (1991), for the hip. Gaps shorter than 0.2 s are filled by
 splines and the trajectories smoothed by splines under generalised cross-validation (Woltring 1986), as Schlagenhauf
-did (2017, 5.6.3).
+did (2017, section 5.6.3).
 
 Joint centres. From the same markers and measurements, unsmoothed, shoulder, elbow, wrist, hand and hip are Vicon's own
 to below a micrometre. With ``r`` the marker's radius and :func:`chord` the chord function:
@@ -63,7 +63,7 @@ from body_tracking.files import open_regular
 from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, Joint
 
 LONGEST_GAP = 0.2
-"""Seconds from which on a gap is left open (Schlagenhauf 2017, 5.6.3)."""
+"""Seconds from which on a gap is left open (Schlagenhauf 2017, section 5.6.3)."""
 
 THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")
 ARM_MARKERS = ("SHO", "ELB", "WRA", "WRB")
@@ -74,7 +74,7 @@ MARKERS: tuple[str, ...] = (
     *(side + name for side in "LR" for name in (*ARM_MARKERS, "FIN")),
     *("LASI", "RASI", "LPSI", "RPSI"),
 )
-"""The markers that are used; SACR stands in for LPSI and RPSI."""
+"""The markers that are used; SACR stands in for LPSI and RPSI. Schlagenhauf 2017, figures 5.4-5.6, table C.1."""
 
 ACROMION_TO_SHOULDER = 0.12
 """Shoulder centre from the acromion marker, in distances between the acromia."""
@@ -360,7 +360,7 @@ def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, t
 
 
 def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> tuple[FloatArray, FloatArray]:
-    """Joint centres as the module's docstring tells.
+    """Joint centres as the module's docstring tells; the truth of Jatesiktat et al. (2018), section IV-A.
 
     Args:
         markers: (n, 3) metres each; all of :data:`MARKERS`, NaN where unknown.
@@ -460,7 +460,7 @@ def arm_angles(positions: FloatArray, thorax: FloatArray) -> ArmAngles:
 
 
 def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> FloatArray:
-    """A trajectory with its gaps shorter than ``longest`` filled by cubic splines.
+    """A trajectory with its gaps shorter than ``longest`` filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
 
     A spline goes through all that is known between two longer gaps. What precedes the first known sample and follows
     the last one stays unknown.
@@ -485,9 +485,9 @@ def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> 
 def smooth(values: FloatArray) -> FloatArray:
     """Every stretch of known samples replaced by its smoothing spline under generalised cross-validation.
 
-    The cubic spline minimises the squared residuals plus ``lambda`` times the integral of the squared second
-    derivative. One ``lambda`` serves the coordinates of a stretch together and minimises (Craven and Wahba 1979;
-    Woltring, Adv. Eng. Softw. 8, 1986)::
+    As Schlagenhauf 2017, section 5.6.3, but for the order of the spline. The cubic spline minimises the squared
+    residuals plus ``lambda`` times the integral of the squared second derivative. One ``lambda`` serves the coordinates
+    of a stretch together and minimises (Craven and Wahba 1979; Woltring, Adv. Eng. Softw. 8, 1986)::
 
         GCV = mean squared residual / (1 - trace of the influence matrix / n)^2
 

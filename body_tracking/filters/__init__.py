@@ -24,6 +24,8 @@ _FILTERS: Final = {
     "lkf_zero_velocity": _LINEAR,
     "lkf_constant_velocity": _LINEAR,
     "ekf": ("ekf", "ExtendedKalmanFilter", "EkfParameters", "ekf."),
+    "thesis_lkf1": ("thesis", "ThesisLkf1", "ThesisLkfParameters", "thesis_lkf."),
+    "thesis_lkf2": ("thesis", "ThesisLkf2", "ThesisLkfParameters", "thesis_lkf."),
     "schlagenhauf_ekf": ("schlagenhauf", "SchlagenhaufKalmanFilter", "SchlagenhaufParameters", "schlagenhauf_ekf."),
 }
 

@@ -27,6 +27,7 @@ from scipy.special import chdtri
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.errors import BodyTrackingError
+from body_tracking.filters.arrival import Arrival, Arrivals
 from body_tracking.filters.stacked import Stacked
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
@@ -34,7 +35,6 @@ from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     BONES,
     N_JOINTS,
-    NANOSECONDS,
     BoolArray,
     FloatArray,
     IntArray,
@@ -242,27 +242,15 @@ class LinearKalmanFilter:
         self._fading_time: FloatArray = 2.0 * p.initial_velocity_stddev**2 / joint_densities(densities)
         self._gate = float(chdtri(3, 1.0 - p.gate_probability))
         self.counters: dict[str, int] = dict.fromkeys(
-            (
-                "frames",
-                "measured",
-                "predicted",
-                "rejected",
-                "reacquired",
-                "lost",
-                "damaged",
-                "repeated_stamps",
-                "late_frames",
-                "backward_jumps",
-                "gaps",
-                "frame_changes",
-            ),
-            0,
+            ("measured", "predicted", "rejected", "reacquired", "lost", "damaged"), 0
         )
+        self._arrivals = Arrivals(self.counters, p.reorder_window, p.reset_gap)
         self._centres = JointCentres(self.counters)
         self._restart()
 
     def reset(self) -> None:
         """Forget the person; the counters stay."""
+        self._arrivals.reset()
         self._centres.reset()
         self._restart()
 
@@ -274,8 +262,6 @@ class LinearKalmanFilter:
         self._kalman = KalmanFilter(dim_x=size, dim_z=3)
         self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))
         self._kalman.P = Stacked.of(np.broadcast_to(np.eye(size), (N_JOINTS, size, size)).copy())
-        self._frame_id: str | None = None
-        self._stamp_ns = 0
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
         self._level: FloatArray = np.zeros(N_JOINTS)
@@ -296,9 +282,14 @@ class LinearKalmanFilter:
             infinite covariance where it is lost or was never seen. None where the stamp repeats the last one or is a
             little older, or no joint is known.
         """
-        step = self._step(skeleton)
-        if step is None:
+        arrival = self._arrivals.take(skeleton)
+        if arrival is Arrival.IGNORED:
             return None
+        if arrival is Arrival.AFTER_JUMP:
+            self._centres.reset()
+        if arrival is not Arrival.NEXT:  # after a gap it is still the same person
+            self._restart()
+        step = self._arrivals.elapsed if arrival is Arrival.NEXT else 0.0
         if self.parameters.t_pose:
             self._centres.see(skeleton)
         positions, measured = self._measurement(skeleton)
@@ -315,36 +306,6 @@ class LinearKalmanFilter:
         slow = self._centres.remaining(slow, np.where(measured[:, None], positions, np.nan), skeleton.stamp_ns)
         self._slow = np.where(used[:, None, None], slow, self._slow)
         return self._output(skeleton, used)
-
-    def _step(self, skeleton: Skeleton) -> float | None:
-        """Seconds since the last frame; 0 for a first one, None for one to ignore."""
-        p = self.parameters
-        elapsed_ns = skeleton.stamp_ns - self._stamp_ns
-        if self._frame_id is not None:
-            reason = None
-            # the number of the body may change, as sensors number it differently; its place must not jump
-            if skeleton.frame_id != self._frame_id:
-                reason = "frame_changes"
-            elif elapsed_ns == 0:
-                self.counters["repeated_stamps"] += 1
-                return None
-            elif -p.reorder_window * NANOSECONDS <= elapsed_ns < 0:
-                self.counters["late_frames"] += 1
-                return None
-            elif elapsed_ns < 0:
-                reason = "backward_jumps"
-            elif elapsed_ns > p.reset_gap * NANOSECONDS:
-                reason = "gaps"
-            if reason is not None:
-                self.counters[reason] += 1
-                if reason == "gaps":  # it is still the same person
-                    self._restart()
-                else:
-                    self.reset()
-        step = 0.0 if self._frame_id is None else elapsed_ns / NANOSECONDS
-        self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
-        self.counters["frames"] += 1
-        return step
 
     def _measurement(self, skeleton: Skeleton) -> tuple[FloatArray, BoolArray]:
         """(25, 3) positions without a NaN or infinity, (25,) which of them are measurements."""

@@ -18,13 +18,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from body_tracking.filters.arrival import Arrival, Arrivals
 from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.measurement import left_right_axes
 from body_tracking.parameters import check_fields, number_field
 from body_tracking.skeleton import (
     N_JOINTS,
-    NANOSECONDS,
     BoolArray,
     FloatArray,
     IntArray,
@@ -109,6 +109,8 @@ class SchlagenhaufParameters:
 class SchlagenhaufKalmanFilter:
     """Her filter on her model, one step of ``filterpy.kalman.ExtendedKalmanFilter`` a frame.
 
+    The model of eq. 3.22-3.26 is that of eq. 5.13-5.16: f is linear, h the model's forward kinematics (eq. 5.19).
+
     Attributes:
         parameters: the settings.
         model: her model, placed where the subject stood; at the origin until calibrated.
@@ -122,22 +124,9 @@ class SchlagenhaufKalmanFilter:
     def __init__(self, parameters: SchlagenhaufParameters | None = None) -> None:
         """Set up, waiting for the T-pose; the default parameters where None."""
         self.parameters = parameters or SchlagenhaufParameters()
-        self.counters: dict[str, int] = dict.fromkeys(
-            (
-                "frames",
-                "calibrating",
-                "measured",
-                "predicted",
-                "diverged",
-                "repeated_stamps",
-                "late_frames",
-                "backward_jumps",
-                "gaps",
-                "frame_changes",
-            ),
-            0,
-        )
-        self.reset()
+        self.counters: dict[str, int] = dict.fromkeys(("calibrating", "measured", "predicted", "diverged"), 0)
+        self._arrivals = Arrivals(self.counters, self.parameters.reorder_window, self.parameters.reset_gap)
+        self._forget()
 
     @property
     def q(self) -> FloatArray:
@@ -161,11 +150,13 @@ class SchlagenhaufKalmanFilter:
 
     def reset(self) -> None:
         """Forget the subject and wait for a T-pose; the counters stay."""
+        self._arrivals.reset()
+        self._forget()
+
+    def _forget(self) -> None:
         self.model = Schlagenhauf26()
         self.lengths: FloatArray = np.full(len(self.model.length_names), np.nan)
         self.innovations: FloatArray = np.full((len(self.model.joints), 3), np.nan)
-        self._frame_id: str | None = None
-        self._stamp_ns = 0
         self._t_pose: deque[FloatArray] = deque(maxlen=self.parameters.calibration_frames)
         self._start()
 
@@ -195,8 +186,11 @@ class SchlagenhaufKalmanFilter:
             covariance. None until the frames of the T-pose are complete and show every length, and where the stamp
             repeats the last one or is a little older.
         """
-        if not self._takes(skeleton):
+        arrival = self._arrivals.take(skeleton)
+        if arrival is Arrival.IGNORED:
             return None
+        if arrival is Arrival.AFTER_JUMP:
+            self._forget()
         positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
         if not self.calibrated:
             self.counters["calibrating"] += 1
@@ -207,29 +201,6 @@ class SchlagenhaufKalmanFilter:
         measured = skeleton.valid[self.model.joints]
         self._filter(positions[self.model.joints], measured)
         return self._output(skeleton, measured)
-
-    def _takes(self, skeleton: Skeleton) -> bool:
-        """Whether a frame is new; forgets the subject where time or place jumped."""
-        p = self.parameters
-        elapsed_ns = skeleton.stamp_ns - self._stamp_ns
-        if self._frame_id is not None:
-            if skeleton.frame_id != self._frame_id:
-                self.counters["frame_changes"] += 1
-                self.reset()
-            elif elapsed_ns == 0:
-                self.counters["repeated_stamps"] += 1
-                return False
-            elif -p.reorder_window * NANOSECONDS <= elapsed_ns < 0:
-                self.counters["late_frames"] += 1
-                return False
-            elif elapsed_ns < 0:
-                self.counters["backward_jumps"] += 1
-                self.reset()
-            elif elapsed_ns > p.reset_gap * NANOSECONDS:
-                self.counters["gaps"] += 1
-        self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
-        self.counters["frames"] += 1
-        return True
 
     def _calibrate(self, positions: FloatArray) -> None:
         """Lengths, place and heading from (n, 25, 3) metres in the T-pose; nothing where they show no place or heading.
@@ -254,7 +225,10 @@ class SchlagenhaufKalmanFilter:
         self._t_pose.clear()
 
     def _filter(self, positions: FloatArray, measured: BoolArray) -> None:
-        """Predict (lines 2-3) and update (lines 5-9) with (10, 3) metres, of which (10,) are measured."""
+        """Predict (lines 2-3) and update (lines 5-9) with (10, 3) metres, of which (10,) are measured.
+
+        A joint that is not measured has neither innovation nor gain (section 5.5.2, eq. 5.21-5.22).
+        """
         kalman, n = self._kalman, self.model.nq
         kalman.predict()
         here = self.model.linearise(kalman.x[:n], self.lengths)

@@ -463,7 +463,10 @@ class Fusion:
     def _combined(
         self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
     ) -> Skeleton:
-        """The weighted mean (eq. 5.8), with the covariance that the sensors claim, or their disagreement if larger."""
+        """The weighted mean, with the covariance that the sensors claim, or their disagreement if larger.
+
+        The mean is that of Schlagenhauf 2017, eq. 5.8, for any number of sensors.
+        """
         used = weights > 0.0
         if not used.all():
             used &= np.isfinite(points[..., 0])

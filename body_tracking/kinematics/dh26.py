@@ -36,7 +36,11 @@ def _three(first: int) -> tuple[str, str, str]:
 
 
 def dh26(model: UpperBody) -> Convention:
-    """The convention; her axes x (left), y (backward), z (up) are our y, -x, z."""
+    """The convention; her axes x (left), y (backward), z (up) are our y, -x, z.
+
+    What an angle does follows from tables 3.1 and 3.2. The names in table 3.4 do not fit them in the torso: theta1
+    turns it, theta2 flexes it, theta3 bends it to the side; theta4 bends, theta5 turns, theta6 flexes.
+    """
     left, back, up = _Y, -_X, _Z
     chains = [
         Chain(_three(1), "pelvis", "lower_trunk", EulerAngles((up, left, back), _TRUNK_USUAL)),

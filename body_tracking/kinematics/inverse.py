@@ -80,7 +80,7 @@ class _Descent:
 
 
 class InverseKinematics:
-    """Fits ``upper_body`` to points."""
+    """Fits ``upper_body`` to points: the inverse kinematics, which Schlagenhauf (2017, eq. 3.4) leaves to a filter."""
 
     def __init__(self, model: UpperBody, ranges: Ranges | None = None) -> None:
         self.model = model

@@ -240,6 +240,8 @@ def _dihedral(
 def positional_angles(skeleton: Skeleton) -> JointAngles:
     """The angles of ``ANGLE_NAMES`` of one body; see the module's text for their definitions.
 
+    The elbow's is that of Schlagenhauf (2017), section 4.3.2: between upper arm and forearm.
+
     Args:
         skeleton: in a frame with z up, usually ``/filtered/skeleton``.
 

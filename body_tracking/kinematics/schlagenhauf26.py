@@ -28,7 +28,6 @@ from body_tracking.skeleton import FloatArray, IntArray, Joint
 
 _QUARTER = np.pi / 2
 
-# offset of theta_i, d_i, a_i, alpha_i; a length is its number in table 3.3, with its sign, and 0 is none
 _TABLE: Final[tuple[tuple[float, int, int, float], ...]] = (
     # table 3.1, torso
     (+_QUARTER, 0, 0, +_QUARTER),  # 1 SpineBase Z
@@ -59,6 +58,10 @@ _TABLE: Final[tuple[tuple[float, int, int, float], ...]] = (
     (0.0, 0, 0, -_QUARTER),  # 25 WristRight Z
     (0.0, 0, -10, 0.0),  # 26 WristRight Y
 )
+"""Offset of theta_i, d_i, a_i, alpha_i: table 3.1 with figures 3.2-3.3, table 3.2 with figures 3.4-3.5.
+
+A length is its number in table 3.3, with its sign, and 0 is none.
+"""
 
 _COUNT = len(_TABLE)
 # frame i hangs on frame i - 1, but for the first of the right clavicle and of both arms
@@ -84,7 +87,6 @@ _SEGMENTS: Final[dict[str, tuple[int, float]]] = {
     "hand_right": (26, -1.0),
 }
 
-# table 5.3: measured joint: the segment that it ends; its length is L1, L2, ... in this order (table 3.3)
 _ENDS: Final[dict[Joint, str]] = {
     Joint.SPINE_MID: "lower_trunk",
     Joint.SPINE_SHOULDER: "upper_trunk",
@@ -97,6 +99,7 @@ _ENDS: Final[dict[Joint, str]] = {
     Joint.WRIST_RIGHT: "forearm_right",
     Joint.HAND_TIP_RIGHT: "hand_right",
 }
+"""Each measured joint (table 5.3), and the segment that it ends: L1 to L10 in this order (table 3.3, figure 3.6)."""
 _LENGTH_COUNT = len(_ENDS)
 
 # Drillis and Contini (1966) in Winter (2009), figure 4.1, with the shoulder width that Kinect shows; the palm ends at
@@ -110,7 +113,11 @@ _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def _local_rotations() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Three (26, 3, 3) arrays: the rotation of eq. 3.1 is the first + cos(theta) second + sin(theta) third."""
+    """Three (26, 3, 3) arrays: the rotation of eq. 3.1 is the first + cos(theta) second + sin(theta) third.
+
+    Eq. 5.17 is eq. 3.1 again. Figure 3.1 shows the parameters; its text has a and alpha from axis i to i + 1, the
+    equation and the tables from axis i - 1 to i, which is meant.
+    """
     along = np.diag([0.0, 0.0, 1.0])
     cosine = np.diag([1.0, 1.0, 0.0])
     sine = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -245,7 +252,7 @@ class Schlagenhauf26:
         return q1 - q0
 
     def forward(self, q: FloatArray, lengths: FloatArray) -> Posture:
-        """Forward kinematics (eq. 3.3).
+        """Forward kinematics (eq. 3.2-3.3; eq. 5.18-5.19 for the joints that are measured).
 
         Args:
             q: (..., 26) radians.
@@ -260,6 +267,7 @@ class Schlagenhauf26:
     def linearise(self, q: FloatArray, lengths: FloatArray) -> Linearisation:
         """Forward kinematics with the analytic derivatives; arguments and errors as of :meth:`forward`.
 
+        The Jacobian is J of eq. 3.5, and the part of H (eq. 3.27, 5.20) that belongs to the angles.
         A point moves with an angle by the cross product of the angle's axis and the lever from the axis to the point.
         """
         frames, bones, lengths = self._chains(q, lengths)

@@ -45,7 +45,7 @@ class Layout:
 
 
 def layout(number: int) -> Layout:
-    """One of the nine layouts of Schlagenhauf 2017, table 5.1, with sensors ``kinect1`` and ``kinect2``.
+    """One of the nine layouts of Schlagenhauf 2017, table 5.1 and figures 5.2-5.3, with ``kinect1`` and ``kinect2``.
 
     In 1 to 6 both stand at the angle gamma from the front, the first to the person's left, the second to the right; in
     7 to 9 the first stands in front and the second at the angle delta to the person's right. In 1 they stand side by

@@ -529,19 +529,19 @@ def _compose(
 
 
 def _two_handed_wave(rng: np.random.Generator | None) -> _Exercise:
-    """Upper arms out, forearms up, both swinging in the frontal plane (thesis 4.3.3)."""
+    """Upper arms out, forearms up, both swinging in the frontal plane (thesis, section 4.3.3)."""
     start = _posture(elevation=92.0, plane=10.0, twist=-70.0, elbow=100.0, pronation=10.0)
     return _Exercise(start, 5, 1.6, _Swing(out=_posture(elevation=14.0, elbow=-75.0)))
 
 
 def _slow_down(rng: np.random.Generator | None) -> _Exercise:
-    """Both arms forward, palms down, pressing down and rising again in the sagittal plane (thesis 4.3.3)."""
+    """Both arms forward, palms down, pressing down and rising again in the sagittal plane (thesis, section 4.3.3)."""
     start = _posture(elevation=105.0, plane=82.0, twist=22.0, elbow=60.0, pronation=60.0, wrist_flexion=-15.0)
     return _Exercise(start, 5, 2.0, _Swing(out=_posture(elevation=-60.0, elbow=-35.0, trunk_flexion=6.0)))
 
 
 def _move_along(rng: np.random.Generator | None) -> _Exercise:
-    """The left arm points to the left; the right hand goes round an ellipse (thesis 4.3.4)."""
+    """The left arm points to the left; the right hand goes round an ellipse (thesis, section 4.3.4)."""
     start = _posture(elevation_left=86.0, plane_left=8.0, elbow_left=5.0, pronation_left=15.0)
     start += _posture(elevation_right=72.0, plane_right=28.0, twist_right=-30.0, elbow_right=75.0, pronation_right=25.0)
     out = _posture(plane_right=60.0, twist_right=45.0, elbow_right=15.0, trunk_axial=3.0, plane_left=3.0)
@@ -549,7 +549,7 @@ def _move_along(rng: np.random.Generator | None) -> _Exercise:
 
 
 def _torso_twist(rng: np.random.Generator | None) -> _Exercise:
-    """Arms out, the shoulders' line turning by about 90 degrees to each side against the feet (thesis 5.6.1).
+    """Arms out, the shoulders' line turning by about 90 degrees to each side against the feet (thesis, section 5.6.1).
 
     Hips, spine and shoulder girdle share the turn, and the foot left behind pivots on its toes.
     """
@@ -560,7 +560,7 @@ def _torso_twist(rng: np.random.Generator | None) -> _Exercise:
 
 
 def _squat(rng: np.random.Generator | None) -> _Exercise:
-    """Down until the thighs are almost level, the arms forward for balance."""
+    """Down until the thighs are almost level, the arms forward for balance (thesis, section 5.8, figure 5.16)."""
     out = _posture(
         drop=0.42,
         forward=-0.17,
@@ -576,7 +576,7 @@ def _squat(rng: np.random.Generator | None) -> _Exercise:
 
 
 def _calf_raise(rng: np.random.Generator | None) -> _Exercise:
-    """Up onto the toes and down again."""
+    """Up onto the toes and down again (thesis, section 5.8, figure 5.16)."""
     return _Exercise(_HANGING, 6, 2.2, _Swing(out=_posture(heel=36.0, forward=0.06)))
 
 
@@ -693,6 +693,11 @@ _EXERCISES: dict[str, Callable[[np.random.Generator | None], _Exercise]] = {
     "punching": _punching,
     "shoulder_lifts": _shoulder_lifts,
 }
+"""The first six are the thesis's (sections 4.3.3-4.3.4 with figures 4.14 and 4.18, 5.6.1, 5.8).
+
+Arm raises, hair combing, forearm rolling, punching and shoulder lifts are among those of Jatesiktat et al. (2018),
+section IV-B.
+"""
 
 
 # ---------------------------------------------------------------------------------------------------------------------

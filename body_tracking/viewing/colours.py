@@ -1,6 +1,6 @@
 """Which colour things have: sensors each its own, and joints that are not well seen red.
 
-As in Schlagenhauf (2017), section 5.6: a joint is red whose position is lost, or whose tracking state is Inferred.
+As in Schlagenhauf (2017), section 5.9: a joint is red whose position is lost, or whose tracking state is Inferred.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ def sensor_colours(sensors: Sequence[str]) -> dict[str, Colour]:
 
 def joint_colours(states: NDArray[np.uint8], own: Colour) -> ColourArray:
     """(n, 3) RGB of joints: their own where tracked, else red, and darker where not tracked at all.
+
+    Schlagenhauf 2017, section 5.9, figures 5.18-5.19.
 
     Args:
         states: (n,) of ``TrackingState``.

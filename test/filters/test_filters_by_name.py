@@ -22,7 +22,7 @@ from body_tracking.parameters import check_all, fields_of, parameters_from
 
 
 def test_every_filter_is_made_with_the_parameters_of_its_own_prefix() -> None:
-    assert set(FILTERS) == {*LINEAR_MODELS, "ekf", "schlagenhauf_ekf"}
+    assert set(FILTERS) == {*LINEAR_MODELS, "ekf", "thesis_lkf1", "thesis_lkf2", "schlagenhauf_ekf"}
     assert DEFAULT_FILTER in FILTERS
     table = [item for prefix, each in parameter_classes().items() for item in parameters_from(each, prefix=prefix)]
     assert len({item.name for item in table}) == len(table)

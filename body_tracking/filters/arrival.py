@@ -1,0 +1,81 @@
+"""Which frames a filter takes: every stamp once and in order; a jump of time or of the frame starts anew."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum, auto
+
+from body_tracking.skeleton import NANOSECONDS, Skeleton
+
+
+class Arrival(Enum):
+    """What a frame is to the one before it."""
+
+    FIRST = auto()
+    NEXT = auto()
+    AFTER_GAP = auto()
+    """Later than ``reset_gap`` allows."""
+    AFTER_JUMP = auto()
+    """In another frame, or so much earlier that time went back: nothing known of the person holds any more."""
+    IGNORED = auto()
+    """A repeated stamp, or a frame that came late."""
+
+
+class Arrivals:
+    """Compares each frame with the one before it, and counts what is not ordinary.
+
+    The number of the body may change from frame to frame, as sensors number it differently.
+
+    Args:
+        counters: those of the filter; ``NAMES`` are added to them.
+        reorder_window: seconds by which a late frame may be older than the last one; an older one is a jump of time.
+        reset_gap: seconds between frames from which on there is a gap.
+
+    Attributes:
+        elapsed: seconds from the last frame to the one taken now; 0 for a first one and after a jump.
+    """
+
+    NAMES = ("frames", "repeated_stamps", "late_frames", "backward_jumps", "gaps", "frame_changes")
+
+    def __init__(self, counters: dict[str, int], reorder_window: float, reset_gap: float = math.inf) -> None:
+        self._counters = counters
+        counters.update(dict.fromkeys(self.NAMES, 0))
+        self._late_ns = reorder_window * NANOSECONDS
+        self._gap_ns = reset_gap * NANOSECONDS
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last frame; the counters stay."""
+        self._frame_id: str | None = None
+        self._stamp_ns = 0
+        self.elapsed = 0.0
+
+    def take(self, skeleton: Skeleton) -> Arrival:
+        """What a frame is; it becomes the last one unless it is ignored."""
+        arrival = self._compared(skeleton.frame_id, skeleton.stamp_ns - self._stamp_ns)
+        if arrival is Arrival.IGNORED:
+            return arrival
+        following = arrival in (Arrival.NEXT, Arrival.AFTER_GAP)
+        self.elapsed = (skeleton.stamp_ns - self._stamp_ns) / NANOSECONDS if following else 0.0
+        self._frame_id, self._stamp_ns = skeleton.frame_id, skeleton.stamp_ns
+        self._counters["frames"] += 1
+        return arrival
+
+    def _compared(self, frame_id: str, elapsed_ns: int) -> Arrival:
+        if self._frame_id is None:
+            return Arrival.FIRST
+        if frame_id != self._frame_id:
+            return self._counted("frame_changes", Arrival.AFTER_JUMP)
+        if elapsed_ns == 0:
+            return self._counted("repeated_stamps", Arrival.IGNORED)
+        if -self._late_ns <= elapsed_ns < 0:
+            return self._counted("late_frames", Arrival.IGNORED)
+        if elapsed_ns < 0:
+            return self._counted("backward_jumps", Arrival.AFTER_JUMP)
+        if elapsed_ns > self._gap_ns:
+            return self._counted("gaps", Arrival.AFTER_GAP)
+        return Arrival.NEXT
+
+    def _counted(self, name: str, arrival: Arrival) -> Arrival:
+        self._counters[name] += 1
+        return arrival
