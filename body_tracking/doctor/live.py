@@ -31,7 +31,8 @@ from body_tracking.nodes.bag_topics import message_class
 PATIENCE = 10.0
 """Seconds for a sensor that was asked for to begin."""
 OLD = 0.5
-"""Seconds; a stamp that is further from now is not delayed but of another clock."""
+"""Seconds; a stamp that is further from now is of another clock, not delayed."""
+_WATCHERS = ("body_tracking_doctor_", "body_tracking_up_")
 _QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -39,7 +40,7 @@ class Listener(Node):
     """Subscribes to the sensors, the skeletons and the angles that are published."""
 
     def __init__(self) -> None:
-        super().__init__(f"body_tracking_doctor_{time.time_ns()}")
+        super().__init__(f"{_WATCHERS[0]}{time.time_ns()}")
         self.came: dict[str, list[tuple[float, float, float]]] = {}
         """By topic: steady time, stamp and age of each message, seconds; the age by ``/clock`` where there is one."""
         self.malformed: dict[str, str] = {}
@@ -103,7 +104,7 @@ def domain(sensors: Sequence[str], seconds: float = 3.0) -> Iterator[Finding]:
 
 def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> Iterator[Finding]:
     publishers = node.get_publishers_info_by_topic(topic)
-    readers = [each for each in node.get_subscriptions_info_by_topic(topic) if each.node_name != node.get_name()]
+    readers = [each for each in node.get_subscriptions_info_by_topic(topic) if not each.node_name.startswith(_WATCHERS)]
     by, to = (
         ", ".join(sorted({f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in side})) or "nobody"
         for side in (publishers, readers)
@@ -112,12 +113,11 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
         if wanted or (readers and SEGMENTS not in kinds):  # segments are of filters on a body model only
             remedy = "start its publisher; where it runs, compare env | grep ROS_ in both shells"
             source = wanted or topic == names.CLOCK or kinds[0] in (POINT_CLOUD, IMU)
-            found = f"{topic}: nobody publishes it" + (f", {to} waits" if readers else "")
+            found = f"{topic}: nobody publishes it" + (f", wanted by {to}" if readers else "")
             yield Finding(PROBLEM if source else WARNING, found, remedy)
         return
     if len(publishers) > 1 and graph.has_one_publisher(topic):
-        found = f"{topic}: {len(publishers)} publishers, {by}"
-        yield Finding(PROBLEM, found, f"end all but one: ros2 topic info -v {topic}")
+        yield Finding(PROBLEM, f"{topic}: {len(publishers)} publishers, {by}", f"end one: ros2 topic info -v {topic}")
     for publisher, reader in product(publishers, readers):
         compatible, reason = qos_check_compatible(publisher.qos_profile, reader.qos_profile)
         if compatible == QoSCompatibility.ERROR:
