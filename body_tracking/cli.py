@@ -17,7 +17,7 @@ SUBCOMMANDS = {
     "replay": ("recording.replay", "run the whole graph offline over a bag"),
     "calibrate": ("calibration.offline", "the poses and clocks of a bag's sensors"),
     "up": ("up", "run the live graph: sensors or a bag in, joint angles out"),
-    "doctor": ("doctor.command", "what is wrong with the machine, its ROS, the sensors or a bag, and what to do"),
+    "doctor": ("doctor.command", "why nothing comes: what is wrong with the shell, the graph or a bag, and what to do"),
     "show": ("evaluation.show", "show the joint angles in a recording"),
     "evaluate": ("evaluation.evaluate", "compare what was estimated with the truth"),
     "simulate": ("simulation.bags", "people who move before simulated sensors, as a bag with the truth"),

@@ -1,6 +1,23 @@
-"""``body_tracking doctor``: what is wrong with the machine, its ROS, the sensors or a bag, and what to do about it.
+"""``body_tracking doctor``: why nothing comes, and what to do about it.
 
-A check is a function that looks at one real thing and returns findings; none needs another. What needs ROS runs in
-processes of its own (``nodes/doctor_probe.py``), so that a broken one is a finding here and not a crash. May import
-``recording`` and ``graph``; only ``cli`` imports it.
+``environment`` looks at the shell, ``bags`` at a recording, ``live`` at the ROS domain; each yields findings. Only
+``cli`` imports it.
 """
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+OK: Final = "OK"
+WARNING: Final = "warning"
+PROBLEM: Final = "problem"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a check says: where, how it is, and the one thing to do; a problem keeps the graph from working."""
+
+    level: Literal["OK", "warning", "problem"]
+    found: str
+    remedy: str = ""

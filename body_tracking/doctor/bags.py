@@ -6,64 +6,41 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from body_tracking import graph, names
-from body_tracking.doctor.finding import OK, PROBLEM, WARNING, Finding
+from body_tracking.doctor import OK, PROBLEM, WARNING, Finding
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages.base import IMU, POINT_CLOUD
-from body_tracking.recording.info import TopicSummary, bag_info
+from body_tracking.messages.base import IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.recording.info import bag_info
 
-SLOW_RATE = 20.0
-"""Hertz; a Kinect has 30, and 15 in the dark."""
+LEAST_RATE = {POINT_CLOUD: 20.0, JOINT_STATE: 20.0, IMU: 50.0}
+"""Hertz: a Kinect has 30, and 15 in the dark; with less than 50 the orientation of an IMU drifts."""
 GAP = 0.5
-"""Seconds without a frame after which calibration and filter have lost the thread."""
+"""Seconds without a frame after which calibration and filter have lost the person."""
 
 
-def bag(path: Path, deadline: float | None = None) -> Iterator[Finding]:
-    """All of a bag.
-
-    Args:
-        path: a folder, or a single mcap file.
-        deadline: steady time at which to stop reading, seconds; None for never.
-    """
+def bag(path: Path) -> Iterator[Finding]:
+    """Whether a folder, or a single mcap file, can be read, and what it lacks."""
+    recover = f"body_tracking bag recover {path}"
     try:
-        info = bag_info(path, deadline)
+        info = bag_info(path)
     except BodyTrackingError as error:
-        remedy = f"body_tracking bag recover {path}" if path.is_dir() else "give the folder that the recorder made"
-        yield Finding("bag", PROBLEM, str(error), remedy)
+        yield Finding(PROBLEM, str(error), recover if path.is_dir() else "give the folder that the recorder made")
         return
-    looked = "" if info.complete else ", of which this is only what could be read in time"
-    yield Finding("bag", OK, f"{path}: {info.messages} messages in {info.duration_s:.1f} s{looked}")
+    yield Finding(OK, f"{path}: {info.messages} messages in {info.duration_s:.1f} s")
     for warning in info.warnings:
-        yield Finding(
-            "bag", WARNING, warning, f"body_tracking bag recover {path}; what is damaged is left out when it is played"
-        )
+        yield Finding(WARNING, warning, f"{recover}; its whole messages are played as it is, too")
     namespace = names.rig_namespace(topic.name for topic in info.topics)
     clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
-    own = (names.within(name, namespace) for name in clouds)
-    sensors = graph.sensors_among(name for name in own if name is not None)
+    sensors = graph.sensors_among(names.within(name, namespace) or name for name in clouds)
     if not sensors:
-        there = ", ".join(topic.name for topic in info.topics)
-        yield Finding(
-            "bag",
-            PROBLEM,
-            f"{path}: no skeletons on /<sensor>/skeleton; it has {there or 'no topics'}",
-            "record the sensors' topics: ros2 bag record -a, or body_tracking up --record; "
-            "see docs/your_own_sensor.md for another format",
-        )
-    elif len(sensors) == 1:
-        yield Finding("bag", OK, f"{path}: one sensor, {sensors[0]}: nothing to calibrate")
+        found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
+        yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")
     skeletons = {names.resolved(graph.skeleton_topic(sensor), namespace) for sensor in sensors}
     for topic in info.topics:
-        if topic.name in skeletons or (topic.type == IMU and topic.count):
-            yield _stream(topic)
-
-
-def _stream(topic: TopicSummary) -> Finding:
-    rate, gap = topic.rate or 0.0, topic.longest_gap or 0.0
-    text = f"{topic.name}: {topic.count} messages, {rate:.1f} Hz, longest gap {gap:.2f} s"
-    if gap > GAP:
-        return Finding(
-            "bag", WARNING, text, "nobody in view, or the sensor stalled; there the angles are predicted, then lost"
-        )
-    if rate < SLOW_RATE:
-        return Finding("bag", WARNING, text, "a slow sensor: more light, USB 3; estimates are less certain by it")
-    return Finding("bag", OK, text)
+        if topic.name in skeletons or topic.type == IMU:
+            rate, gap = topic.rate or 0.0, topic.longest_gap or 0.0
+            text, remedy = f"{topic.name}: {topic.count} messages, {rate:.1f} Hz, longest gap {gap:.2f} s", ""
+            if gap > GAP:
+                remedy = "keep the person in view: in a gap angles are predicted, then lost"
+            elif rate < LEAST_RATE[topic.type]:
+                remedy = "more light, USB 3, the driver's settings: at this rate estimates are less certain"
+            yield Finding(WARNING if remedy else OK, text, remedy)

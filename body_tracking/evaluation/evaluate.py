@@ -13,8 +13,8 @@ from body_tracking.evaluation.comparison import (
     read_markers,
     read_truth,
 )
-from body_tracking.evaluation.plots import pictures
-from body_tracking.evaluation.report import as_json, check_writable, page, text, write, write_csv
+from body_tracking.evaluation.pictures import pictures
+from body_tracking.evaluation.report import as_csv, as_json, facts, page, text, write
 from body_tracking.evaluation.summary import EvaluationError
 from body_tracking.recording.replay import Progress
 
@@ -85,21 +85,16 @@ def run(args: argparse.Namespace) -> int:
     progress = Progress(0, 1000)
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)
-        progress.at(100)
         truth, own_clock = truth_from(args)
-        progress.at(200)
         parameters = EvaluationParameters(beyond=1e-3 * args.off_track, own_clock=own_clock)
-        for path in (args.html, args.csv):
-            if path is not None:
-                check_writable(path)
-        result = evaluate(estimate, truth, parameters, lambda share: progress.at(int(200 + 400 * share)))
-        if args.html is not None:
-            write(args.html, page(result, pictures(result, lambda share: progress.at(int(600 + 400 * share)))))
-        if args.csv is not None:
-            write_csv(result, args.csv)
+        result = evaluate(estimate, truth, parameters, lambda share: progress.at(int(1000 * share)))
     finally:
         progress.end()
-    print(as_json(result) if args.json else text(result))
+    if args.html is not None:
+        write(args.html, page(result, pictures(result)).encode())
+    if args.csv is not None:
+        write(args.csv, as_csv(result).encode())
+    print(as_json(result) if args.json else f"{facts(result)}\n{text(result)}")
     if not args.json:
         for name, path in (("numbers", args.csv), ("report", args.html)):
             if path is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from body_tracking.evaluation.picture import draw
+from body_tracking.evaluation.pictures import draw
 from body_tracking.evaluation.summary import AngleSummary, read, summaries, table
 
 

@@ -275,6 +275,17 @@ def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS
     return result
 
 
+def true_at(angles: AngleSeries, truth: AngleSeries | None) -> FloatArray:
+    """(n, m) the truth at the stamps of what was measured, or within 20 ms; NaN where there is none."""
+    true = np.full_like(angles.position, np.nan)
+    if truth is not None:
+        matches = nearest(truth.stamps_ns, angles.stamps_ns)
+        for column, name in enumerate(angles.names):
+            if name in truth.names:
+                true[:, column] = np.where(matches >= 0, truth.known[matches, truth.names.index(name)], np.nan)
+    return true
+
+
 def summaries(angles: AngleSeries, truth: AngleSeries | None = None) -> tuple[AngleSummary, ...]:
     """A summary per angle.
 
@@ -282,13 +293,8 @@ def summaries(angles: AngleSeries, truth: AngleSeries | None = None) -> tuple[An
         angles: what was measured.
         truth: what was true, at any stamps within 20 ms of the measured ones.
     """
-    errors, true = np.full_like(angles.position, np.nan), np.full_like(angles.position, np.nan)
-    if truth is not None:
-        matches = nearest(truth.stamps_ns, angles.stamps_ns)
-        for column, name in enumerate(angles.names):
-            if name in truth.names:
-                true[:, column] = np.where(matches >= 0, truth.known[matches, truth.names.index(name)], np.nan)
-        errors = (angles.known - true + np.pi) % (2.0 * np.pi) - np.pi
+    true = true_at(angles, truth)
+    errors = (angles.known - true + np.pi) % (2.0 * np.pi) - np.pi
     result = []
     for column, name in enumerate(angles.names):
         values, stddev = np.degrees(angles.known[:, column]), np.degrees(angles.stddev[:, column])

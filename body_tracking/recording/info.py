@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -48,7 +47,6 @@ class BagInfo:
         messages: that can be read.
         topics: by name.
         warnings: what is missing or damaged.
-        complete: it was read to its end.
     """
 
     path: Path
@@ -58,28 +56,19 @@ class BagInfo:
     messages: int
     topics: tuple[TopicSummary, ...]
     warnings: list[str]
-    complete: bool = True
 
 
-def bag_info(path: Path | str, deadline: float | None = None) -> BagInfo:
-    """Look through a whole bag; what is counted is what can really be read.
-
-    Args:
-        path: a folder, or a single mcap file.
-        deadline: steady time at which to stop, seconds; None for never.
+def bag_info(path: Path | str) -> BagInfo:
+    """Look through a whole bag, a folder or a single mcap file; what is counted is what can really be read.
 
     Raises:
         BagError: nothing there can be read as a recording.
     """
-    complete = True
     with BagReader(path) as reader:
         spans: dict[str, _Span] = {}
         for message in reader.messages():
             span = spans.setdefault(message.topic, _Span(message.log_time_ns, message.log_time_ns))
             span.add(message.log_time_ns)
-            if deadline is not None and time.monotonic() > deadline:
-                complete = False
-                break
         topics = []
         for name, topic in reader.topics.items():
             span = spans.get(name, _Span(0, 0))
@@ -96,7 +85,6 @@ def bag_info(path: Path | str, deadline: float | None = None) -> BagInfo:
             messages=sum(span.count for span in spans.values()),
             topics=tuple(topics),
             warnings=reader.warnings,
-            complete=complete,
         )
 
 

@@ -1,129 +1,137 @@
-"""The doctor's own processes in real ROS domains: one that is silent, one in which a graph runs, and broken ones."""
+"""The doctor in real ROS domains: one in which a node does most things wrong, an empty one, and no ROS at all."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
+import time
+from collections.abc import Callable, Iterator
+from threading import Thread
+from typing import Any
 
+import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="ROS is not installed")
+rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from rclpy.qos import QoSProfile
-from running import Running, environment
-from sensor_msgs.msg import Imu, PointCloud2
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from running import environment  # noqa: E402
+from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
 
-from body_tracking import graph
-from body_tracking.doctor import live
-from body_tracking.doctor.finding import OK, PROBLEM, WARNING
+from body_tracking.doctor import OK, PROBLEM, WARNING, Finding, live  # noqa: E402
+from body_tracking.doctor.environment import client_library  # noqa: E402
+from body_tracking.messages.base import IMU, POINT_CLOUD, RosMessages  # noqa: E402
+from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
+from body_tracking.nodes.bag_topics import to_profile  # noqa: E402
+from body_tracking.recording.qos import RELIABLE, SENSOR_DATA  # noqa: E402
+from body_tracking.skeleton import N_JOINTS, Skeleton  # noqa: E402
 
-BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_wave"
-PATIENCE = 90.0
-"""Seconds for a process to start on a busy machine."""
-
-
-def observe(variables: dict[str, str], seconds: float = 2.5) -> live.Observation | str:
-    return live.observe(variables, seconds, start_timeout=PATIENCE)
-
-
-@pytest.fixture(scope="module")
-def playing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A player and a fusion; the second sensor has another publisher besides, the third sends what cannot be read."""
-    with Running(tmp_path_factory.mktemp("playing")) as running:
-        running.start("fusion", reliable=True)
-        running.start("bag_player", bag=BAG, loop=True, reliable=True, topics="[/kinect1/skeleton, /kinect2/skeleton]")
-        publisher = running.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect2"), QoSProfile(depth=1))
-        wrong = running.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect3"), QoSProfile(depth=1))
-        running.node.create_publisher(Imu, "/wrist/imu/data", QoSProfile(depth=1))
-        running.node.create_timer(0.1, lambda: wrong.publish(PointCloud2()))
-        assert running.until(
-            lambda: float(running.diagnostics.get("fusion", {}).get("rate in /kinect1/skeleton", 0)) > 20.0, PATIENCE
-        )
-        assert publisher.get_subscription_count()
-        yield running
+NOW = 1.8e9
+"""A time in seconds, in this decade."""
 
 
-def test_what_runs_is_seen_and_judged(playing: Running) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "body_tracking.cli",
-        "doctor",
-        "--json",
-        "--sensors",
-        "kinect1,kinect4",
-        "--seconds",
-        "4",
-    ]
-    command += ["--timeout", f"{PATIENCE:g}"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=playing.environment)
-    assert playing.until(lambda: process.poll() is not None, 2.0 * PATIENCE)
-    assert process.stdout is not None
-    findings = json.load(process.stdout)["findings"]
-    found = [(each["check"], each["level"], each["found"]) for each in findings]
-    assert process.returncode == 1
-    assert "end all but one: ros2 topic info -v /kinect2/skeleton" in [each["remedy"] for each in findings]
-
-    def level(check: str, text: str) -> str:
-        [answer] = [level for name, level, found_ in found if name == check and text in found_] or [f"none of {found}"]
-        return answer
-
-    assert level("discovery", "two processes heard each other after") == OK
-    assert level("sensors", "/kinect1/skeleton: ") in (OK, WARNING)  # slow, on a busy machine
-    assert any("/kinect1/skeleton: " in text and "% of the joints tracked" in text for _, _, text in found), found
-    assert level("sensors", "/kinect2/skeleton: 2 publishers") == PROBLEM
-    assert level("sensors", "/kinect3/skeleton: ") == PROBLEM
-    assert level("sensors", "/kinect4/skeleton: nobody publishes it; there are kinect1, kinect2, kinect3") == PROBLEM
-    assert level("sensors", "/wrist/imu/data: there is a publisher, but nothing came") == PROBLEM
-    assert level("nodes", "bag_player: playing") == OK
-    assert level("nodes", "fusion: ") in (OK, WARNING)  # a busy machine loses messages
+def skeleton() -> PointCloud2:
+    body = Skeleton(time.time_ns(), "kinect", np.zeros((N_JOINTS, 3)), np.full(N_JOINTS, 2, np.uint8))
+    return skeletons_to_cloud((body,), RosMessages())
 
 
-def test_a_sensor_that_was_asked_for_and_is_about_to_begin_is_waited_for(tmp_path: Path) -> None:
-    with Running(tmp_path) as running:
-
-        def begin(elapsed: float) -> None:
-            if elapsed > 3.0 and not running.processes:
-                running.start("kinect_skeleton", file=BAG, loop=True)
-
-        seen = live.observe(running.environment, 0.5, begin, PATIENCE, ("kinect1",))
-        assert not isinstance(seen, str), seen
-        assert next(iter(live.sensors(seen, ("kinect1",)))).level != PROBLEM
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ROS domain of its own."""
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
 
 
-def test_a_middleware_that_is_not_there_is_named() -> None:
-    variables = {**environment(), "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
-    seen = observe(variables)
-    assert isinstance(seen, str)
-    finding = live.discovery(seen, variables, True)
-    assert finding.level == PROBLEM
-    assert "rmw_cyclonedds_cpp" in finding.found
-    assert "unset RMW_IMPLEMENTATION" in finding.remedy
+@pytest.fixture
+def bench(domain: None) -> Iterator[Any]:
+    """A node with a thread that handles its callbacks."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node, executor = rclpy.create_node("bench", context=context), SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    thread = Thread(target=executor.spin)
+    thread.start()
+    yield node
+    executor.shutdown()
+    thread.join()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
 
-def test_processes_that_do_not_hear_each_other_are_a_problem() -> None:
-    variables = {**environment(), "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
-    seen = observe(variables)
-    assert not isinstance(seen, str), seen
-    assert seen.heard_after is None
-    assert live.discovery(seen, variables, False).level == PROBLEM
-    assert not seen.nodes
-    assert [each.level for each in live.sensors(seen)] == [OK]
+def test_faults_of_a_graph_are_named(bench: Any) -> None:
+    def publish(kind: type, topic: str, hertz: float, make: Callable[[], Any], qos: Any = 10) -> None:
+        publisher = bench.create_publisher(kind, topic, qos)
+        bench.create_timer(1.0 / hertz, lambda: publisher.publish(make()))
+
+    for topic in ("/kinect1/skeleton", "/kinect2/skeleton", "/kinect5/skeleton"):
+        publish(PointCloud2, topic, 30.0, skeleton, to_profile(SENSOR_DATA))
+    bench.create_publisher(PointCloud2, "/kinect2/skeleton", 10)
+    publish(PointCloud2, "/kinect3/skeleton", 10.0, PointCloud2)
+    bench.create_subscription(PointCloud2, "/kinect5/skeleton", lambda message: None, to_profile(RELIABLE))
+    bench.create_subscription(PointCloud2, "/kinect6/skeleton", lambda message: None, 10)
+    bench.create_publisher(Imu, "/silent/imu/data", 10)
+    watcher = rclpy.create_node("body_tracking_up_1", context=bench.context)  # listens to a clock that is not needed
+    watcher.create_subscription(Clock, "/clock", lambda message: None, 10)
+    publish(Imu, "/slow/imu/data", 5.0, Imu)
+    status = DiagnosticStatus(level=b"\x02", name="bench: stream", message="broken")
+    publish(DiagnosticArray, "/diagnostics", 5.0, lambda: DiagnosticArray(status=[status]))
+
+    found = list(live.domain(["kinect1"], 1.5))
+
+    def judged(text: str) -> set[str]:
+        return {each.level for each in found if text in each.found and (each.level == OK) == (not each.remedy)}
+
+    watcher.destroy_node()
+    assert judged("2 other nodes in this domain") == {OK}, found
+    assert not judged("/clock"), found
+    assert judged("/kinect1/skeleton from /bench to nobody: ") <= {OK, WARNING}, found  # slow, on a busy machine
+    assert judged("/kinect2/skeleton: 2 publishers, /bench") == {PROBLEM}, found
+    assert judged("/kinect3/skeleton from /bench to nobody: malformed") == {PROBLEM}, found
+    assert judged("/kinect5/skeleton: nothing goes from bench to bench: ") == {PROBLEM}, found
+    assert judged("/kinect6/skeleton: nobody publishes it, wanted by /bench") == {PROBLEM}, found
+    assert judged("/silent/imu/data from /bench to nobody: nothing came") == {PROBLEM}, found
+    assert judged("/slow/imu/data from /bench to nobody: ") == {WARNING}, found
+    assert judged("bench: stream: broken") == {PROBLEM}, found
 
 
-def test_without_ros_the_doctor_says_so_and_lives() -> None:
-    """``-I`` and ``-S`` leave out what is installed."""
-    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from body_tracking.doctor.environment import environment as e\n"
-    )
-    code += "print([f.found for f in e({}) if f.level == 'problem'])"
-    root = str(BAG.parent.parent)
-    answer = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", code, root], capture_output=True, text=True, env=variables
-    )
-    assert "no rclpy" in answer.stdout, answer.stderr
+@pytest.mark.parametrize(
+    ("kind", "hertz", "stamp", "age", "level", "said"),
+    [
+        (POINT_CLOUD, 30.0, NOW, 0.02, OK, "30.0 Hz, stamps 0.02 s old"),
+        (POINT_CLOUD, 30.0, 60.0, NOW, OK, "stamps of the sensor's own clock"),
+        (POINT_CLOUD, 15.0, NOW, 0.02, WARNING, "should have 20 Hz"),
+        (IMU, 30.0, NOW, 0.02, WARNING, "should have 50 Hz"),
+        (POINT_CLOUD, 30.0, NOW, 3.0, WARNING, "synchronise"),
+        (POINT_CLOUD, 30.0, NOW, -3.0, WARNING, "synchronise"),
+    ],
+)
+def test_rate_and_stamps_are_judged(kind: str, hertz: float, stamp: float, age: float, level: str, said: str) -> None:
+    found = live.stream("/topic", kind, [(number / hertz, stamp, age) for number in range(30)])
+    assert found.level == level
+    assert said in found.found + found.remedy
+
+
+def test_a_sensor_that_begins_late_is_waited_for(bench: Any) -> None:
+    def begin() -> None:
+        timer.cancel()
+        publisher = bench.create_publisher(PointCloud2, "/kinect1/skeleton", 10)
+        bench.create_timer(0.02, lambda: publisher.publish(skeleton()))
+
+    timer = bench.create_timer(1.0, begin)
+    found = list(live.domain(["kinect1"], 0.5))
+    assert [each for each in found if each.found.startswith("/kinect1/skeleton from /bench to nobody: ")], found
+
+
+def test_an_empty_domain_is_named_and_so_is_an_absent_sensor(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "PATIENCE", 0.0)
+    found = [(each.level, each.found) for each in live.domain(["kinect4"], 0.5)]
+    assert found == [(WARNING, "0 other nodes in this domain"), (PROBLEM, "/kinect4/skeleton: nobody publishes it")]
+
+
+def test_a_client_library_that_ends_its_process_is_a_finding(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert client_library() == Finding(OK, "rclpy works, on rmw_fastrtps_cpp")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    found = client_library()
+    assert found.level == PROBLEM
+    assert "rmw_cyclonedds_cpp" in found.found
+    assert "unset RMW_IMPLEMENTATION" in found.remedy

@@ -1,0 +1,216 @@
+"""Pictures: the person at some instants, angles over time with their uncertainty, and errors over time."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from body_tracking.evaluation.comparison import AngleComparison, Evaluation
+from body_tracking.evaluation.metrics import angle_errors
+from body_tracking.evaluation.report import named_are_positional, write
+from body_tracking.evaluation.summary import Tracked, nearest, true_at
+from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+
+_COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
+_COLUMNS, _INSTANTS = 4, 6
+_POINTS = 1500
+"""No curve needs more of them than the picture has columns."""
+_VIEW = np.radians(25.0)
+"""By which the viewer stands off the person's front, so that depth shows."""
+_LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
+
+
+def draw(tracked: Tracked, path: Path) -> None:
+    """Draw the person and the angles of a recording, at least one frame, into a PNG file; raises as :func:`write`."""
+    angles, known = tracked.angles, tracked.angles.known
+    height = _height(angles.names)
+    figure = _figure(3.9 + height)
+    top, bottom = figure.subfigures(2, 1, height_ratios=(3.6, height))
+    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {_LEGEND}", fontsize=11)
+    start_ns = int(angles.stamps_ns[0])
+    if tracked.skeletons:
+        _draw_person(top, tracked, start_ns)
+    times, true = (angles.stamps_ns - start_ns) / NANOSECONDS, true_at(angles, tracked.true_angles)
+    errors = angle_errors(known, true, angles.stddev)
+    _draw_angles(bottom, AngleComparison(angles.names, times, known, true, angles.stddev, errors))
+    write(path, _png(figure))
+
+
+def pictures(result: Evaluation) -> list[tuple[str, str]]:
+    """Of each picture of an evaluation's report the caption and the ``data:`` address."""
+    first = result.comparisons[0]
+    angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
+    stated = np.isfinite(angles.stddev)
+    figure = _figure(_height(angles.names))
+    _draw_angles(figure, replace(angles, found=np.where(stated | ~stated.any(), angles.found, np.nan)))
+    drawn = [
+        (f"Distance of each joint from the truth, mm, {first.name}; white: not known in both", _errors(result)),
+        (f"Angles, degrees, {first.name}; {_LEGEND}", _address(figure)),
+    ]
+    if result.calibration:
+        drawn.append(("Calibration over time against the true one", _calibration(result)))
+    return drawn
+
+
+def _figure(height: float) -> Any:
+    from matplotlib.figure import Figure  # slow to import, and whoever asks for a table alone does not need it
+
+    return Figure(figsize=(15.0, height), dpi=100, layout="constrained")
+
+
+def _png(figure: Any) -> bytes:
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    return data.getvalue()
+
+
+def _address(figure: Any) -> str:
+    return f"data:image/png;base64,{base64.b64encode(_png(figure)).decode()}"
+
+
+def _thin(count: int) -> slice:
+    return slice(None, None, max(1, count // _POINTS))
+
+
+def _label(axis: Any, title: str) -> None:
+    axis.set_title(title, fontsize=10)
+    axis.set_xlabel("s", fontsize=8)
+    axis.tick_params(labelsize=8, labelbottom=True)
+    axis.grid(color="#eeeeee")
+    axis.set_axisbelow(True)
+    axis.margins(x=0.01)
+
+
+# --- angles
+
+
+def _side(name: str) -> str:
+    return next((side for side in ("left", "right") if name.endswith(f"_{side}")), "")
+
+
+def _panels(names: tuple[str, ...]) -> dict[str, list[int]]:
+    """Title to columns: left and right of an angle share a panel."""
+    panels: dict[str, list[int]] = {}
+    for column, name in enumerate(names):
+        panels.setdefault(name.removesuffix(f"_{_side(name)}").replace("_", " "), []).append(column)
+    return panels
+
+
+def _height(names: tuple[str, ...]) -> float:
+    return 2.5 * -(-len(_panels(names)) // _COLUMNS)
+
+
+def _unbroken(degrees: FloatArray) -> FloatArray:
+    """The curve with a gap where it passes from +180 to -180 or back."""
+    curve = degrees.copy()
+    curve[1:][np.abs(np.diff(degrees)) > 180.0] = np.nan
+    return curve
+
+
+def _draw_angles(figure: Any, angles: AngleComparison) -> None:
+    panels, shown = _panels(angles.names), _thin(len(angles.times))
+    axes = figure.subplots(-(-len(panels) // _COLUMNS), _COLUMNS, sharex=True, squeeze=False)
+    times, stddev = angles.times[shown], angles.stddev[shown]
+    band = 1.96 * np.degrees(np.where(np.isfinite(stddev), stddev, np.nan))
+    found, true = np.degrees(angles.found[shown]), np.degrees(angles.true[shown])
+    for axis, (title, columns) in zip(axes.flat, panels.items(), strict=False):
+        for column in columns:
+            colour, curve = _COLOURS[_side(angles.names[column])], _unbroken(found[:, column])
+            low, high = curve - band[:, column], curve + band[:, column]
+            axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0.0)
+            axis.plot(times, curve, color=colour, linewidth=1.3)
+            axis.plot(times, _unbroken(true[:, column]), "--", color="black", linewidth=0.8)
+        edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider ones would leave the curves flat
+        edges = np.concatenate([found[:, columns] - edge, found[:, columns] + edge, true[:, columns]])
+        least, most = (np.nanmin(edges), np.nanmax(edges)) if np.isfinite(edges).any() else (0.0, 0.0)
+        margin = max(0.05 * (most - least), 0.5 * (30.0 - (most - least)))  # a still angle should look still
+        axis.set_ylim(least - margin, most + margin)
+        _label(axis, title)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+
+
+# --- the person
+
+
+def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
+    """Stick figures at evenly spaced instants."""
+    skeletons, truths = tracked.skeletons, tracked.true_skeletons
+    chosen = [skeletons[n] for n in np.unique(np.linspace(0, len(skeletons) - 1, _INSTANTS).astype(int))]
+    stamps, true = (np.array([each.stamp_ns for each in side], dtype=np.int64) for side in (chosen, truths))
+    matches = nearest(true, stamps) if truths else np.full(len(chosen), -1)
+    axes, view = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0], _view(chosen)
+    for axis, skeleton, match in zip(axes, chosen, matches, strict=True):
+        base = skeleton.positions[Joint.SPINE_BASE]
+        if match >= 0:
+            _draw_bones(axis, (truths[match].positions - base) @ view.T, color="#9a9a9a", linewidth=4.0, alpha=0.45)
+        points = (skeleton.positions - base) @ view.T
+        _draw_bones(axis, points)
+        unseen = points[skeleton.states != TrackingState.TRACKED]
+        axis.plot(*unseen.T, "o", color="white", markeredgecolor="red", markersize=4.5)
+        axis.set_title(f"{(skeleton.stamp_ns - start_ns) / NANOSECONDS:.1f} s", fontsize=9)
+        axis.set_aspect("equal")
+        axis.axis("off")
+    figure.supxlabel("left blue, right orange, truth grey; circles: not tracked by any sensor", fontsize=8)
+
+
+def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
+    for bone in BONES:
+        colour = _COLOURS[_side(Joint(bone[1]).name.lower())]
+        axis.plot(*points[list(bone)].T, **{"color": colour, "linewidth": 1.6} | style)
+
+
+def _view(skeletons: list[Skeleton]) -> FloatArray:
+    """(2, 3) world to picture: somewhat off the front that the person shows on average, z up."""
+    across = np.array([each.positions[Joint.HIP_LEFT] - each.positions[Joint.HIP_RIGHT] for each in skeletons])
+    left = np.nan_to_num(across).sum(axis=0)
+    heading = np.arctan2(left[1], left[0]) + _VIEW  # the person's left is the picture's right
+    return np.array([[np.cos(heading), np.sin(heading), 0.0], [0.0, 0.0, 1.0]])
+
+
+# --- errors
+
+
+def _errors(result: Evaluation) -> str:
+    comparison = result.comparisons[0]
+    joints, shown = np.flatnonzero(comparison.joints.frames), _thin(len(comparison.times))
+    distances = 1e3 * np.linalg.norm(comparison.found - comparison.true, axis=-1)[shown][:, joints]
+    times = comparison.times[shown]
+    gap = max(result.parameters.max_gap, 2.0 * float(np.median(np.diff(times))))
+    after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # a gap, which its neighbours would fill
+    edges = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
+    distances, times = np.insert(distances, after, np.nan, axis=0), np.insert(times, after, edges)
+    figure, rows = _figure(5.0), range(len(joints))
+    axis = figure.subplots()
+    highest = max(float(np.nanpercentile(distances, 99.0)), 1.0)
+    colours = axis.pcolormesh(times, rows, distances.T, vmin=0.0, vmax=highest, shading="nearest")
+    axis.set_yticks(rows, [JOINT_NAMES[joint] for joint in joints], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("s", fontsize=8)
+    figure.colorbar(colours, label="mm")
+    return _address(figure)
+
+
+def _calibration(result: Evaluation) -> str:
+    figure = _figure(3.0)
+    axes = figure.subplots(1, 3)
+    for number, each in enumerate(result.calibration):
+        curves = (
+            (each.times, np.degrees(each.poses.rotation)),
+            (each.times, 1e3 * each.poses.displacement),
+            (each.clock_times, 1e3 * each.clock),
+        )
+        for axis, (times, values) in zip(axes, curves, strict=True):
+            if len(times):  # the last one holds until the end
+                end = max(result.span[1], times[-1])
+                axis.step([*times, end], [*values, values[-1]], where="post", color=f"C{number}", label=each.sensor)
+    for axis, title in zip(axes, ("rotation, deg", "at the person, mm", "clock, ms"), strict=True):
+        axis.axhline(0.0, color="#9a9a9a", linewidth=0.8)
+        _label(axis, title)
+    axes[0].legend(fontsize=8)
+    return _address(figure)
