@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from body_tracking.filtering import FilterSettings, FilterStage, PeopleStage, make_stage
 from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking import graph
 from body_tracking.calibration.result import level_pose
 from body_tracking.cdr import decode_skeletons
-from body_tracking.filtering import FilterSettings, FilterStage, PeopleStage, make_stage
 from body_tracking.fusion.people import PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.upper_body import SEGMENTS

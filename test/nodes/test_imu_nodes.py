@@ -12,12 +12,12 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
+from body_tracking.imu_tracking import ImuSettings  # noqa: E402
 from running import RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
-from body_tracking.imu_tracking import ImuSettings  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.imus import message_to_orientation  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402

@@ -30,9 +30,8 @@ from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import ParameterError
 from body_tracking.recording import replay as replay_module
 from body_tracking.recording import stages
-from body_tracking.recording.replay import ReplayError, replay
+from body_tracking.recording.replay import Downstream, ForkedDownstream, ReplayError, ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
-from body_tracking.recording.stages import Downstream, ForkedDownstream, ReplaySettings
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate
