@@ -16,9 +16,10 @@ from std_srvs.srv import Trigger
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.nodes.bag_topics import UnknownTypeError, message_class, to_profile
-from body_tracking.nodes.common import ROS, STEADY, GraphNode, deserialized
+from body_tracking.nodes.common import ROS, STEADY, GraphNode, deserialized, run
 from body_tracking.parameters import Value
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.systems import stage_class
 
 _LOOK_S = 0.1
 """Seconds between two looks for what other nodes publish."""
@@ -209,3 +210,13 @@ class StageNode(GraphNode):
             self.stage.save()
         except BodyTrackingError as error:
             self.get_logger().error(str(error))
+
+
+def main_of(executable: str) -> Callable[[], None]:
+    """What runs the node that hosts the stage of this name."""
+    hosted = stage_class(executable)
+
+    class Host(StageNode):
+        STAGE = hosted
+
+    return partial(run, Host)

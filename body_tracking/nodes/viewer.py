@@ -25,11 +25,12 @@ from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2
 from std_srvs.srv import Trigger
 
-from body_tracking import graph, names
+from body_tracking import graph, names, systems
 from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
+from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
@@ -96,7 +97,7 @@ class ViewerNode(GraphNode):
         self.history = AngleHistory(given["window"])
         self.drawn, self.drawing_s = 0, 0.0
         self.ended = threading.Event()
-        self.triggers = {name: self.create_client(Trigger, name) for name, _, _ in graph.SERVICES}
+        self.triggers = {each.name: self.create_client(Trigger, each.name) for each in systems.SERVICES}
         self.setters = {
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
             for name in ("skeleton_filter", "joint_angles")
@@ -273,7 +274,7 @@ class ViewerNode(GraphNode):
 
     def choose_filter(self, name: str) -> str:
         """Another filter, and what the joint angles then are made of."""
-        convention = graph.ROLES[name].convention
+        convention = ROLES[name].convention
         self.set_parameters_of("skeleton_filter", filter=name)
         self.set_parameters_of("joint_angles", convention=convention, input=graph.AUTO)
         return f"{name}, with angles {convention}"
