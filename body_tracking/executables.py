@@ -47,7 +47,7 @@ def start(name: str) -> None:
     if importlib.util.find_spec(f"body_tracking.nodes.{name}") is not None:
         main = importlib.import_module(f"body_tracking.nodes.{name}").main
     else:  # of a system that another package brings
-        main = importlib.import_module("body_tracking.nodes.host").main_of(name)
+        main = importlib.import_module("body_tracking.nodes.host").host_of(name)
     imported.set()
     main()
 

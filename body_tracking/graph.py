@@ -13,7 +13,7 @@ from typing import Final
 
 from body_tracking import names
 from body_tracking.errors import BodyTrackingError
-from body_tracking.messages.base import (
+from body_tracking.messages.types import (
     IMAGE,
     JOINT_STATE,
     SEGMENTS,

@@ -14,13 +14,10 @@ from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from body_tracking import graph
-from body_tracking.fusion.subject import ALL, MAX_PEOPLE
 from body_tracking.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
-from body_tracking.pipeline.offline import connect
-from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import (
     NodeSpec,
     Options,
@@ -28,6 +25,9 @@ from body_tracking.pipeline.system import (
     System,
     load,
 )
+
+if TYPE_CHECKING:
+    from body_tracking.pipeline.stage import Stage
 
 ENTRY_POINTS: Final = "body_tracking.systems"
 """The group of entry points by which another package brings a system."""
@@ -175,6 +175,8 @@ def with_file(options: Options, file: Path | None) -> Options:
 
 def bodies_of(options: Options) -> tuple[str, ...]:
     """The ids of those who may be tracked, of several people; empty with one subject."""
+    from body_tracking.fusion.subject import ALL, MAX_PEOPLE
+
     return graph.bodies(int(str(options["people"])) or MAX_PEOPLE) if options["subject"] == ALL else ()
 
 
@@ -238,6 +240,8 @@ def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, 
     for spec in hosts:
         own = {name: value for name, value in parameters[spec.name].items() if not is_ros_own(name)}
         stages[spec.name] = stage_class(spec.executable)(check_all(parameters_of(spec.executable), own))
+    from body_tracking.pipeline.offline import connect  # numpy takes its time
+
     connect(tuple(stages.values()))
     return stages
 

@@ -122,7 +122,7 @@ def options_for(args: argparse.Namespace) -> Options:
         given["sensors"] = asked
     if args.robot is not None:
         given["convention"] = convention_of(args.robot, args.convention or "")
-    given["namespace"] = names.check_namespace(args.namespace)
+    given["namespace"] = names.check_namespace(args.namespace or "/")
     options = with_file(options_of(**given), args.params_file)
     imus = options["imus"]
     if args.bag is not None and isinstance(imus, tuple):

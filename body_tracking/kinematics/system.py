@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from body_tracking import graph
-from body_tracking.messages.base import JOINT_STATE
+from body_tracking.messages.types import JOINT_STATE
 from body_tracking.parameters import Value
 from body_tracking.pipeline.system import (
     NodeSpec,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from body_tracking import graph
-from body_tracking.messages.base import DIAGNOSTICS
+from body_tracking.messages.types import DIAGNOSTICS
 from body_tracking.pipeline.system import Command, Option, System, TopicSpec
 from body_tracking.recording.qos import RELIABLE
 

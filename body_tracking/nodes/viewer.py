@@ -39,9 +39,11 @@ from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_status import NodeStatus, note_statuses
-from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.bag_topics import message_class, to_profile
 from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run
+from body_tracking.nodes.wire import WIRE
 from body_tracking.parameters import Parameter
+from body_tracking.pipeline.system import load
 from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import FloatArray, Skeleton
@@ -105,6 +107,10 @@ class ViewerNode(GraphNode):
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
             self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+        self.codecs = {layer.topic: load(layer.codec)() for layer in systems.LAYERS}
+        for topic, codec in self.codecs.items():
+            kind = message_class(codec.type_name)
+            self.listen(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
         self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
         self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
         self.of_body: list[Any] = []
@@ -125,7 +131,14 @@ class ViewerNode(GraphNode):
         except ImportError as error:
             raise PageError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
         page = Page(
-            given["host"], given["port"], self.sensors, self, tuple(FILTERS), tuple(ALL_CONVENTIONS), given["window"]
+            given["host"],
+            given["port"],
+            self.sensors,
+            self,
+            tuple(FILTERS),
+            tuple(ALL_CONVENTIONS),
+            given["window"],
+            systems.LAYERS,
         )
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
@@ -208,6 +221,7 @@ class ViewerNode(GraphNode):
             self.seen(graph.FILTERED),
             origins,
             quats,
+            {layer.name: self.payload(layer.topic) for layer in systems.LAYERS},
         )
 
     def seen(self, topic: str) -> Seen:
@@ -236,6 +250,17 @@ class ViewerNode(GraphNode):
         except MessageError as error:
             self.malformed(graph.segments_topic(self.body), str(error))
             return np.empty((0, 3)), np.empty((0, 4))
+
+    def payload(self, topic: str) -> Any:
+        """The latest message of a layer's topic; None for none, or none that is new."""
+        cdr, received = self.latest.get(topic, (b"", -np.inf))
+        if time.monotonic() - received > _STALE_S:
+            return None
+        try:
+            return self.codecs[topic].decode(cdr, WIRE)
+        except BodyTrackingError as error:
+            self.malformed(topic, str(error))
+            return None
 
     def collect_angles(self) -> None:
         """Take the joint angles that have come, each with its standard deviations."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from body_tracking import graph
-from body_tracking.messages.base import CLOCK
+from body_tracking.messages.types import CLOCK
 from body_tracking.parameters import Value
 from body_tracking.pipeline.system import (
     Command,

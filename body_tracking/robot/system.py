@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from body_tracking import graph
-from body_tracking.messages.base import JOINT_TRAJECTORY
+from body_tracking.messages.types import JOINT_TRAJECTORY
 from body_tracking.parameters import Value
 from body_tracking.pipeline.system import (
     NodeSpec,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from body_tracking import graph
-from body_tracking.messages.base import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.messages.types import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.parameters import Value
 from body_tracking.pipeline.system import (
     Command,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from body_tracking import graph
-from body_tracking.messages.base import MARKERS
+from body_tracking.messages.types import MARKERS
 from body_tracking.parameters import Value
 from body_tracking.pipeline.system import NodeSpec, NodeType, Option, Options, Place, System, TopicSpec
 from body_tracking.recording.qos import RELIABLE
