@@ -186,6 +186,8 @@ def bodies_of(options: Options) -> tuple[str, ...]:
 def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     """The nodes of a graph; sources last, so that those who listen are there first.
 
+    With two sensors and a filter it is the process of Schlagenhauf (2017), figure 5.1.
+
     Raises:
         GraphError: no sensor, or one twice; a filter was asked for what it cannot do.
         SensorNameError: a name that cannot be a sensor's.

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -20,6 +21,13 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 ROOT = Path(__file__).resolve().parent.parent
 HEIGHT = "/humans/height"
+
+
+class _Nobody:
+    """Takes what people press."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *given: ""
 
 
 def command(*words: str | Path) -> str:
@@ -81,7 +89,7 @@ def test_its_layer_is_drawn_and_can_be_switched_off(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         viser.SceneApi, "add_label", lambda self, name, text, visible=True, **rest: shown.append((text, visible))
     )
-    page = Page("127.0.0.1", 0, (), None, ("ekf",), ("model",), 5.0, SYSTEM.layers)  # type: ignore[arg-type]
+    page = Page("127.0.0.1", 0, (), cast(Any, _Nobody()), ("ekf",), ("model",), 5.0, SYSTEM.layers)
     try:
         nobody = Seen((), stale=True)
         empty = np.empty((0, 3)), np.empty((0, 4))

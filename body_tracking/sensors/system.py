@@ -32,7 +32,6 @@ def _subjects() -> tuple[str, ...]:
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
-    """With two sensors and a filter it is the process of Schlagenhauf (2017), figure 5.1."""
     sensors = sensors_of(options)
     several = sensors_and_transport(options)
     yield NodeSpec("fusion", "fusion", parameters={**several, **asked(options, subject="subject", people="people")})
