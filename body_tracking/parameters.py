@@ -126,19 +126,28 @@ def number_field(default: float, doc: str, unit: str, low: float, high: float) -
 
 
 def parameters_from(
-    parameter_class: type[Any], *, live: bool = False, prefix: str = "", fixed: Mapping[str, str] = MappingProxyType({})
+    parameter_class: type[Any],
+    *,
+    only: Collection[str] = (),
+    live: bool = False,
+    prefix: str = "",
+    fixed: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Parameter, ...]:
     """A parameter per field of a library's parameter dataclass.
 
     Args:
         parameter_class: a dataclass with a default for every field; ``field(metadata=...)`` may hold ``doc``, ``unit``,
             ``min``, ``max`` and ``choices``.
+        only: the fields that users may set, by name; all when empty. Others keep their defaults, whose source stands
+            beside them, but for who uses the class.
         live: whether they may change while the node runs.
         prefix: of the parameters' names, such as ``ekf.``.
         fixed: those that may not even so, and why not; empty for the usual reason.
     """
     table = []
     for item in fields(parameter_class):
+        if only and item.name not in only:
+            continue
         default: Any = item.default
         known = {key: item.metadata[key] for key in ("unit", "min", "max") if key in item.metadata}
         choices = tuple(item.metadata.get("choices", ()))
@@ -168,7 +177,8 @@ def check_fields(parameters: Any, what: str, error: type[BodyTrackingError]) -> 
 
 def fields_of(parameter_class: type[Any], values: Mapping[str, Value], *, prefix: str = "") -> dict[str, Any]:
     """Those of a node's values that are fields of a library's parameter dataclass; ``prefix`` as given above."""
-    return {item.name: values[f"{prefix}{item.name}"] for item in fields(parameter_class)}
+    names = (item.name for item in fields(parameter_class))
+    return {name: values[f"{prefix}{name}"] for name in names if f"{prefix}{name}" in values}
 
 
 def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[str, Value]:

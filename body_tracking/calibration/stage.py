@@ -42,7 +42,12 @@ class CalibrationStage(Stage):
             fixed="it is loaded at the start",
         ),
         WORLD_FRAME,
-        *parameters_from(CalibrationParameters, live=True, fixed=_FIXED),
+        *parameters_from(
+            CalibrationParameters,
+            only=("method", "reference_height", "reference_pitch", "reference_roll", "activation_delay"),
+            live=True,
+            fixed=_FIXED,
+        ),
         RELIABLE,
     )
 

@@ -144,12 +144,17 @@ def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
     return {graph.orientation_topic(segment): segment for segment in segments}
 
 
+_SETTABLE = {"": ("measurement_noise_scale", "predict_for", "t_pose"), "ekf.": ("predict_for", "posture", "t_pose")}
+"""What users may set of the filters with each prefix; the thesis's are as she has them."""
+
+
 def filter_table() -> tuple[Parameter, ...]:
     """The parameters of all filters, as ``skeleton_filter`` has them."""
+    classes = parameter_classes()
     return tuple(
         item
-        for prefix, parameter_class in parameter_classes().items()
-        for item in parameters_from(parameter_class, live=True, prefix=prefix)
+        for prefix, names in _SETTABLE.items()
+        for item in parameters_from(classes[prefix], only=names, live=True, prefix=prefix)
     )
 
 

@@ -108,7 +108,7 @@ class _Sensor(Placement):
         self.selector.reset()
 
 
-PEOPLE = parameters_from(PeopleParameters)
+PEOPLE = parameters_from(PeopleParameters, only=("subject", "people"))
 """Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
 
 
@@ -118,7 +118,8 @@ def people_from(values: Mapping[str, Value]) -> PeopleParameters:
     Raises:
         ParameterError: one of them is out of its range.
     """
-    given = {item.name: item.check(values[item.name]) for item in PEOPLE}
+    table = parameters_from(PeopleParameters)
+    given = {item.name: item.check(values[item.name]) for item in table if item.name in values}
     return PeopleParameters(**fields_of(PeopleParameters, given))
 
 

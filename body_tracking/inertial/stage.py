@@ -41,7 +41,8 @@ MOUNTINGS = Parameter(
     "SEGMENT:AXES of sensors that are not put on as usual: where their x and z point on the hanging arm or the upright "
     "trunk of somebody who looks along x with y to the left, as in forearm_left:-z+y",
 )
-IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters))
+_SETTABLE = ("pose", "camera", "clock", "magnetometer", "rate", "pose_stddev", "movement", "stature")
+IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters, only=_SETTABLE))
 _READINGS = 64
 """Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
 _FIELD_NS = NANOSECONDS // 20

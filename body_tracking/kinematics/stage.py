@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Any
 
 from body_tracking import graph
-from body_tracking.fusion.association import HOLD
 from body_tracking.fusion.people import PEOPLE, PeopleParameters, people_from
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.angles import JointAngles
@@ -114,7 +113,7 @@ class AnglesStage(Stage):
         convention, source = graph.angles_for(asked, known or graph.SKELETON_INPUT)
         # Not before it is known what to take: angles of another convention than all later ones could come.
         self.source = source if known or asked == graph.POSITIONAL else ""
-        people = people_from({**values, "hold": HOLD})
+        people = people_from(values)
         self._several = people.subject == ALL
         self.streams = angle_streams(convention, graph.check_body(str(values["body"])), people)
         self._waiting = {body: OrderedDict() for body in self.streams}

@@ -128,7 +128,8 @@ class ReplaySettings:
             given |= self.parameters.get(spec.name, {})
             table = stage_class(spec.name).PARAMETERS
             known = {item.name for item in table}
-            found[spec.name] = check_all(table, {name: each for name, each in given.items() if name in known})
+            checked = check_all(table, {name: each for name, each in given.items() if name in known})
+            found[spec.name] = {**own.get(spec.name, {}), **checked}
         return found
 
 
@@ -369,7 +370,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         node: {name: value for name, value in values.items() if name not in left} for node, values in given.items()
     }
     whom = given["skeleton_filter"]
-    people = {name: whom[name] for name in ("subject", "people", "hold") if name in whom}
+    people = {name: whom[name] for name in ("subject", "people") if name in whom}
     for node in ("skeleton_filter", "joint_angles"):
         parameters[node]["body"] = args.body
     if args.reference:
