@@ -129,10 +129,10 @@ def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="ROS is not installed")
     file = tmp_path / "parameters.yaml"
     file.write_text(
-        "/lab/fusion: {ros__parameters: {silence: 0.3}}\n"
-        "fusion: {ros__parameters: {silence: 0.2, max_wait: 0.01}}\n"
+        "/lab/calibration: {ros__parameters: {reference_height: 0.3}}\n"
+        "calibration: {ros__parameters: {reference_height: 0.2, reference_roll: 0.01}}\n"
         "skeleton_filter: {ros__parameters: {filter: ekf}}\n"
-        "/**: {ros__parameters: {silence: 0.1, gate: 4.0}}\n"
+        "/**: {ros__parameters: {reference_height: 0.1, reference_pitch: 0.4}}\n"
     )
     for namespace, prefix in (("/", "/"), ("/lab", "/lab/")):
         options = systems.with_file(options_of(namespace=namespace), file)
@@ -140,9 +140,9 @@ def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
         assert {spec.full_name for spec in nodes_for(options)} == {
             f"{prefix}{spec.name}" for spec in nodes_for(options)
         }
-    found = parameters_for(nodes_for(options), file)["fusion"]
-    assert [found[name] for name in ("silence", "max_wait", "gate")] == [0.3, 0.01, 4.0]
-    with pytest.raises(ParameterError, match="/lab/fusion: no such node"):
+    found = parameters_for(nodes_for(options), file)["calibration"]
+    assert [found[name] for name in ("reference_height", "reference_roll", "reference_pitch")] == [0.3, 0.01, 0.4]
+    with pytest.raises(ParameterError, match="/lab/calibration: no such node"):
         parameters_for(nodes_for(options_of()), file)
 
 

@@ -401,8 +401,8 @@ def test_a_bag_that_is_none_or_has_no_skeletons(capsys: pytest.CaptureFixture[st
         ("fusion: {silence: 1.0}", "holds no ros__parameters"),
         ("fusion: [", "is not YAML"),
         (
-            "skeleton_filter: {ros__parameters: {ekf.velocity_tim: 1.0}}",
-            "unknown parameter 'ekf.velocity_tim'; did you mean 'ekf.velocity_time'?",
+            "skeleton_filter: {ros__parameters: {ekf.predict_fr: 1.0}}",
+            "unknown parameter 'ekf.predict_fr'; did you mean 'ekf.predict_for'?",
         ),
         ("skeleton_filter: {ros__parameters: {filter: 3}}", "parameter 'filter': 3, expected a string"),
         ("joint_angles: {ros__parameters: {convention: isp}}", "parameter 'convention': 'isp', expected one of"),
@@ -456,7 +456,7 @@ def test_the_filter_in_the_file_decides_what_joint_angles_listens_to(tmp_path: P
         ("/**: {ros__parameters: {filter: ekf, convention: auto}}", ("model_state", "model")),
         ("skeleton_filter: {ros__parameters: {filter: schlagenhauf_ekf}}", ("skeleton", "model")),
         (
-            "skeleton_filter: {ros__parameters: {filter: ekf, ekf: {velocity_time: 2}}}\n"
+            "skeleton_filter: {ros__parameters: {filter: ekf, ekf: {predict_for: 2}}}\n"
             "joint_angles: {ros__parameters: {convention: isb, input: skeleton}}",
             ("skeleton", "isb"),
         ),
@@ -466,8 +466,8 @@ def test_the_filter_in_the_file_decides_what_joint_angles_listens_to(tmp_path: P
         options = systems.with_file(options_of(), file)
         found = parameters_for(systems.nodes_for(options), file, absent=systems.all_nodes_for(options))
         assert angles_of(found, options) == expected
-        if "velocity_time" in content:
-            assert found["skeleton_filter"]["ekf.velocity_time"] == 2.0
+        if "predict_for" in content:
+            assert found["skeleton_filter"]["ekf.predict_for"] == 2.0
     # The command line wins.
     options = systems.with_file(options_of(filter="lkf_zero_velocity", convention="rep155"), file)
     found = parameters_for(systems.nodes_for(options), file)
@@ -477,8 +477,8 @@ def test_the_filter_in_the_file_decides_what_joint_angles_listens_to(tmp_path: P
 def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(
-        "/**: {ros__parameters: {world_frame: map, gate: 5}}\n"
-        "fusion: {ros__parameters: {gate: 4}}\n"
+        "/**: {ros__parameters: {world_frame: map, silence: 5}}\n"
+        "fusion: {ros__parameters: {silence: 4}}\n"
         "skeleton_filter: {ros__parameters: {filter: lkf_constant_velocity, predict_for: 1}}\n"
         "calibration: {ros__parameters: {calibration_file: mine.yaml}}\n"
         "bag_recorder: {ros__parameters: {chunk_seconds: 2.0}}\n"  # not started, but part of a graph
@@ -488,7 +488,7 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path
     found = parameters_for(systems.nodes_for(options), file, defaults, systems.all_nodes_for(options))
     assert found["fusion"]["world_frame"] == found["calibration"]["world_frame"] == "map"
     assert "world_frame" not in found["joint_angles"]
-    assert found["fusion"]["gate"] == 4.0
+    assert found["fusion"]["silence"] == 4.0
     assert found["skeleton_filter"]["filter"] == "lkf_zero_velocity"
     assert found["skeleton_filter"]["predict_for"] == 1.0
     assert found["calibration"]["calibration_file"] == "mine.yaml"

@@ -24,7 +24,7 @@ _FIXED = {
     "method": "what one method has estimated is no start for the other",
     **dict.fromkeys(("reference_height", "reference_pitch", "reference_roll"), _LEVEL),
     **dict.fromkeys(("history", "pairs_per_place", "capacity"), _MEMORY),
-    **dict.fromkeys(("settle_time", "activation_delay"), _STAMPS),
+    **dict.fromkeys(("activation_delay",), _STAMPS),
 }
 
 
@@ -44,7 +44,14 @@ class CalibrationStage(Stage):
         WORLD_FRAME,
         *parameters_from(
             CalibrationParameters,
-            only=("method", "reference_height", "reference_pitch", "reference_roll", "activation_delay"),
+            only=(
+                "method",
+                "reference_height",
+                "reference_pitch",
+                "reference_roll",
+                "activation_delay",
+                "max_rotation_stddev",
+            ),
             live=True,
             fixed=_FIXED,
         ),

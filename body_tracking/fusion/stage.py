@@ -45,7 +45,7 @@ class FusionStage(Stage):
         REFERENCE,
         WORLD_FRAME,
         *PEOPLE,
-        *parameters_from(FusionParameters, only=("method", "max_wait"), live=True, fixed=_FIXED),
+        *parameters_from(FusionParameters, only=("method", "silence", "max_wait"), live=True, fixed=_FIXED),
         RELIABLE,
     )
 

@@ -130,21 +130,21 @@ def test_a_wrong_name_or_value_is_refused_in_our_words_and_nothing_changes(runni
         "silense": (0.2, "fusion: unknown parameter 'silense'; did you mean 'silence'?"),
         "silence": (99.0, "fusion: parameter 'silence': 99.0, expected 0.02 to 5"),
         "method": ("mean", "fusion: parameter 'method': 'mean', expected one of covariance, thesis_text"),
-        "gate": ("wide", "fusion: parameter 'gate': 'wide', expected a number"),
+        "max_wait": ("wide", "fusion: parameter 'max_wait': 'wide', expected a number"),
     }
-    before = running.get("fusion", ["silence", "method", "gate"])
+    before = running.get("fusion", ["silence", "method", "max_wait"])
     answers = running.set("fusion", **{name: value for name, (value, _) in refused.items()})
     for (done, reason), (_, expected) in zip(answers, refused.values(), strict=True):
         assert not done
         assert reason.startswith(expected)
-    assert running.get("fusion", ["silence", "method", "gate"]) == before
+    assert running.get("fusion", ["silence", "method", "max_wait"]) == before
 
 
 def test_a_whole_number_serves_as_a_number(running: Graph) -> None:
-    assert running.set("fusion", gate=4) == [(True, "")]
-    [gate] = running.get("fusion", ["gate"])
-    assert gate.type == ParameterType.PARAMETER_DOUBLE
-    assert gate.double_value == 4.0
+    assert running.set("fusion", max_wait=1) == [(True, "")]
+    [wait] = running.get("fusion", ["max_wait"])
+    assert wait.type == ParameterType.PARAMETER_DOUBLE
+    assert wait.double_value == 1.0
 
 
 def test_the_fusion_drops_a_sensor_sooner_and_keeps_its_poses(running: Graph) -> None:

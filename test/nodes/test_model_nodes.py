@@ -300,11 +300,11 @@ def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tr
 
 def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> None:
     done, reason = tracking.set_parameter(
-        "skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=0.0)
+        "skeleton_filter", "ekf.predict_for", ParameterValue(type=3, double_value=-1.0)
     )
     assert not done
-    assert "ekf.velocity_time" in reason
-    assert tracking.set_parameter("skeleton_filter", "ekf.velocity_time", ParameterValue(type=3, double_value=2.0))[0]
+    assert "ekf.predict_for" in reason
+    assert tracking.set_parameter("skeleton_filter", "ekf.predict_for", ParameterValue(type=3, double_value=2.0))[0]
     assert tracking.set_parameter("joint_angles", "convention", ParameterValue(type=4, string_value="rep155"))[0]
     tracking.cut_short()
     # With the poses that the filter had before: they do not come again.

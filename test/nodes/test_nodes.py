@@ -59,12 +59,12 @@ def recorded(sensor: str) -> list[Skeleton]:
         ("kinect_skeleton", "sensor:=fused", "sensor name 'fused' is reserved"),
         ("kinect_skeleton", "file:=/nowhere.csv", "/nowhere.csv: no such file"),
         ("calibration", "calibration_fil:=a", "unknown parameter 'calibration_fil'"),
-        ("calibration", "capacity:=1.5", "parameter 'capacity': 1.5, expected a whole number"),
+        ("fusion", "people:=1.5", "parameter 'people': 1.5, expected a whole number"),
         ("calibration", "reference:=kinect9", "kinect9"),
         ("fusion", "silence:=99.0", "parameter 'silence': 99.0, expected 0.02 to 5"),
         ("fusion", "sensors:=3", "parameter 'sensors': 3, expected a list of strings"),
         ("skeleton_filter", "filter:=ekg", "parameter 'filter': 'ekg', expected one of"),
-        ("skeleton_filter", "gate_probability:=true", "parameter 'gate_probability': True, expected a number"),
+        ("skeleton_filter", "predict_for:=true", "parameter 'predict_for': True, expected a number"),
         ("joint_angles", "body:=a/b", "parameter 'body': 'a/b'"),
         ("bag_player", "bags:=x", "unknown parameter 'bags'; did you mean 'bag'?"),
         ("bag_recorder", "chunk_seconds:=-1.0", "parameter 'chunk_seconds'"),
@@ -264,8 +264,8 @@ def test_the_filter_may_change_while_it_runs_but_not_to_nonsense(nodes: Running)
     refused, reason = set_parameter("filter", ParameterValue(type=4, string_value="wishful"))
     assert not refused
     assert "expected one of" in reason
-    assert not set_parameter("gate_probability", ParameterValue(type=3, double_value=7.0))[0]
-    assert set_parameter("gate_probability", ParameterValue(type=3, double_value=0.999))[0]
+    assert not set_parameter("measurement_noise_scale", ParameterValue(type=3, double_value=-7.0))[0]
+    assert set_parameter("measurement_noise_scale", ParameterValue(type=3, double_value=1.1))[0]
     assert not set_parameter("reliable", ParameterValue(type=1, bool_value=False))[0]
 
 

@@ -420,10 +420,10 @@ def test_where_one_process_is_killed_the_other_ends_and_leaves_no_bag(tmp_path: 
 
 def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Command) -> None:
     for text, message in (
-        ("fusion: {ros__parameters: {gait: 3.0}}", "did you mean 'gate'"),
+        ("fusion: {ros__parameters: {max_wate: 3.0}}", "did you mean 'max_wait'"),
         ("calibration: {ros__parameters: {method: best}}", "method"),
-        ("skeleton_filter: {ros__parameters: {white_noise_share: 7.0}}", "white_noise_share"),
-        ("skeleton_filter: {ros__parameters: {filter: ekf, ekf: {velocity_tim: 7.0}}}", "'ekf.velocity_time'"),
+        ("skeleton_filter: {ros__parameters: {measurement_noise_scale: -7.0}}", "measurement_noise_scale"),
+        ("skeleton_filter: {ros__parameters: {filter: ekf, ekf: {predict_fro: 7.0}}}", "'ekf.predict_for'"),
         ("skeleton_filter: {ros__parameters: {filter: ekg}}", "expected one of"),
         ("joint_angles: {ros__parameters: {convention: isp}}", "expected one of"),
         ("joint_angles: {ros__parameters: {convention: isb, input: model_state}}", "has no model of the body"),
