@@ -77,6 +77,8 @@ setup(
             "psutil",
             "setuptools>=77",
             "ezc3d>=1.7",
+            "import-linter>=2",
+            "opencv-python-headless>=4.6",
             "mujoco-core>=4",
             "playwright>=1.50",
         ],

@@ -1,11 +1,8 @@
-"""The 25 Kinect v2 joints, their tracking states, and one body seen at one instant.
-
-The one place for the joint list: every other part indexes joints through :class:`Joint`.
-"""
+"""Sets of joints, the Kinect v2's among them, tracking states, and one body seen at one instant."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -67,49 +64,94 @@ class TrackingState(IntEnum):
     TRACKED = 2
 
 
-N_JOINTS = len(Joint)
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSet:
+    """The points of a body that a kind of sensor sees.
 
-JOINT_NAMES: tuple[str, ...] = tuple(joint.name.title().replace("_", "") for joint in Joint)
+    Attributes:
+        name: of the set.
+        names: of each joint, in upper case; the two sides of a pair differ by a part ``LEFT`` or ``RIGHT``.
+        parents: the number of each joint's parent; -1 at the root.
+
+    Raises:
+        SkeletonError: a name twice, or a parent that is none.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if len(set(self.names)) < count or len(self.parents) != count:
+            raise SkeletonError(f"joint set {self.name}: {count} names, {len(self.parents)} parents, or a name twice")
+        if not all(-1 <= parent < count and parent != joint for joint, parent in enumerate(self.parents)):
+            raise SkeletonError(f"joint set {self.name}: a parent is none of its {count} joints")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def bones(self) -> tuple[tuple[int, int], ...]:
+        """(parent, child) of every segment."""
+        return tuple((parent, joint) for joint, parent in enumerate(self.parents) if parent >= 0)
+
+    @property
+    def mirror(self) -> IntArray:
+        """(n,) ``positions[mirror]`` swaps left and right.
+
+        Raises:
+            SkeletonError: a joint of one side without one of the other.
+        """
+        other = {"LEFT": "RIGHT", "RIGHT": "LEFT"}
+        twins = ["_".join(other.get(word, word) for word in name.split("_")) for name in self.names]
+        missing = set(twins) - set(self.names)
+        if missing:
+            raise SkeletonError(f"joint set {self.name}: no joint {', '.join(sorted(missing))}")
+        return np.array([self.names.index(twin) for twin in twins], dtype=np.intp)
+
+
+_PARENTS = {
+    Joint.SPINE_MID: Joint.SPINE_BASE,
+    Joint.SPINE_SHOULDER: Joint.SPINE_MID,
+    Joint.NECK: Joint.SPINE_SHOULDER,
+    Joint.HEAD: Joint.NECK,
+    Joint.SHOULDER_LEFT: Joint.SPINE_SHOULDER,
+    Joint.ELBOW_LEFT: Joint.SHOULDER_LEFT,
+    Joint.WRIST_LEFT: Joint.ELBOW_LEFT,
+    Joint.HAND_LEFT: Joint.WRIST_LEFT,
+    Joint.HAND_TIP_LEFT: Joint.HAND_LEFT,
+    Joint.THUMB_LEFT: Joint.HAND_LEFT,
+    Joint.SHOULDER_RIGHT: Joint.SPINE_SHOULDER,
+    Joint.ELBOW_RIGHT: Joint.SHOULDER_RIGHT,
+    Joint.WRIST_RIGHT: Joint.ELBOW_RIGHT,
+    Joint.HAND_RIGHT: Joint.WRIST_RIGHT,
+    Joint.HAND_TIP_RIGHT: Joint.HAND_RIGHT,
+    Joint.THUMB_RIGHT: Joint.HAND_RIGHT,
+    Joint.HIP_LEFT: Joint.SPINE_BASE,
+    Joint.KNEE_LEFT: Joint.HIP_LEFT,
+    Joint.ANKLE_LEFT: Joint.KNEE_LEFT,
+    Joint.FOOT_LEFT: Joint.ANKLE_LEFT,
+    Joint.HIP_RIGHT: Joint.SPINE_BASE,
+    Joint.KNEE_RIGHT: Joint.HIP_RIGHT,
+    Joint.ANKLE_RIGHT: Joint.KNEE_RIGHT,
+    Joint.FOOT_RIGHT: Joint.ANKLE_RIGHT,
+}
+KINECT = JointSet(
+    "kinect", tuple(joint.name for joint in Joint), tuple(int(_PARENTS.get(joint, -1)) for joint in Joint)
+)
+"""The joints of a Kinect v2."""
+
+N_JOINTS = len(KINECT)
+
+JOINT_NAMES: tuple[str, ...] = tuple(name.title().replace("_", "") for name in KINECT.names)
 """The SDK's own names, in SDK order: ``SpineBase``, ``SpineMid``, ..."""
 
-BONES: tuple[tuple[Joint, Joint], ...] = (
-    (Joint.SPINE_BASE, Joint.SPINE_MID),
-    (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-    (Joint.SPINE_SHOULDER, Joint.NECK),
-    (Joint.NECK, Joint.HEAD),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT),
-    (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
-    (Joint.ELBOW_LEFT, Joint.WRIST_LEFT),
-    (Joint.WRIST_LEFT, Joint.HAND_LEFT),
-    (Joint.HAND_LEFT, Joint.HAND_TIP_LEFT),
-    (Joint.HAND_LEFT, Joint.THUMB_LEFT),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
-    (Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT),
-    (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
-    (Joint.WRIST_RIGHT, Joint.HAND_RIGHT),
-    (Joint.HAND_RIGHT, Joint.HAND_TIP_RIGHT),
-    (Joint.HAND_RIGHT, Joint.THUMB_RIGHT),
-    (Joint.SPINE_BASE, Joint.HIP_LEFT),
-    (Joint.HIP_LEFT, Joint.KNEE_LEFT),
-    (Joint.KNEE_LEFT, Joint.ANKLE_LEFT),
-    (Joint.ANKLE_LEFT, Joint.FOOT_LEFT),
-    (Joint.SPINE_BASE, Joint.HIP_RIGHT),
-    (Joint.HIP_RIGHT, Joint.KNEE_RIGHT),
-    (Joint.KNEE_RIGHT, Joint.ANKLE_RIGHT),
-    (Joint.ANKLE_RIGHT, Joint.FOOT_RIGHT),
-)
+BONES: tuple[tuple[Joint, Joint], ...] = tuple((parent, child) for child, parent in _PARENTS.items())
 """(parent, child) of every segment, from the base of the spine outwards."""
 
-
-def _mirror() -> IntArray:
-    other = {"LEFT": "RIGHT", "RIGHT": "LEFT"}
-    return np.array(
-        [Joint["_".join(other.get(word, word) for word in joint.name.split("_"))] for joint in Joint], dtype=np.intp
-    )
-
-
-MIRROR: IntArray = _mirror()
-"""``positions[MIRROR]`` exchanges left and right."""
+MIRROR: IntArray = KINECT.mirror
+"""``positions[MIRROR]`` swaps left and right."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,11 +162,12 @@ class Skeleton:
         stamp_ns: capture time in nanoseconds, in the clock of whoever made it (a sensor's own clock, or the
             reference sensor's clock for fused and filtered skeletons).
         frame_id: the frame of the positions, such as ``kinect1_optical_frame`` or ``world``.
-        positions: (25, 3) metres, SDK order; NaN where nothing is known.
-        states: (25,) uint8 of :class:`TrackingState`.
+        positions: (n, 3) metres; NaN where nothing is known.
+        states: (n,) uint8 of :class:`TrackingState`.
         body: the sensor's number of this body.
-        covariances: (25, 3, 3) square metres, or None where the source states none (raw sensors).
-        velocities: (25, 3) metres per second, or None.
+        covariances: (n, 3, 3) square metres, or None where the source states none (raw sensors).
+        velocities: (n, 3) metres per second, or None.
+        joints: which joints these are, n of them.
     """
 
     stamp_ns: int
@@ -134,13 +177,15 @@ class Skeleton:
     body: int = 0
     covariances: FloatArray | None = None
     velocities: FloatArray | None = None
+    joints: JointSet = KINECT
 
     def __post_init__(self) -> None:
+        count = len(self.joints)
         for name, shape in (
-            ("positions", (N_JOINTS, 3)),
-            ("states", (N_JOINTS,)),
-            ("covariances", (N_JOINTS, 3, 3)),
-            ("velocities", (N_JOINTS, 3)),
+            ("positions", (count, 3)),
+            ("states", (count,)),
+            ("covariances", (count, 3, 3)),
+            ("velocities", (count, 3)),
         ):
             value: NDArray[Any] | None = getattr(self, name)
             if value is not None and value.shape != shape:
@@ -153,18 +198,17 @@ class Skeleton:
 
     @property
     def valid(self) -> BoolArray:
-        """(25,) joints that have a position within :data:`MAX_RANGE` and are not NOT_TRACKED."""
+        """(n,) joints that have a position within :data:`MAX_RANGE` and are not NOT_TRACKED."""
         known: BoolArray = (self.states > 0) & (np.abs(self.positions) < MAX_RANGE).all(axis=1)
         return known
 
     def mirrored(self) -> Skeleton:
-        """The same points with the labels left and right exchanged."""
-        return Skeleton(
-            self.stamp_ns,
-            self.frame_id,
-            self.positions[MIRROR],
-            self.states[MIRROR],
-            self.body,
-            None if self.covariances is None else self.covariances[MIRROR],
-            None if self.velocities is None else self.velocities[MIRROR],
+        """The same points with the labels left and right swapped."""
+        mirror = MIRROR if self.joints is KINECT else self.joints.mirror
+        return replace(
+            self,
+            positions=self.positions[mirror],
+            states=self.states[mirror],
+            covariances=None if self.covariances is None else self.covariances[mirror],
+            velocities=None if self.velocities is None else self.velocities[mirror],
         )
