@@ -7,36 +7,15 @@ scripts that colcon installs, else from here on.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import importlib.util
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
-
-
-def hold_signals() -> None:
-    """Let SIGINT and SIGTERM wait; also across ``exec``, by which the client library from PyPI starts Python anew."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
-
-
-def release_signals() -> None:
-    """Take those that have come meanwhile, each once, and all later ones."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
-
-
-@contextlib.contextmanager
-def signals_held() -> Iterator[None]:
-    """Within it, processes are started with these signals blocked."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+from body_tracking.signals import ENDING, hold_signals, release_signals
 
 
 def start(name: str) -> None:

@@ -28,12 +28,12 @@ import yaml
 
 from body_tracking import dds, graph, names
 from body_tracking.errors import BodyTrackingError
-from body_tracking.executables import signals_held
 from body_tracking.node_parameters import parameters_for
 from body_tracking.parameters import SECTION, Value, to_ros
 from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
+from body_tracking.signals import signals_held
 from body_tracking.skeleton import NANOSECONDS
 from body_tracking.systems import (
     FLOW,

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import sys
 
-from body_tracking.executables import hold_signals, start
+from body_tracking.executables import start
+from body_tracking.signals import hold_signals
 
 if __name__ == "__main__":
     hold_signals()

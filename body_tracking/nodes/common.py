@@ -6,26 +6,16 @@
 from __future__ import annotations
 
 import contextlib
-import faulthandler
-import gc
-import inspect
-import signal
-import socket
-import sys
-import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -38,43 +28,35 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.service import Service
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
 
-from body_tracking import dds, graph, names, systems
+from body_tracking import graph, names
 from body_tracking.backlog import Backlog, Sequences, Standstill
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.executables import ENDING, release_signals
 from body_tracking.messages.base import MessageError, RosMessages, to_nanoseconds
 from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.executor import LeanExecutor
+from body_tracking.nodes.declare import declare
+from body_tracking.nodes.main import run as run
+from body_tracking.nodes.monitor import Monitor
 from body_tracking.parameters import (
     Parameter,
     ParameterError,
     Value,
-    as_yaml,
-    check_all,
-    is_ros_own,
-    is_wildcard,
-    matches,
-    read_file,
     to_ros,
     unknown_parameter,
 )
 from body_tracking.pipeline.shared import BODY, FRAMES_KEPT, REFERENCE, RELIABLE, SENSORS, WORLD_FRAME
 from body_tracking.pipeline.shared import result_qos as shared_result_qos
 from body_tracking.pipeline.shared import skeleton_qos as shared_skeleton_qos
-from body_tracking.pipeline.stage import JUMP_BACK_NS
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.recording.qos import SENSOR_DATA, Qos
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.skeleton import Skeleton
 
 __all__ = ["BODY", "REFERENCE", "RELIABLE", "SENSORS", "WORLD_FRAME"]
 
@@ -86,14 +68,8 @@ _TICKS = 1000
 sent."""
 _ACKNOWLEDGE_S = 2.0
 """Seconds for those who listen to take a node's last messages."""
-_LEAVE_S = 5.0
-"""Seconds for the middleware to let a node go that is closed."""
-
 _FORGOTTEN_S = 25.0
 """Seconds after which DDS has forgotten a process that was killed: Fast DDS's lease of 20 s, and some more."""
-
-GAP_NS = 50_000_000
-"""Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
 
 _EVERYWHERE = frozenset({"/rosout", "/parameter_events", graph.DIAGNOSTICS_TOPIC})
 """Outputs that every node has."""
@@ -105,82 +81,6 @@ _LOOK_S = 0.2
 _FAILURES = 10
 """Callbacks of one input that fail one after the other, after which the node forgets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
-
-
-class Monitor:
-    """Counts what goes through a node, for its diagnostics."""
-
-    def __init__(self) -> None:
-        self.totals: Counter[str] = Counter()
-        self.last_reason = ""
-        self.failures: Counter[str] = Counter()
-        """Of each input and kind of error how many callbacks raised one that nobody expected."""
-        self._window: Counter[str] = Counter()
-        self._delays_ns: list[int] = []
-        self._latencies_ns: list[int] = []
-        self._looks = 0
-        self._last_stamp: dict[str, int] = {}
-        self._since = time.monotonic()
-
-    def arrived(self, topic: str) -> None:
-        """Count a message of an input."""
-        self._window[f"in {topic}"] += 1
-        self.totals["received"] += 1
-
-    def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Look at the stamp of a message of an input; True when time jumped back."""
-        last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
-        if last is None:
-            return False
-        step = stamp_ns - last
-        if step == 0:
-            self.totals["repeated stamps"] += 1
-        elif step < 0:
-            self.totals["stamps backwards"] += 1
-        elif step > GAP_NS:
-            self.totals["gaps"] += 1
-        return step < -JUMP_BACK_NS
-
-    def message_out(self, topic: str, delay_ns: int | None = None, latency_ns: int | None = None) -> None:
-        """Count a message of an output.
-
-        Args:
-            topic: its name.
-            delay_ns: since the input that it answers was sent: transport and processing.
-            latency_ns: since capture, by ROS time.
-        """
-        self._window[f"out {topic}"] += 1
-        self.totals["published"] += 1
-        if delay_ns is not None:
-            self._delays_ns.append(delay_ns)
-        # A sensor that counts from its own start tells nothing about how long ago that was.
-        if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
-            self._latencies_ns.append(latency_ns)
-
-    def wants_latency(self) -> bool:
-        """Whether to look at the clock for this message: a few a second will do, and looking takes its time."""
-        self._looks += 1
-        return self._looks <= 5
-
-    def values(self) -> dict[str, object]:
-        """Rates since the last call, and totals."""
-        now = time.monotonic()
-        elapsed, self._since = max(now - self._since, 1e-3), now
-        values: dict[str, object] = {
-            f"rate {name}": f"{count / elapsed:.1f}" for name, count in sorted(self._window.items())
-        }
-        self._window = Counter(dict.fromkeys(self._window, 0))
-        self._looks = 0
-        for name, samples in (("delay", self._delays_ns), ("latency", self._latencies_ns)):
-            if samples:
-                values[f"{name} median ms"] = f"{np.median(samples) / 1e6:.2f}"
-                values[f"{name} max ms"] = f"{max(samples) / 1e6:.2f}"
-                samples.clear()
-        values.update(self.totals)
-        values |= {f"raised {where}": count for where, count in self.failures.items()}
-        if self.last_reason:
-            values["last malformed"] = self.last_reason
-        return values
 
 
 class Alarm:
@@ -675,43 +575,6 @@ class GraphNode(Node):
         }
 
 
-def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
-    """Declare parameters; the values that they have, with what was given by file or ``-p``.
-
-    Raises:
-        ParameterError: something unknown was given, which rclpy would ignore in silence, or a value is not allowed.
-    """
-    overrides: dict[str, RosParameter] = node._parameter_overrides
-    known = {parameter.name: parameter for parameter in table}
-    given = {name: item.value for name, item in overrides.items() if not is_ros_own(name)}
-    for name in _meant_for_others(node, given.keys() - known.keys()):
-        del given[name]
-    values = check_all(table, given)
-    for name, value in values.items():
-        # rclpy would refuse a whole number where a number is expected; check_all has made it one.
-        if name in overrides:
-            overrides[name] = RosParameter(name, value=to_ros(value))
-        node.declare_parameter(name, to_ros(value), _descriptor(known[name]))
-    return MappingProxyType(values)
-
-
-def _meant_for_others(node: Node, unknown: Set[str]) -> Set[str]:
-    """Unknown names that a wildcard section of a parameters file gives to all nodes, and that some node knows."""
-    shared: set[str] = set()
-    for file in _parameter_files() if unknown else ():
-        for pattern, values in read_file(file).items():
-            if is_wildcard(pattern) and matches(pattern, node.get_fully_qualified_name()):
-                shared |= unknown & values.keys()
-    if not shared:
-        return shared
-    return shared & {parameter.name for name in systems.EXECUTABLES for parameter in systems.parameters_of(name)}
-
-
-def _parameter_files() -> list[Path]:
-    """The parameters files on the command line."""
-    return [Path(sys.argv[i + 1]) for i, word in enumerate(sys.argv[:-1]) if word == "--params-file"]
-
-
 def deserialized(cdr: bytes, kind: type[Any]) -> Any:
     """A message of CDR bytes.
 
@@ -722,141 +585,3 @@ def deserialized(cdr: bytes, kind: type[Any]) -> Any:
         return deserialize_message(cdr, kind)
     except Exception as error:  # the client library's own kinds of errors, one per RMW
         raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    description = f"{parameter.doc} [{parameter.unit}]" if parameter.unit else parameter.doc
-    descriptor = ParameterDescriptor(
-        description=description, additional_constraints=parameter.constraint, read_only=not parameter.live
-    )
-    if parameter.min is not None and parameter.max is not None:
-        if isinstance(parameter.default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(parameter.min), to_value=float(parameter.max))
-            ]
-        else:
-            descriptor.integer_range = [
-                IntegerRange(from_value=int(parameter.min), to_value=int(parameter.max), step=1)
-            ]
-    return descriptor
-
-
-# --- main
-
-
-class _Ending:
-    """Waits for SIGINT and SIGTERM in a thread of its own, and then ends the executor.
-
-    SIGINT (Ctrl-C, the end of a recording in ``body_tracking up``) lets a node finish what it has been sent; SIGTERM,
-    or a second SIGINT, does not.
-
-    rclpy's own handler shuts the context down at once, from another thread; the main thread may then be destroying the
-    node, and the process crashes now and then. Here everything ends in its order, and a second Ctrl-C waits until a
-    recording is closed.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._asked = 0
-        self._executor: LeanExecutor | None = None
-        # Python runs its handlers only between two steps of the main thread, which mostly waits below Python; the byte
-        # that it writes for each signal comes through at once.
-        self._reader, self._writer = socket.socketpair()
-        self._writer.setblocking(False)
-        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        for number in ENDING:
-            signal.signal(number, lambda *_: None)
-        threading.Thread(target=self._wait, daemon=True).start()
-        release_signals()
-
-    def over(self) -> None:
-        """Everything has ended: another Ctrl-C, as ``ros2 launch`` passes it on, must not kill what shuts down.
-
-        Python lets go of its handlers then, but for signals that are ignored.
-        """
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def _wait(self) -> None:
-        while True:
-            number = self._reader.recv(1)[0]
-            if number not in ENDING:
-                continue
-            with self._lock:
-                self._asked += 2 if number == signal.SIGTERM else 1
-                self._end()
-
-    def watch(self, executor: LeanExecutor) -> LeanExecutor:
-        """End this executor; at once, if a signal has come already."""
-        with self._lock:
-            self._executor = executor
-            self._end()
-        return executor
-
-    @property
-    def in_order(self) -> bool:
-        """Whether there is time to finish."""
-        return self._asked < 2
-
-    def _end(self) -> None:
-        if self._executor is not None and self._asked:
-            (self._executor.finish if self.in_order else self._executor.stop)()
-
-
-def usage(node_class: type[GraphNode]) -> str:
-    """What ``--help`` prints."""
-    name = node_class.NAME
-    return (
-        f"usage: ros2 run body_tracking {name} [--ros-args [-p PARAMETER:=VALUE ...] [--params-file FILE]]\n\n"
-        f"{inspect.getdoc(node_class)}\n\nIts parameters with their defaults, as a parameters file:\n\n"
-        f"{as_yaml({name: node_class.PARAMETERS})}"
-    ).rstrip()
-
-
-def run(node_class: type[GraphNode]) -> None:
-    """``main`` of every node: exit code 0 at its end or on Ctrl-C, 2 with one line when it cannot start."""
-    if signal.sigpending() & set(ENDING):
-        return  # it was to end while it was imported
-    asked = {"-h", "--help"}
-    if asked & set(sys.argv) and asked & set(remove_ros_args(sys.argv)[1:]):  # the latter reads parameters files
-        print(usage(node_class))
-        return
-    code, node = 0, None
-    faulthandler.enable()  # a crash below Python says where it was
-    ending = _Ending()
-    try:
-        for file in _parameter_files():
-            read_file(file)  # rcl's own complaint takes several lines
-        dds.prepare()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        node = node_class()
-        # What is there now stays: the collector need not look at it again while frames wait.
-        gc.collect()
-        gc.freeze()
-        ending.watch(LeanExecutor(node)).spin()
-        if ending.in_order:
-            node.hand_over()
-    except ExternalShutdownException:
-        pass
-    except BodyTrackingError as error:
-        print(f"{node_class.NAME}: {error}", file=sys.stderr)
-        code = 2
-    except RCLError as error:
-        if node is None:
-            print(f"{node_class.NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-            code = 2
-        elif node.context.ok():
-            raise
-        # else the node shut itself down between two steps of the executor: the end, like any other
-    finally:
-        if node is not None:
-            node.close()
-        # Nothing is lost any more: what waits for ever, below Python, is told and ended.
-        faulthandler.dump_traceback_later(_LEAVE_S, exit=True)
-        if node is not None:
-            with contextlib.suppress(InvalidHandle):
-                node.destroy_node()
-        rclpy.try_shutdown()
-        faulthandler.cancel_dump_traceback_later()
-        ending.over()
-    if code:
-        sys.exit(code)

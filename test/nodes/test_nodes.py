@@ -385,7 +385,7 @@ def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
 
 NEVER_LEAVES = """\
 import threading
-from body_tracking.nodes import common
+from body_tracking.nodes import common, main
 
 class Stuck(common.GraphNode):
     NAME = "stuck"
@@ -397,7 +397,7 @@ class Stuck(common.GraphNode):
     def destroy_node(self):
         threading.Event().wait()
 
-common._LEAVE_S = 1.0
+main._LEAVE_S = 1.0
 print("here", flush=True)
 common.run(Stuck)
 """

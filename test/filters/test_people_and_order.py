@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking import graph
 from body_tracking.calibration.result import level_pose
-from body_tracking.filters.stage import FilterSettings, PeopleFilter, PersonFilter, filter_of
+from body_tracking.filters.people import PeopleFilter, filter_of
+from body_tracking.filters.person import FilterSettings, PersonFilter
 from body_tracking.fusion.people import PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.upper_body import SEGMENTS

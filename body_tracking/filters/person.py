@@ -1,0 +1,310 @@
+"""The filter of one person: sensors' frames in their order, predicted frames in a silence, segment lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from body_tracking import graph
+from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.filters import (
+    DEFAULT_FILTER,
+    ModelFilter,
+    make_filter,
+)
+from body_tracking.filters.prediction import Prediction
+from body_tracking.filters.roles import role_of
+from body_tracking.fusion.alignment import SensorAlignment
+from body_tracking.fusion.fusion import WORLD
+from body_tracking.fusion.ordering import Ordering
+from body_tracking.fusion.people import People, PeopleParameters
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.tracking import LengthChanges
+from body_tracking.orientation import SegmentOrientation
+from body_tracking.pipeline.codecs import (
+    ModelCovariance,
+    ModelState,
+    ModelStddev,
+    Segments,
+    Skeletons,
+    Text,
+)
+from body_tracking.pipeline.stage import Port
+from body_tracking.recording.qos import Qos
+from body_tracking.skeleton import Skeleton
+
+DEFAULT_PREDICT_AFTER = 0.1
+"""Seconds."""
+
+DEFAULT_ORDER_WAIT = 0.05
+"""Seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class FilterSettings:
+    """What to filter, and how; defaults as the node's.
+
+    Attributes:
+        filter_name: one of ``FILTERS``.
+        parameters: of the filter, without a prefix.
+        input: ``graph.AUTO``, ``graph.FUSED_INPUT`` or ``graph.SENSORS_INPUT``.
+        sensors: for ``graph.SENSORS_INPUT``.
+        reference: likewise: whose clock is that of ``world``; the first one where empty.
+        world: likewise: the frame of the output.
+        body: the person's id in topics, of one subject.
+        predict_after: seconds without a frame after which predicted ones are published.
+        order_wait: seconds that a sensor's frame waits at most for an older one.
+        people: whom to filter.
+    """
+
+    filter_name: str = DEFAULT_FILTER
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    input: str = graph.AUTO
+    sensors: Sequence[str] = ()
+    reference: str = ""
+    world: str = WORLD
+    body: str = graph.DEFAULT_BODY
+    predict_after: float = DEFAULT_PREDICT_AFTER
+    order_wait: float = DEFAULT_ORDER_WAIT
+    people: PeopleParameters = field(default_factory=PeopleParameters)
+
+
+class PersonFilter:
+    """Feeds the filter of one person and publishes its output.
+
+    Args:
+        settings: which one.
+        publish: takes a topic, the content of a message and its capture time.
+        wanted: whether to make messages of a topic at all; always when None.
+        one_of_several: gets the filtered skeletons instead of ``publish``, of one of several people; frames are of this
+            person alone then, and topics below the person's name.
+
+    Attributes:
+        by_sensor: it takes sensors' frames, not fused ones.
+        alignment: places these; None with fused ones.
+        models: it publishes the state of a model.
+
+    Raises:
+        FilterError: the filter or its parameters make no sense.
+        GraphError: it does not take this input.
+        FusionError: the reference is not among the sensors.
+    """
+
+    def __init__(
+        self,
+        settings: FilterSettings,
+        publish: Callable[[str, Any, int], None],
+        wanted: Callable[[str], bool] | None = None,
+        one_of_several: Callable[[Skeleton], None] | None = None,
+    ) -> None:
+        self._filter = make_filter(settings.filter_name, **settings.parameters)
+        role = role_of({"filter": settings.filter_name, "filter_input": settings.input})
+        self.by_sensor = role.input == graph.SENSORS_INPUT
+        self.alignment: SensorAlignment | None = None
+        self.people: People | None = None
+        if self.by_sensor:
+            self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
+            if one_of_several is None:
+                self.people = People(settings.sensors, settings.people, self.alignment.reference)
+        self._ordering = Ordering(settings.sensors, settings.order_wait)
+        self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
+        self.models = self._model_filter is not None
+        self._prediction = Prediction(settings.predict_after)
+        self._lengths = LengthChanges()
+        self._topics = graph.model_topics(settings.body, one_of_several is not None)
+        self._body = settings.body
+        self._publish = publish
+        self._skeleton = one_of_several or self._publish_skeleton
+        self._wanted = wanted if wanted is not None else lambda topic: True
+        self._predicted = 0
+        self._present = False
+        self._received = dict.fromkeys(settings.sensors, 0)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What happened since the construction."""
+        counters = dict(self._filter.counters)
+        if self.alignment is not None:
+            counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
+            counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
+            counters |= {f"waited {name}": count for name, count in self._ordering.counters.items()}
+        if self.people is not None:
+            counters |= {f"association {name}": count for name, count in self.people.counters.items()}
+        if self._model_filter is not None:
+            counters["predicted frames"] = self._predicted
+        return counters
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """A sensor's pose, in force from its time on."""
+        if self.people is not None:
+            self.people.set_pose(pose)
+        if self.alignment is not None:
+            self.alignment.set_pose(pose)
+
+    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
+        """A sensor's clock, in force from a reference time on."""
+        if self.people is not None:
+            self.people.set_clock(sensor, valid_from_ns, clock)
+        if self.alignment is not None:
+            self.alignment.set_clock(sensor, valid_from_ns, clock)
+
+    def inherit(self, before: object) -> None:
+        """Take over what is known of the sensors from the filter that was there before: latched poses come once."""
+        if isinstance(before, PersonFilter) and self.by_sensor and before.by_sensor:
+            self.alignment, self.people = before.alignment, before.people
+
+    def outputs(self, skeletons: Qos, results: Qos) -> tuple[Port, ...]:
+        """The topics that it publishes, where skeletons and results have these qualities of service."""
+        filtered = (Port(graph.FILTERED, Skeletons(), skeletons, measured=True),)
+        if self._model_filter is None:
+            return filtered
+        model, topics = self._model_filter.model, self._topics
+        return (
+            *filtered,
+            Port(topics.state, ModelState(model), skeletons, measured=True),
+            Port(topics.stddev, ModelStddev(model), skeletons),
+            Port(topics.covariance, ModelCovariance(model), skeletons),
+            Port(topics.segments, Segments(model), results),
+            Port(topics.urdf, Text(), graph.URDF_QOS),
+        )
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """The ids of the people who are there."""
+        there = self._present if self.people is None else bool(self.people.tracked)
+        return (self._body,) if there else ()
+
+    def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """One fused frame.
+
+        Args:
+            skeletons: in world; with one subject the first of them counts.
+            now_ns: when it arrived, in a clock that goes on.
+        """
+        self.poll(now_ns)
+        skeleton = skeletons[0]
+        self._present = True
+        if self._model_filter is not None:
+            self._take([("", skeleton)], now_ns)
+        elif (filtered := self._filter.update(skeleton)) is not None:
+            self._skeleton(filtered)
+
+    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """Keep one frame of one sensor: the next :meth:`poll` takes all that are here, in the order of their stamps.
+
+        Args:
+            sensor: its name.
+            skeletons: the bodies in it, in the sensor's own frame and clock.
+            now_ns: as above.
+        """
+        aligned = self._aligned(sensor, skeletons)
+        if aligned is not None:
+            self._ordering.hold(sensor, aligned, now_ns)
+
+    def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
+        """The person in ``world``; None where the sensor is not calibrated, or shows nobody."""
+        self._received[sensor] += 1
+        if self.people is None:
+            subject = skeletons[0]
+        elif found := self.people.sort(sensor, skeletons):
+            ((_, subject),) = found
+        else:
+            return None
+        return None if self.alignment is None else self.alignment.push(sensor, subject)
+
+    def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
+        """The orientation of one segment, in ``world`` and in the reference's clock, as inertial sensors have it.
+
+        What it changes is published with the next frame; while none comes, with the predicted ones. Filters without a
+        model of the body have no use for it.
+
+        Args:
+            measurement: how it is turned.
+            now_ns: as above.
+        """
+        if self._model_filter is None:
+            return
+        self.poll(now_ns)
+        if self._model_filter.take_orientation(measurement) and self._prediction.due_ns is None:
+            self._prediction.arrived(measurement.stamp_ns, now_ns)
+
+    def poll(self, now_ns: int) -> None:
+        """Take the frames that have waited long enough, and publish the predicted ones that are due."""
+        if self._model_filter is None:
+            return
+        # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
+        while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
+            self._take(self._ordering.poll(deadline_ns), deadline_ns)
+        self._take(self._ordering.poll(now_ns), now_ns)
+        # what waits is of a time that must not be told before
+        while self.deadline_ns is None and (stamp_ns := self._prediction.due(now_ns)) is not None:
+            predicted = self._model_filter.predict(stamp_ns)
+            if predicted is None:
+                self._prediction.stop()
+                return
+            self._predicted += 1
+            self._send(*predicted)
+
+    def settle(self) -> None:
+        """Do what the next frame would have to wait for; to be called when there is nothing else to do."""
+        expected_ns = self._ordering.expected_ns
+        if self._model_filter is not None and expected_ns is not None:
+            self._model_filter.settle(expected_ns)
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When :meth:`poll` is to be called for a frame that waits, in the clock by which it does; None without one."""
+        return self._ordering.deadline_ns
+
+    @property
+    def due_ns(self) -> int | None:
+        """When it should be called for a predicted frame, in the clock of ``now_ns``; None where none is to come
+        before a frame that waits.
+        """
+        return self._prediction.due_ns if self.deadline_ns is None else None
+
+    def reset(self) -> None:
+        """Forget the person, because time jumped back; poses and clocks stay."""
+        self._filter.reset()
+        self._ordering.flush()
+        self._prediction.stop()
+        self._lengths.reset()
+        self._present = False
+
+    def forget(self) -> None:
+        """Forget the person, because the next frames are of somebody else."""
+        self.reset()
+        if self.alignment is not None:
+            self.alignment.forget()
+
+    def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
+        """Filter frames, and publish what is known after each that does not come after newer ones."""
+        assert self._model_filter is not None
+        for sensor, skeleton in frames:
+            if not self._model_filter.take(skeleton, sensor):
+                continue
+            estimate = self._model_filter.estimate
+            assert estimate is not None  # a frame was taken
+            self._prediction.arrived(skeleton.stamp_ns, now_ns)
+            self._send(None, estimate)
+            if self._lengths.news(estimate.stamp_ns, estimate.lengths):
+                from body_tracking.kinematics.urdf import urdf
+
+                text = urdf(self._model_filter.model, estimate.lengths, self._body)
+                self._publish(self._topics.urdf, text, estimate.stamp_ns)
+
+    def _publish_skeleton(self, skeleton: Skeleton) -> None:
+        self._publish(graph.FILTERED, (skeleton,), skeleton.stamp_ns)
+
+    def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
+        """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""
+        assert self._model_filter is not None
+        if self._wanted(graph.FILTERED):
+            skeleton = skeleton or self._model_filter.filtered
+            assert skeleton is not None
+            self._skeleton(skeleton)
+        topics = self._topics
+        for topic in (topics.state, topics.stddev, topics.covariance, topics.segments):
+            if self._wanted(topic):
+                self._publish(topic, estimate, estimate.stamp_ns)
