@@ -89,16 +89,9 @@ class _Layout:
 @cache
 def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
     """From the one place that knows the fields."""
-    joints = np.zeros((N_JOINTS, 3))
-    sample = Skeleton(
-        0,
-        "",
-        joints,
-        np.zeros(N_JOINTS, np.uint8),
-        0,
-        np.zeros((N_JOINTS, 3, 3)) if covariance else None,
-        joints if velocity else None,
-    )
+    joints, states = np.zeros((N_JOINTS, 3)), np.zeros(N_JOINTS, np.uint8)
+    covariances = np.zeros((N_JOINTS, 3, 3)) if covariance else None
+    sample = Skeleton(0, "", joints, states, 0, covariances, joints if velocity else None)
     cloud = skeletons_to_cloud([sample] * bodies, BagMessages(defaultdict(lambda: SimpleNamespace)))
     table, padding = struct.pack("<III", cloud.height, cloud.width, len(cloud.fields)), b"\xff" * 12
     for field in cloud.fields:
@@ -108,12 +101,6 @@ def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
     table += struct.pack("<?3xIII", cloud.is_bigendian, cloud.point_step, cloud.row_step, len(cloud.data))
     padding += b"\xff\x00\x00\x00" + b"\xff" * 12
     return _Layout(table, np.frombuffer(padding, np.uint8), cloud.point_step // 4, covariance, velocity)
-
-
-def _known_layouts() -> tuple[_Layout, ...]:
-    """Those that are read here: one body of each kind, and then some more."""
-    kinds = ((True, False), (True, True), (False, False))
-    return tuple(_layout(count, *kind) for count in range(1, 7) for kind in kinds)
 
 
 def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:
@@ -181,7 +168,9 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
     return _ENCAPSULATION + struct.pack("<iI", *divmod(stamp_ns, NANOSECONDS)) + _padded(_string(frame_id))
 
 
-_KNOWN = _known_layouts()
+_KINDS = ((True, False), (True, True), (False, False))
+_KNOWN = tuple(_layout(count, *kind) for count in range(1, 7) for kind in _KINDS)
+"""Those that are read here: one body of each kind, and then some more."""
 
 
 # --- joint angles
