@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
@@ -39,7 +39,6 @@ METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
 MAX_TIME_NS = 2**63 - 1
 
-_COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 BAG_MESSAGES = BagMessages(_STORE.types)
@@ -248,8 +247,8 @@ class BagReader:
             raise BagError(f"{path}: not a regular file")
         try:
             information = load_yaml(read_text(path))["rosbag2_bagfile_information"]
-            storage = str(information["storage_identifier"])
-            compression = str(information.get("compression_mode") or "").lower()
+            storage = information["storage_identifier"]
+            compression = str(information.get("compression_mode") or "none").lower()
             names = [Path(str(name)).name for name in information["relative_file_paths"]]
         except FileLimitError as error:
             raise BagError(f"{path}: {error}") from error
@@ -258,7 +257,7 @@ class BagReader:
             return None
         if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
             raise BagError(f"{self.path}: storage {storage!r} is not supported, only mcap")
-        if compression not in ("", "none"):
+        if compression != "none":
             raise BagError(f"{self.path}: rosbag2 compression mode {compression!r} is not supported, only mcap's own")
         return [self.path / name for name in names]
 
@@ -334,7 +333,6 @@ class BagWriter:
         folder: of the bag; its files are called ``<folder>_<n>.mcap``.
         overwrite: replace a bag that is there.
         resume: go on in a bag that is there, in its next file; what its recorder left unclosed is closed as well.
-        compression: of the chunks: ``zstd``, ``lz4`` or ``none``.
         chunk_bytes: a chunk is closed at this size, uncompressed.
         flush_interval_s: seconds; infinite for writing offline.
 
@@ -354,12 +352,9 @@ class BagWriter:
         *,
         overwrite: bool = False,
         resume: bool = False,
-        compression: str = "zstd",
         chunk_bytes: int = 768 * 1024,
         flush_interval_s: float = 1.0,
     ) -> None:
-        if compression not in _COMPRESSION:
-            raise BagError(f"compression {compression!r} is unknown: {', '.join(_COMPRESSION)}")
         self.folder = Path(folder).absolute()
         self.failure: BagError | None = None
         self._channels: dict[str, tuple[int, str]] = {}  # and type
@@ -373,7 +368,7 @@ class BagWriter:
             self.path = self.folder / f"{self.folder.name}_{number}.mcap"
             self._sink = _Sink(self.path)
             fcntl.flock(self._sink.file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._mcap = Writer(self._sink, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])  # type: ignore[arg-type]
+            self._mcap = Writer(self._sink, chunk_size=chunk_bytes)  # type: ignore[arg-type]
             self._mcap.start(profile="ros2", library=LIBRARY)
         except OSError as error:
             raise BagError(f"{self.folder}: {error.strerror}") from error
@@ -462,7 +457,7 @@ class BagWriter:
         """
         if not self._open:
             return
-        self._check()
+        self.flush()
         with self._writing():
             self._mcap.finish()  # type: ignore[no-untyped-call]
             os.fdatasync(self._sink.file.fileno())

@@ -564,7 +564,7 @@ import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 from small_bags import TOPICS, messages
 from body_tracking.recording.rosbag2 import BagError, BagWriter
-writer = BagWriter(sys.argv[1], flush_interval_s=0.0, compression="none")
+writer = BagWriter(sys.argv[1], flush_interval_s=0.0)
 for topic, (kind, qos) in TOPICS.items():
     writer.add_topic(topic, kind, qos)
 try:
