@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos as RosbagsQos
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from small_bags import TOPICS, Stored, message, messages, read, write
 
@@ -63,12 +63,7 @@ def test_what_is_written_is_read_in_the_order_of_log_times(drawn, compression, c
             assert [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()] == expected
             assert reader.warnings == []
             assert reader.message_count == len(stored)
-            assert {name: topic.type_name for name, topic in reader.topics.items()} == {
-                name: kind for name, (kind, _) in TOPICS.items()
-            }
-            assert {name: topic.qos for name, topic in reader.topics.items()} == {
-                name: qos for name, (_, qos) in TOPICS.items()
-            }
+            assert {name: (topic.type_name, topic.qos) for name, topic in reader.topics.items()} == TOPICS
             for name, topic in reader.topics.items():
                 assert topic.count == sum(item[0] == name for item in stored)
             if stored:
@@ -86,40 +81,19 @@ def test_selection_of_topics_and_start(tmp_path):
     assert found == [item for item in stored if item[0] == "/text" and item[2] >= start_ns]
 
 
-def test_publish_time_is_kept(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/text", "std_msgs/msg/String")
-        writer.write("/text", serialize(message("/text", "a", 0.0)), 20, 10)
-    with BagReader(tmp_path / "bag") as reader:
-        assert [(found.log_time_ns, found.publish_time_ns) for found in reader.messages()] == [(20, 10)]
-
-
 # --- with others
 
 
-def test_rosbags_finds_the_same_topics(tmp_path):
-    stored = messages(100)
-    write(tmp_path / "bag", stored, chunk_bytes=1000)
-    with Reader(tmp_path / "bag") as reader:
-        assert (reader.message_count, reader.start_time) == (len(stored), stored[0][2])
-        assert reader.duration == stored[-1][2] - stored[0][2] + 1
-        for connection in reader.connections:
-            definition, _ = TYPES.generate_msgdef(connection.msgtype, ros_version=2)
-            assert connection.msgdef.data == definition
-            assert connection.digest == TYPES.hash_rihs01(connection.msgtype)
-
-
 @pytest.mark.parametrize("version", [8, 9])
-@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.STORAGE])
-def test_we_read_what_rosbags_writes(tmp_path, version, mode):
+def test_rosbags_and_we_read_what_the_other_writes(tmp_path, version):
     stored = messages(100)
-    infinite = QosTime(9223372036, 854775807)
+    write(tmp_path / "ours", stored, chunk_bytes=1000)
+    endless = QosTime(9223372036, 854775807)
     profile = RosbagsQos(
-        *(QosHistory.KEEP_LAST, 7, QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, infinite, infinite),
-        *(QosLiveliness.AUTOMATIC, infinite, False),
+        *(QosHistory.KEEP_LAST, 7, QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, endless, endless),
+        *(QosLiveliness.AUTOMATIC, endless, False),
     )
-    writer = Writer(tmp_path / "bag", version=version, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
+    writer = Writer(tmp_path / "theirs", version=version, storage_plugin=StoragePlugin.MCAP)
     with writer:
         connections = {
             name: writer.add_connection(name, kind, typestore=TYPES, offered_qos_profiles=[profile])
@@ -127,38 +101,42 @@ def test_we_read_what_rosbags_writes(tmp_path, version, mode):
         }
         for topic, cdr, at in stored:
             writer.write(connections[topic], at, cdr)
-    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
-        assert read(path) == stored
-    with BagReader(tmp_path / "bag") as reader:
-        assert reader.warnings == []
-        assert reader.topics["/pose"].offered == (Qos("best_effort", "transient_local", 7),)
+    for path in (tmp_path / "theirs", tmp_path / "theirs" / "theirs.mcap"):
+        with BagReader(path) as reader:
+            assert [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()] == stored
+            assert reader.topics["/pose"].offered == (Qos("best_effort", "transient_local", 7),)
+            assert reader.warnings == []
+    with Reader(tmp_path / "ours") as ours, Reader(tmp_path / "theirs") as theirs:
+        assert (ours.message_count, ours.start_time, ours.duration) == (100, theirs.start_time, theirs.duration)
+        for one, other in zip(ours.connections, sorted(theirs.connections, key=lambda each: each.topic), strict=True):
+            assert one[1:4] == other[1:4], "topic, type, definition"
+            assert one.digest == other.digest
 
 
-UNCHUNKED = {"chunked": {}, "in records of their own": {"use_chunking": False}}
-
-
-@pytest.mark.parametrize("options", UNCHUNKED)
+@pytest.mark.parametrize("chunked", [True, False])
 @pytest.mark.parametrize("size", [None, -2000])
-def test_files_of_other_recorders_are_read_and_recovered(tmp_path, options, size):
+def test_files_of_other_recorders_are_read_and_recovered(tmp_path, chunked, size):
     """``ros2 bag record --storage-preset-profile fastwrite`` writes no chunks."""
     stored = messages(100)
     path = tmp_path / "bag" / "bag_0.mcap"
     path.parent.mkdir()
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=900, **UNCHUNKED[options])
+        writer = McapWriter(file, chunk_size=900, use_chunking=chunked)
         writer.start("ros2")
         channels = {
             name: writer.register_channel(name, "cdr", writer.register_schema(kind, "ros2msg", b""))
             for name, (kind, _) in TOPICS.items()
         }
         for topic, cdr, at in stored:
-            writer.add_message(channels[topic], at, cdr, at)
+            writer.add_message(channels[topic], at, cdr, at - 5)
         writer.finish()
     path.write_bytes(path.read_bytes()[:size])
     found = read(path.parent)
     assert found == (stored if size is None else stored[: len(found)]) and found
     recover(path.parent).close()
     assert read(path.parent) == rosbags_read(path.parent) == found
+    with BagReader(path) as reader:
+        assert {message.log_time_ns - message.publish_time_ns for message in reader.messages()} == {5}
 
 
 def test_metadata_has_the_form_that_jazzy_writes(tmp_path):
@@ -277,27 +255,24 @@ def test_continuing_closes_what_was_cut_off(tmp_path):
     before = read(tmp_path / "bag")
     assert 0 < len(before) <= 60
     write(tmp_path / "bag", stored[60:], resume=True)
-    assert read(tmp_path / "bag") == before + stored[60:]
     assert rosbags_read(tmp_path / "bag") == before + stored[60:]
     with BagReader(tmp_path / "bag") as reader:
         assert reader.warnings == []
 
 
-def test_a_file_that_is_not_listed_yet_is_read(tmp_path):
+def test_what_the_listing_leaves_out_or_has_too_much_is_named(tmp_path):
     stored = messages(60)
     write(tmp_path / "bag", stored[:30])
-    listing = (tmp_path / "bag" / "metadata.yaml").read_bytes()
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    first = metadata.read_bytes()
     write(tmp_path / "bag", stored[30:], resume=True)
-    (tmp_path / "bag" / "metadata.yaml").write_bytes(listing)
+    both = metadata.read_bytes()
+    metadata.write_bytes(first)
     with BagReader(tmp_path / "bag") as reader:
         assert [found.cdr for found in reader.messages()] == [item[1] for item in stored]
         assert any("bag_1.mcap" in warning for warning in reader.warnings)
-
-
-def test_a_listed_file_that_is_missing_is_named(tmp_path):
-    stored = messages(60)
-    write(tmp_path / "bag", stored[:30])
-    write(tmp_path / "bag", stored[30:], resume=True).with_name("bag_0.mcap").unlink()
+    metadata.write_bytes(both)
+    (tmp_path / "bag" / "bag_0.mcap").unlink()
     with BagReader(tmp_path / "bag") as reader:
         assert [found.cdr for found in reader.messages()] == [item[1] for item in stored[30:]]
         assert any("bag_0.mcap" in warning and "missing" in warning for warning in reader.warnings)
@@ -343,20 +318,18 @@ def test_a_file_cut_anywhere_opens_with_a_prefix_of_its_messages(tmp_path, compr
     assert longest == len(stored)
 
 
-@pytest.mark.parametrize("compression", ["zstd", "none"])
-def test_a_cut_file_is_closed_without_losing_a_message(tmp_path, compression):
+def test_a_cut_file_is_closed_without_losing_a_message(tmp_path):
     stored = messages(40)
-    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
+    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression="none").read_bytes()
     folder = tmp_path / "cut"
     folder.mkdir()
     for size in offsets(len(data))[::12]:
         (folder / "cut_0.mcap").write_bytes(data[:size])
-        (folder / "metadata.yaml").unlink(missing_ok=True)
         before = read(folder)
         with recover(folder) as reader:
             assert reader.warnings == [], f"cut at {size}"
-            assert [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()] == before
-        assert rosbags_read(folder) == before, f"cut at {size}"
+        assert read(folder) == rosbags_read(folder) == before, f"cut at {size}"
+        (folder / "metadata.yaml").unlink()
 
 
 def test_what_is_missing_of_a_cut_chunk_is_said(tmp_path):
@@ -409,35 +382,26 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path):
     path.write_bytes(data)
     with BagReader(tmp_path / "bag") as reader:
         found = [item.cdr for item in reader.messages()]
-        assert len(reader.warnings) == 1 and "damaged chunk at byte" in reader.warnings[0]
-        list(reader.messages())
-        assert len(reader.warnings) == 1, "said once, however often it is read"
-        reader_message_count = reader.message_count
+        assert [item.cdr for item in reader.messages()] == found
+        (warning,) = reader.warnings  # said once, however often it is read
+        assert reader.message_count == len(stored), "the index still tells how many there were"
     lost = [item[1] for item in stored if item[1] not in found]
     assert stored[12][1] in lost and 0 < len(lost) < 20
-    assert reader_message_count == len(stored), "the index still tells how many there were"
+    assert "damaged chunk at byte" in warning and f"with {len(lost)} message(s), 1." in warning
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.binary(max_size=300))
-def test_any_bytes_after_the_magic_are_no_crash(data):
+@given(st.builds(struct.Struct("<BQ").pack, st.integers(0, 255), st.integers(0, 2**64 - 1)) | st.just(b""), st.binary())
+def test_any_bytes_after_the_magic_are_no_crash(head, data):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "random.mcap"
-        path.write_bytes(b"\x89MCAP0\r\n" + data)
+        path.write_bytes(b"\x89MCAP0\r\n" + head + data)
         try:
             with BagReader(path) as reader:
                 list(reader.messages())
                 assert reader.warnings
         except BagError as error:
             assert "nothing in it can be read" in str(error)
-
-
-def test_a_record_that_claims_to_be_huge_is_no_crash(tmp_path):
-    path = tmp_path / "huge.mcap"
-    for opcode in range(1, 256):
-        path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", opcode, 2**63 + 5) + bytes(100))
-        with BagReader(path) as reader:
-            assert list(reader.messages()) == [] and reader.warnings
 
 
 def test_what_is_no_recording_is_one_line(tmp_path):
@@ -474,16 +438,14 @@ def test_a_folder_that_is_there_is_refused(tmp_path):
 
 @pytest.mark.parametrize("option", ["overwrite", "resume"])
 def test_a_folder_that_is_no_bag_is_never_touched(tmp_path, option):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter.txt").write_text("precious")
+    (tmp_path / "chapter.txt").write_text("precious")
     with pytest.raises(BagError, match="no bag"):
-        BagWriter(tmp_path / "thesis", **{option: True})
-    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "precious"
+        BagWriter(tmp_path, **{option: True})
+    assert (tmp_path / "chapter.txt").read_text() == "precious"
 
 
 def test_two_writers_do_not_share_a_bag(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/text", "std_msgs/msg/String")
+    with BagWriter(tmp_path / "bag"):
         with pytest.raises(BagError, match="another process"):
             BagWriter(tmp_path / "bag", resume=True)
         with pytest.raises(BagError, match="another process"):
