@@ -136,22 +136,6 @@ def test_angles_read_as_they_were_written(seed: int, stamp_ns: int, frame_id: st
         assert len(read.effort) == 0
 
 
-def test_ros_reads_angles_as_they_were_written() -> None:
-    serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
-    from sensor_msgs.msg import JointState
-
-    for frame_id in ("", "a", "ab", "abc", "abcd", "world"):
-        for count in range(4):
-            names = tuple("abcd"[:count])
-            position, velocity, *stddev = np.arange(4.0 * count).reshape(4, count)
-            angles = JointAngles(5, names, position, velocity, stddev[0], stddev[1])
-            message = serialization.deserialize_message(encode_angles(angles, "b", frame_id)[0], JointState)
-            assert message.name == [f"{name}_b" for name in names]
-            assert list(message.position) == list(position)
-            assert list(message.velocity) == list(velocity)
-            assert message.header.frame_id == frame_id
-
-
 # --- the state of a body model
 
 
@@ -252,17 +236,3 @@ def test_a_covariance_that_is_none_is_refused(field: str, value: object, said: s
     setattr(message, field, value)
     with pytest.raises(MessageError, match=said):
         image_to_covariance(message, MODEL)
-
-
-def test_ros_reads_segments_as_they_were_written() -> None:
-    serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
-    from sensor_msgs.msg import MultiDOFJointState
-
-    for frame_id in ("", "a", "ab", "abc", "abcd", "world"):
-        given_estimate = estimate(0, frame_id=frame_id)
-        posture = MODEL.forward(given_estimate.q, given_estimate.lengths)
-        quats = so3.matrix_to_quat(posture.rotations)
-        cdr = encode_segments(given_estimate, MODEL.segment_names, posture.origins, quats)
-        segments = serialization.deserialize_message(cdr, MultiDOFJointState)
-        assert tuple(segments.joint_names) == MODEL.segment_names
-        assert segments.transforms[-1].rotation.w == quats[-1, 3]

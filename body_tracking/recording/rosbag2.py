@@ -182,6 +182,11 @@ class BagReader:
         """A line for each thing that is missing or damaged, as far as it was noticed yet."""
         return self._notes + [warning for file in self.files for warning in file.warnings]
 
+    @property
+    def whole(self) -> bool:
+        """Whether every file was closed properly."""
+        return not self._notes and all(file.whole for file in self.files)
+
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None) -> Iterator[RawMessage]:
         """The messages in the order of their log times, and as they were written where those are equal.
 
