@@ -126,7 +126,7 @@ def _decompress(compression: str, data: bytes, limit: int) -> bytes:
 
 
 def _too_large(size: int) -> str:
-    return f"a chunk of {size >> 20} MB when decompressed; at most {MAX_CHUNK_BYTES >> 20} MB are read"
+    return f"a chunk of {size >> 20} MB; at most {MAX_CHUNK_BYTES >> 20} MB are read"
 
 
 def _seconds(nanoseconds: int) -> str:
@@ -208,8 +208,10 @@ class McapFile:
 
     def _messages(self, block: Block) -> list[StoredMessage]:
         """What is in a block; nothing, and a warning, if it is damaged."""
-        data = self._bytes_at(block.offset, block.length)
         try:
+            if block.length > MAX_CHUNK_BYTES + _RUN_BYTES:
+                raise Damaged(_too_large(block.length))
+            data = self._bytes_at(block.offset, block.length)
             if len(data) < block.length:
                 raise Damaged("the file ends in it")
             if block.chunk:
@@ -217,6 +219,8 @@ class McapFile:
                     raise Damaged("no chunk is there")
                 data = _chunk_records(data[_HEAD.size :], block.cut)
             return self._records(data)
+        except BagError:
+            raise
         except Exception as error:  # what the parsers and decompressors raise where the bytes are others is not listed
             if not block.cut:
                 self._skip(block, error if isinstance(error, Damaged) else Damaged("it cannot be read"))
@@ -282,7 +286,7 @@ class McapFile:
             return False
         start, _, checksum = _FOOTER.unpack_from(ending, _HEAD.size)
         end = size - _ENDING_BYTES
-        if not len(MAGIC) < start < end:
+        if not len(MAGIC) < start < end <= start + MAX_CHUNK_BYTES:
             return False
         summary = self._bytes_at(start, end - start)
         covered = summary + ending[: _HEAD.size + _FOOTER.size - 4]
