@@ -37,9 +37,11 @@ from imu_only import ANGLES, Angles, angle_errors, angle_variances, rms, true_co
 from tqdm import tqdm
 
 from body_tracking import graph
-from body_tracking.cdr import decode_covariance, decode_model_state, decode_skeletons
+from body_tracking.cdr import decode_skeletons
+from body_tracking.messages.base import IMAGE, JOINT_STATE
+from body_tracking.messages.model import image_to_covariance, joint_state_to_model
 from body_tracking.recording.replay import FilterAndAngles, ReplaySettings, Upstream
-from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.imus import Iron, SimulatedImu, Slip, Surroundings, usual_mounting
 from body_tracking.simulation.layouts import Layout, around
@@ -170,13 +172,11 @@ class Chain:
 
     def _published(self, topic: str, cdr: bytes) -> None:
         if topic == graph.MODEL_STATE:
-            state = decode_model_state(cdr, MODEL)
-            assert state is not None
-            self._configuration = state[2]
+            self._configuration = joint_state_to_model(deserialize(JOINT_STATE, cdr), MODEL)[2]
         elif topic == graph.MODEL_COVARIANCE:
-            told = decode_covariance(cdr, MODEL)
-            assert told is not None and self._configuration is not None
-            self.states.append((told[0], self._configuration, told[1]))
+            assert self._configuration is not None
+            stamp_ns, covariance = image_to_covariance(deserialize(IMAGE, cdr), MODEL)
+            self.states.append((stamp_ns, self._configuration, covariance))
 
 
 def measure(run: Run) -> Figures:

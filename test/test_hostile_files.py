@@ -14,6 +14,7 @@ from pathlib import Path
 import lz4.frame
 import pytest
 from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, McapRecord, Schema, Statistics
 
 from body_tracking import files
@@ -212,6 +213,19 @@ def test_the_beginning_of_a_chunk_that_is_cut_off_takes_no_more_than_a_whole_one
     with BagReader(tmp_path / "a.mcap") as reader:
         assert reader.message_count == 0
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10 < BYTES
+
+
+@pytest.mark.parametrize("kind", ["chunk", "message", "summary"])
+def test_a_sparse_file_of_gigabytes_is_not_read_into_memory(tmp_path: Path, kind: str) -> None:
+    path, size = tmp_path / "a.mcap", 8 << 30
+    opcode = {"chunk": Opcode.CHUNK, "message": Opcode.MESSAGE, "summary": 0}[kind]
+    with path.open("wb") as file:
+        file.write(MAGIC + struct.pack("<BQ", opcode, size))
+        file.truncate(size + len(MAGIC) + 9)
+        file.seek(0, os.SEEK_END)
+        file.write(struct.pack("<BQQQI", Opcode.FOOTER, 20, 20, 0, 0) + MAGIC)
+    assert path.stat().st_blocks < 1000
+    refused_soon(path, read_whole)
 
 
 # --- what is no file

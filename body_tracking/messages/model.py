@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
@@ -22,8 +21,8 @@ from body_tracking.messages.base import (
 from body_tracking.skeleton import FloatArray
 
 
-def estimate_to_joint_states(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> tuple[Any, Any]:
-    """The coordinates of a body model and their standard deviations as two ``sensor_msgs/JointState``.
+def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
+    """The coordinates of a body model as a ``sensor_msgs/JointState``.
 
     Args:
         estimate: of the model.
@@ -32,35 +31,32 @@ def estimate_to_joint_states(estimate: ModelEstimate, model: BodyModel, types: M
 
     Returns:
         Positions: the tangent vector from the model's neutral pose, so that a rotation that is free is its rotation
-        vector; velocities: the tangent velocity. The deviations are those of small tangent vectors at the estimate.
+        vector; velocities: the tangent velocity.
     """
-    header = to_header(estimate.stamp_ns, estimate.frame_id, types)
+    return _joint_state(estimate, model, model.difference(model.neutral(), estimate.q), estimate.velocity, types)
 
-    def joint_state(position: FloatArray, velocity: FloatArray) -> Any:
-        return types.make(
-            JOINT_STATE,
-            header=header,
-            name=list(model.coordinate_names),
-            position=types.floats(position),
-            velocity=types.floats(velocity),
-            effort=types.floats(np.empty(0)),
-        )
 
-    deviations = stddevs(estimate)
-    return (
-        joint_state(model.difference(model.neutral(), estimate.q), estimate.velocity),
-        joint_state(deviations[: model.nv], deviations[model.nv :]),
+def estimate_to_stddevs(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
+    """As :func:`estimate_to_joint_state`, the standard deviations of small tangent vectors at the estimate."""
+    deviations = np.sqrt(np.maximum(estimate.covariance.diagonal(), 0.0))
+    return _joint_state(estimate, model, deviations[: model.nv], deviations[model.nv :], types)
+
+
+def _joint_state(
+    estimate: ModelEstimate, model: BodyModel, position: FloatArray, velocity: FloatArray, types: MessageTypes
+) -> Any:
+    return types.make(
+        JOINT_STATE,
+        header=to_header(estimate.stamp_ns, estimate.frame_id, types),
+        name=list(model.coordinate_names),
+        position=types.floats(position),
+        velocity=types.floats(velocity),
+        effort=types.floats(np.empty(0)),
     )
 
 
-def stddevs(estimate: ModelEstimate) -> FloatArray:
-    """(2 nv,) the standard deviations in an estimate's covariance."""
-    result: FloatArray = np.sqrt(np.maximum(estimate.covariance.diagonal(), 0.0))
-    return result
-
-
 def joint_state_to_model(message: Any, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray]:
-    """The inverse of :func:`estimate_to_joint_states`, without what that does not hold.
+    """The inverse of :func:`estimate_to_joint_state`, without what that does not hold.
 
     Args:
         message: ``sensor_msgs/JointState``.
@@ -109,31 +105,10 @@ COVARIANCE_ENCODING = "32FC1"
 """Of the image that holds covariances: one float32 per pixel."""
 
 
-def covariance_rows(estimate: ModelEstimate) -> NDArray[np.float32]:
-    """(2 nv, nv) the covariance of the coordinates, and under it that of their rates."""
-    nv = len(estimate.velocity)
-    return np.concatenate([estimate.covariance[:nv, :nv], estimate.covariance[nv:, nv:]]).astype("<f4")
-
-
-def rows_to_covariance(rows: FloatArray) -> FloatArray:
-    """(2 nv, 2 nv) of (2 nv, nv) rows; nothing is said of how coordinates and rates depend on each other.
-
-    Raises:
-        MessageError: a NaN, or a negative variance.
-    """
-    nv = rows.shape[1]
-    covariance = np.zeros((2 * nv, 2 * nv))
-    covariance[:nv, :nv], covariance[nv:, nv:] = rows[:nv], rows[nv:]
-    if np.isnan(covariance).any():
-        raise MessageError("a covariance is NaN")
-    if (covariance.diagonal() < 0.0).any():
-        raise MessageError("a variance is negative")
-    return covariance
-
-
 def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
-    """``sensor_msgs/Image`` of :func:`covariance_rows`: 2 nv rows of nv columns."""
-    rows = covariance_rows(estimate)
+    """``sensor_msgs/Image`` of 2 nv rows of nv: the covariance of the coordinates, and under it that of their rates."""
+    nv = len(estimate.velocity)
+    rows = np.concatenate([estimate.covariance[:nv, :nv], estimate.covariance[nv:, nv:]]).astype("<f4")
     return types.make(
         IMAGE,
         header=to_header(estimate.stamp_ns, estimate.frame_id, types),
@@ -149,6 +124,8 @@ def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
 def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray]:
     """(stamp in nanoseconds, (2 nv, 2 nv) covariance), the inverse of :func:`covariance_to_image`.
 
+    Nothing is said of how coordinates and rates depend on each other.
+
     Raises:
         MessageError: another encoding or size, big-endian numbers, a NaN, a negative variance.
     """
@@ -160,7 +137,13 @@ def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray
         size = f"{height} x {width} with {message.step} bytes a row and {len(message.data)} in all"
         raise MessageError(f"covariance of {size}, expected {2 * nv} x {nv} float32")
     rows = np.frombuffer(memoryview(message.data), "<f4").reshape(2 * nv, nv).astype(np.float64)
-    return to_nanoseconds(message.header.stamp), rows_to_covariance(rows)
+    covariance = np.zeros((2 * nv, 2 * nv))
+    covariance[:nv, :nv], covariance[nv:, nv:] = rows[:nv], rows[nv:]
+    if np.isnan(covariance).any():
+        raise MessageError("a covariance is NaN")
+    if (covariance.diagonal() < 0.0).any():
+        raise MessageError("a variance is negative")
+    return to_nanoseconds(message.header.stamp), covariance
 
 
 def segments_to_joint_state(

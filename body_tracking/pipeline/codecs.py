@@ -10,19 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from body_tracking.calibration.result import ClockModel, SensorPose
-from body_tracking.cdr import (
-    decode_covariance,
-    decode_model_state,
-    decode_skeletons,
-    encode_angles,
-    encode_covariance,
-    encode_model_state,
-    encode_model_stddev,
-    encode_orientation,
-    encode_segments,
-    encode_skeletons,
-    encode_string,
-)
+from body_tracking.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
@@ -48,8 +36,19 @@ from body_tracking.messages.calibration import (
     time_reference_to_clock,
     transform_to_pose,
 )
-from body_tracking.messages.imus import message_to_magnetic_field, message_to_orientation, message_to_sample
-from body_tracking.messages.model import image_to_covariance, joint_state_to_model
+from body_tracking.messages.imus import (
+    message_to_magnetic_field,
+    message_to_orientation,
+    message_to_sample,
+    orientation_to_message,
+)
+from body_tracking.messages.model import (
+    covariance_to_image,
+    estimate_to_joint_state,
+    estimate_to_stddevs,
+    image_to_covariance,
+    joint_state_to_model,
+)
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample
@@ -173,7 +172,7 @@ class Orientation(Codec):
         self.segment = segment
 
     def encode(self, payload: SegmentOrientation, wire: Wire) -> bytes:
-        return encode_orientation(payload)
+        return wire.serialize(IMU, orientation_to_message(payload, wire.types))
 
     def decode(self, cdr: bytes, wire: Wire) -> SegmentOrientation:
         return message_to_orientation(wire.deserialize(IMU, cdr), self.segment)
@@ -214,11 +213,10 @@ class ModelState(OfModel):
     type_name = JOINT_STATE
 
     def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
-        return encode_model_state(payload, self.model)
+        return wire.serialize(JOINT_STATE, estimate_to_joint_state(payload, self.model, wire.types))
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, FloatArray, FloatArray]:
-        known = decode_model_state(cdr, self.model)
-        return known or joint_state_to_model(wire.deserialize(JOINT_STATE, cdr), self.model)
+        return joint_state_to_model(wire.deserialize(JOINT_STATE, cdr), self.model)
 
     def stamp_ns(self, payload: tuple[int, str, FloatArray, FloatArray]) -> int:
         return payload[0]
@@ -230,7 +228,7 @@ class ModelStddev(OfModel):
     type_name = JOINT_STATE
 
     def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
-        return encode_model_stddev(payload, self.model)
+        return wire.serialize(JOINT_STATE, estimate_to_stddevs(payload, self.model, wire.types))
 
 
 class ModelCovariance(OfModel):
@@ -239,10 +237,10 @@ class ModelCovariance(OfModel):
     type_name = IMAGE
 
     def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
-        return encode_covariance(payload)
+        return wire.serialize(IMAGE, covariance_to_image(payload, wire.types))
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[int, FloatArray]:
-        return decode_covariance(cdr, self.model) or image_to_covariance(wire.deserialize(IMAGE, cdr), self.model)
+        return image_to_covariance(wire.deserialize(IMAGE, cdr), self.model)
 
 
 class Segments(Codec):
@@ -267,7 +265,7 @@ class Text(Codec):
     type_name = STRING
 
     def encode(self, payload: str, wire: Wire) -> bytes:
-        return encode_string(payload)
+        return wire.serialize(STRING, wire.types.make(STRING, data=payload))
 
 
 class Angles(Codec):

@@ -5,25 +5,26 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from array import array
+from collections import defaultdict
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from body_tracking.recording.qos import Qos
-from body_tracking.recording.rosbag2 import BagReader, recover
+from body_tracking.recording.rosbag2 import BagReader, TopicInfo, recover
 from body_tracking.skeleton import NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """A topic of a bag.
+    """A topic of a bag: its messages that can be read, and what its publishers offered.
 
     Attributes:
-        name: of the topic.
-        type: of its messages.
-        count: messages that can be read.
-        rate: mean rate in hertz, between its first and its last message; None with fewer than two.
-        qos: what its publishers offered.
+        rate: mean, in hertz, between the first and the last message; None with fewer than two.
         longest_gap: seconds between two messages at most; None with fewer than two.
     """
 
@@ -32,7 +33,7 @@ class TopicSummary:
     count: int
     rate: float | None
     qos: tuple[Qos, ...]
-    longest_gap: float | None = None
+    longest_gap: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,61 +66,37 @@ def bag_info(path: Path | str) -> BagInfo:
         BagError: nothing there can be read as a recording.
     """
     with BagReader(path) as reader:
-        spans: dict[str, _Span] = {}
+        found: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
         for message in reader.messages():
-            span = spans.setdefault(message.topic, _Span(message.log_time_ns, message.log_time_ns))
-            span.add(message.log_time_ns)
-        topics = []
-        for name, topic in reader.topics.items():
-            span = spans.get(name, _Span(0, 0))
-            known = span.last > span.first
-            rate = (span.count - 1) * NANOSECONDS / (span.last - span.first) if known else None
-            gap = span.longest / NANOSECONDS if known else None
-            topics.append(TopicSummary(name, topic.type_name, span.count, rate, topic.offered, gap))
-        start_ns = min((span.first for span in spans.values()), default=0)
+            found[message.topic].append(message.log_time_ns)
+        start_ns = min((times[0] for times in found.values()), default=0)
         return BagInfo(
             path=Path(path),
             files={file.path.name: file.path.stat().st_size for file in reader.files},
             start_ns=start_ns,
-            duration_s=(max((span.last for span in spans.values()), default=0) - start_ns) / NANOSECONDS,
-            messages=sum(span.count for span in spans.values()),
-            topics=tuple(topics),
+            duration_s=(max((times[-1] for times in found.values()), default=0) - start_ns) / NANOSECONDS,
+            messages=sum(map(len, found.values())),
+            topics=tuple(_summary(name, topic, np.array(found.get(name, ()))) for name, topic in reader.topics.items()),
             warnings=reader.warnings,
         )
 
 
-@dataclass(slots=True)
-class _Span:
-    """Log times of a topic, nanoseconds."""
-
-    first: int
-    last: int
-    count: int = 0
-    longest: int = 0
-
-    def add(self, time_ns: int) -> None:
-        self.count += 1
-        self.longest = max(self.longest, time_ns - self.last)
-        self.last = max(self.last, time_ns)
-
-
-def _as_json(info: BagInfo) -> str:
-    return json.dumps(asdict(info) | {"path": str(info.path)}, indent=2)
+def _summary(name: str, topic: TopicInfo, times_ns: NDArray[np.uint64]) -> TopicSummary:
+    rate = gap = None
+    if len(times_ns) and times_ns[-1] > times_ns[0]:
+        rate = (len(times_ns) - 1) * NANOSECONDS / int(times_ns[-1] - times_ns[0])
+        gap = int(np.diff(times_ns).max()) / NANOSECONDS
+    return TopicSummary(name, topic.type_name, len(times_ns), rate, topic.offered, gap)
 
 
 def _qos_text(offers: tuple[Qos, ...]) -> str:
     """``best_effort 5``, ``reliable transient_local 10``; the durability only where it is not the usual one."""
-    texts = dict.fromkeys(
-        " ".join(
-            (
-                qos.reliability,
-                *(() if qos.durability == "volatile" else (qos.durability,)),
-                *(() if qos.history == "unknown" else (str(qos.depth),)),
-            )
-        )
-        for qos in offers
-    )
-    return ", ".join(texts) or "-"
+    texts = []
+    for qos in offers:
+        durability = "" if qos.durability == "volatile" else f" {qos.durability}"
+        depth = "" if qos.history == "unknown" else f" {qos.depth}"
+        texts.append(qos.reliability + durability + depth)
+    return ", ".join(dict.fromkeys(texts)) or "-"
 
 
 def _print(info: BagInfo) -> None:
@@ -130,16 +107,10 @@ def _print(info: BagInfo) -> None:
     print(f"start     {info.start_ns / NANOSECONDS:.3f} s ({start:%Y-%m-%d %H:%M:%S} UTC)")
     print(f"duration  {info.duration_s:.3f} s")
     print(f"messages  {info.messages}")
-    rows = [("topic", "type", "count", "rate", "qos")] + [
-        (
-            topic.name,
-            topic.type,
-            str(topic.count),
-            "-" if topic.rate is None else f"{topic.rate:.1f} Hz",
-            _qos_text(topic.qos),
-        )
-        for topic in info.topics
-    ]
+    rows = [("topic", "type", "count", "rate", "qos")]
+    for topic in info.topics:
+        rate = "-" if topic.rate is None else f"{topic.rate:.1f} Hz"
+        rows.append((topic.name, topic.type, str(topic.count), rate, _qos_text(topic.qos)))
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     print()
     for name, kind, count, rate, qos in rows:
@@ -171,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
         recover(args.bag).close()
     info = bag_info(args.bag)
     if args.json:
-        print(_as_json(info))
+        print(json.dumps(asdict(info) | {"path": str(info.path)}, indent=2))
     else:
         _print(info)
     return 0

@@ -5,8 +5,9 @@ rosbag2 writes the names of the policies from metadata version 9 (Jazzy) on, and
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import yaml
@@ -23,6 +24,12 @@ _NUMBERED = {
     "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
     "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
     "liveliness": ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available"),
+}
+
+_DURATIONS = {
+    "deadline": "deadline_ns",
+    "lifespan": "lifespan_ns",
+    "liveliness_lease_duration": "liveliness_lease_ns",
 }
 
 
@@ -98,25 +105,14 @@ def request_for(offered: Sequence[Qos], depth: int) -> Qos:
 
 def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
     """The value of ``offered_qos_profiles`` in metadata version 9."""
-
-    def duration(nanoseconds: int) -> dict[str, int]:
-        sec, nsec = divmod(nanoseconds, NANOSECONDS)
-        return {"sec": sec, "nsec": nsec}
-
-    return [
-        {
-            "history": offer.history,
-            "depth": offer.depth,
-            "reliability": offer.reliability,
-            "durability": offer.durability,
-            "deadline": duration(offer.deadline_ns),
-            "lifespan": duration(offer.lifespan_ns),
-            "liveliness": offer.liveliness,
-            "liveliness_lease_duration": duration(offer.liveliness_lease_ns),
-            "avoid_ros_namespace_conventions": offer.avoid_ros_namespace_conventions,
-        }
-        for offer in offers
-    ]
+    profiles = []
+    for offer in offers:
+        profile = asdict(offer)
+        for name, field in _DURATIONS.items():
+            sec, nsec = divmod(profile.pop(field), NANOSECONDS)
+            profile[name] = {"sec": sec, "nsec": nsec}
+        profiles.append(profile)
+    return profiles
 
 
 # libyaml, where PyYAML was built with it, is ten times as fast; a short replay notices.
@@ -149,31 +145,18 @@ def load(value: object) -> tuple[Qos, ...]:
 
 
 def _profile(item: dict[str, Any]) -> Qos:
-    def policy(name: str, default: str) -> str:
-        value = item.get(name, default)
-        names = _NUMBERED[name]
-        if isinstance(value, int):
-            return names[value] if 0 <= value < len(names) else default
-        return value if value in names else default
-
-    def duration(name: str) -> int:
+    values: dict[str, Any] = {"depth": 0, "history": "unknown"}
+    for name, names in _NUMBERED.items():
         value = item.get(name)
-        try:
-            nanoseconds = int(value["sec"]) * NANOSECONDS + int(value["nsec"])  # type: ignore[index]
-        except (TypeError, KeyError, ValueError):
-            return INFINITE_NS
-        # Before Jazzy an infinite duration was 2147483647 s and 4294967295 ns; 0 is "unspecified".
-        return nanoseconds if 0 < nanoseconds < 2147483647 * NANOSECONDS else INFINITE_NS
-
-    depth = item.get("depth", 0)
-    return Qos(
-        reliability=policy("reliability", "reliable"),
-        durability=policy("durability", "volatile"),
-        depth=depth if isinstance(depth, int) and depth >= 0 else 0,
-        history=policy("history", "unknown"),
-        deadline_ns=duration("deadline"),
-        lifespan_ns=duration("lifespan"),
-        liveliness=policy("liveliness", "automatic"),
-        liveliness_lease_ns=duration("liveliness_lease_duration"),
-        avoid_ros_namespace_conventions=bool(item.get("avoid_ros_namespace_conventions", False)),
-    )
+        if isinstance(value, int) and 0 <= value < len(names):
+            value = names[value]
+        if value in names:
+            values[name] = value
+    for name, field in _DURATIONS.items():
+        with contextlib.suppress(TypeError, KeyError, ValueError, OverflowError):
+            nanoseconds = int(item[name]["sec"]) * NANOSECONDS + int(item[name]["nsec"])
+            # Before Jazzy an infinite duration was 2147483647 s and 4294967295 ns; 0 is "unspecified".
+            values[field] = nanoseconds if 0 < nanoseconds < 2147483647 * NANOSECONDS else INFINITE_NS
+    if isinstance(item.get("depth"), int):
+        values["depth"] = max(0, item["depth"])
+    return Qos(**values, avoid_ros_namespace_conventions=bool(item.get("avoid_ros_namespace_conventions", False)))

@@ -9,49 +9,36 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import heapq
 import os
 import re
 import time
-from collections import Counter
+from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
 from body_tracking.messages.base import BagMessages
 from body_tracking.recording import qos as quality
-from body_tracking.recording.mcap_file import LIBRARY, BagError, Block, McapFile, StoredMessage
+from body_tracking.recording.mcap_file import LIBRARY, McapFile
+from body_tracking.recording.mcap_file import BagError as BagError
 from body_tracking.recording.mcap_repair import finish
 from body_tracking.recording.qos import Qos
 
-__all__ = [
-    "BAG_MESSAGES",
-    "BagError",
-    "BagReader",
-    "BagWriter",
-    "RawMessage",
-    "TopicInfo",
-    "deserialize",
-    "is_known",
-    "recover",
-    "remove_file",
-    "serialize",
-]
-
 METADATA = "metadata.yaml"
 MAX_WAITING_BYTES = 1 << 28
-"""Bytes of messages that wait for older ones of chunks that overlap in time."""
+"""Bytes of messages that wait for those of chunks that overlap with theirs in time."""
+_MESSAGE_BYTES = 250
+"""What a message that waits takes besides its content, about."""
 METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
 MAX_TIME_NS = 2**63 - 1
 
-_COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 BAG_MESSAGES = BagMessages(_STORE.types)
@@ -147,7 +134,7 @@ class BagReader:
     """Reads a bag: a folder, also without its ``metadata.yaml``, or a single mcap file.
 
     What is damaged or missing does not stop it: a line in :attr:`warnings` says what and where. A damaged chunk is only
-    noticed when it is read; :meth:`verify` reads them all.
+    noticed when it is read.
 
     Args:
         path: the folder or file.
@@ -161,11 +148,15 @@ class BagReader:
         self.files: list[McapFile] = []
         self._notes: list[str] = []
         try:
-            found = self._paths()
-            for file in found:
-                self._open(file)
+            for path in self._paths():
+                try:
+                    self.files.append(McapFile(path))
+                except BagError as error:
+                    if path == self.path:
+                        raise
+                    self._notes.append(str(error))
             if not self.files:
-                raise BagError(self._notes[-1] if found else f"{self.path}: no mcap file is in the folder")
+                raise BagError(self._notes[-1] if _files(self.path) else f"{self.path}: no mcap file is in the folder")
         except BaseException:
             self.close()
             raise
@@ -211,46 +202,36 @@ class BagReader:
             }
             for file in self.files
         ]
-        blocks: list[tuple[int, int, int, Block]] = sorted(
+        blocks = sorted(
             (block.start_ns, index, block.offset, block)
             for index, file in enumerate(self.files)
             for block in file.blocks
             if (start_ns is None or block.end_ns >= start_ns)
-            and (block.counts is None or not wanted[index].keys().isdisjoint(block.counts))
+            and (block.channels is None or not block.channels.isdisjoint(wanted[index]))
         )
-        # Blocks overlap in time where messages were written late: a block is opened before anything later than its
-        # beginning leaves the heap.
-        heap: list[tuple[int, int, int, int, RawMessage]] = []
-        position = waiting = 0
-        while position < len(blocks) or heap:
-            while position < len(blocks) and (not heap or blocks[position][0] <= heap[0][0]):
-                _, index, offset, block = blocks[position]
-                position += 1
-                names = wanted[index]
-                for number, stored in enumerate(self.files[index].read(block)):
-                    if stored.channel in names and (start_ns is None or stored.log_time_ns >= start_ns):
-                        message = _raw(names[stored.channel], stored)
-                        waiting += len(message.cdr)
-                        heapq.heappush(heap, (stored.log_time_ns, index, offset, number, message))
-                if waiting > MAX_WAITING_BYTES:
-                    raise BagError(f"{self.path}: more than {MAX_WAITING_BYTES >> 20} MB of chunks are of one time")
-            if heap:
-                message = heapq.heappop(heap)[-1]
-                waiting -= len(message.cdr)
-                yield message
-
-    def verify(self) -> None:
-        """Read everything once, so that :attr:`warnings` is complete."""
-        for file in self.files:
-            for block in file.blocks:
-                file.read(block)
+        # Blocks overlap in time where messages were written late: what is not earlier than the next block waits for it.
+        waiting: list[tuple[int, int, int, int, RawMessage]] = []
+        for begin_ns, index, offset, block in blocks:
+            ready = bisect_left(waiting, (begin_ns,))
+            yield from [each[-1] for each in waiting[:ready]]
+            del waiting[:ready]
+            if sum(len(each[-1].cdr) + _MESSAGE_BYTES for each in waiting) > MAX_WAITING_BYTES:
+                raise BagError(f"{self.path}: more than {MAX_WAITING_BYTES >> 20} MB of chunks are of one time")
+            names = wanted[index]
+            waiting += [
+                (at_ns, index, offset, number, RawMessage(names[channel], cdr, at_ns, sent_ns))
+                for number, (channel, at_ns, sent_ns, cdr) in enumerate(self.files[index].read(block))
+                if channel in names and (start_ns is None or at_ns >= start_ns)
+            ]
+            waiting.sort()
+        yield from [each[-1] for each in waiting]
 
     def _paths(self) -> list[Path]:
         if not self.path.exists():
             raise BagError(f"{self.path}: no such recording")
         if not self.path.is_dir():
             return [self.path]
-        found = sorted(self.path.glob("*.mcap"), key=_natural)
+        found = _files(self.path)
         listed = self._listed()
         if listed is None:
             return found
@@ -271,8 +252,8 @@ class BagReader:
             raise BagError(f"{path}: not a regular file")
         try:
             information = load_yaml(read_text(path))["rosbag2_bagfile_information"]
-            storage = str(information["storage_identifier"])
-            compression = str(information.get("compression_mode") or "").lower()
+            storage = information["storage_identifier"]
+            compression = str(information.get("compression_mode") or "none").lower()
             names = [Path(str(name)).name for name in information["relative_file_paths"]]
         except FileLimitError as error:
             raise BagError(f"{path}: {error}") from error
@@ -281,49 +262,43 @@ class BagReader:
             return None
         if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
             raise BagError(f"{self.path}: storage {storage!r} is not supported, only mcap")
-        if compression not in ("", "none"):
+        if compression != "none":
             raise BagError(f"{self.path}: rosbag2 compression mode {compression!r} is not supported, only mcap's own")
         return [self.path / name for name in names]
-
-    def _open(self, path: Path) -> None:
-        try:
-            self.files.append(McapFile(path))
-        except BagError as error:
-            if not self.path.is_dir():
-                raise
-            self._notes.append(str(error))
 
     def _topics(self) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
         for file in self.files:
             for number, channel in sorted(file.channels.items()):
-                schema = file.schemas.get(channel.schema_id)
+                name, schema = channel.topic, file.schemas.get(channel.schema_id)
                 if channel.message_encoding != "cdr" or schema is None:
                     self._notes.append(
-                        f"{file.path.name}: topic {channel.topic} has encoding {channel.message_encoding!r}"
+                        f"{file.path.name}: topic {name} has encoding {channel.message_encoding!r}"
                         f" and {'no' if schema is None else 'a'} schema; skipped"
                     )
                     continue
+                if name in topics and topics[name].type_name != schema.name:
+                    self._notes.append(f"{name}: recorded as {topics[name].type_name} and as {schema.name}")
                 offered = quality.load(channel.metadata.get("offered_qos_profiles", ""))
-                known = topics.get(channel.topic)
-                if known is not None and known.type_name != schema.name:
-                    self._notes.append(f"{channel.topic}: recorded as {known.type_name} and as {schema.name}")
-                topics[channel.topic] = TopicInfo(
-                    schema.name if known is None else known.type_name,
-                    file.counts[number] + (0 if known is None else known.count),
-                    offered if known is None else tuple(dict.fromkeys(known.offered + offered)),
-                )
+                _add(topics, name, TopicInfo(schema.name, file.counts[number], offered))
         return dict(sorted(topics.items()))
 
 
-def _raw(topic: str, stored: StoredMessage) -> RawMessage:
-    return RawMessage(topic, stored.data, stored.log_time_ns, stored.publish_time_ns)
+def _add(topics: dict[str, TopicInfo], name: str, more: TopicInfo) -> None:
+    """Add messages and publishers of a topic; its type is the one that it had first."""
+    known = topics.get(name, TopicInfo(more.type_name, 0))
+    offered = tuple(dict.fromkeys(known.offered + more.offered))
+    topics[name] = TopicInfo(known.type_name, known.count + more.count, offered)
 
 
 def _natural(path: Path) -> tuple[str, int]:
     """``name_10`` after ``name_9``."""
     match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
     return (match[1], int(match[2])) if match else (path.stem, -1)
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap"), key=_natural)
 
 
 def _is_part(folder: Path, path: Path) -> bool:
@@ -337,39 +312,18 @@ class _Sink:
     """The file under the mcap writer: unbuffered, so that what failed to be written is known to the byte."""
 
     def __init__(self, path: Path) -> None:
-        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self.position = 0
-        self.synchronised = 0
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            written = os.write(self.descriptor, view)
-            self.position += written
-            view = view[written:]
-        return len(data)
+        self.file = path.open("xb", buffering=0)
 
     def tell(self) -> int:
-        return self.position
+        return self.file.tell()
+
+    def write(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self.file.write(view) :]
 
     def flush(self) -> None:
         """For the mcap writer; nothing waits in here."""
-
-    def synchronise(self) -> None:
-        """Returns when a power failure can no longer take what was written."""
-        if self.synchronised != self.position:
-            os.fdatasync(self.descriptor)
-            self.synchronised = self.position
-
-    def close(self) -> None:
-        os.close(self.descriptor)
-
-
-@dataclass(slots=True)
-class _Topic:
-    channel: int
-    type_name: str
-    offered: tuple[Qos, ...]
 
 
 class BagWriter:
@@ -377,14 +331,20 @@ class BagWriter:
 
     Chunks are closed and written through to the disk at least every ``flush_interval_s`` while messages come, so that a
     power failure loses about that much. Whoever has nothing to write for a while calls :meth:`flush` in between.
+    After a failure (disk full) the file ends with its last whole chunk, as after a power failure. ``rosbags`` can write
+    bags too, of one file, without checksums, and with nothing that a reader finds before they are closed.
 
     Args:
         folder: of the bag; its files are called ``<folder>_<n>.mcap``.
         overwrite: replace a bag that is there.
         resume: go on in a bag that is there, in its next file; what its recorder left unclosed is closed as well.
-        compression: of the chunks: ``zstd``, ``lz4`` or ``none``.
         chunk_bytes: a chunk is closed at this size, uncompressed.
         flush_interval_s: seconds; infinite for writing offline.
+
+    Attributes:
+        path: of the file that is written.
+        message_count: messages written by this writer.
+        failure: why nothing can be written any more; None while all is well.
 
     Raises:
         BagError: the folder exists and neither ``overwrite`` nor ``resume`` is given, is no bag, is being written by
@@ -397,32 +357,27 @@ class BagWriter:
         *,
         overwrite: bool = False,
         resume: bool = False,
-        compression: str = "zstd",
         chunk_bytes: int = 768 * 1024,
         flush_interval_s: float = 1.0,
     ) -> None:
-        if compression not in _COMPRESSION:
-            raise BagError(f"compression {compression!r} is unknown: {', '.join(_COMPRESSION)}")
         self.folder = Path(folder).absolute()
-        self._topics: dict[str, _Topic] = {}
+        self.failure: BagError | None = None
+        self._channels: dict[str, tuple[int, str]] = {}  # and type
         self._schemas: dict[str, int] = {}
-        self._counts: Counter[str] = Counter()
-        self._start_ns, self._end_ns = MAX_TIME_NS, 0
+        self.message_count = 0
         self._interval_s = flush_interval_s
         self._flushed_s = time.monotonic()
         self._open = False
-        self.failure: BagError | None = None
-        """Why nothing can be written any more; None while all is well."""
         try:
             number = self._prepare(overwrite, resume)
             self.path = self.folder / f"{self.folder.name}_{number}.mcap"
             self._sink = _Sink(self.path)
-            fcntl.flock(self._sink.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._mcap = Writer(self._sink, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])  # type: ignore[arg-type]
+            fcntl.flock(self._sink.file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._mcap = Writer(self._sink, chunk_size=chunk_bytes)  # type: ignore[arg-type]
             self._mcap.start(profile="ros2", library=LIBRARY)
         except OSError as error:
             raise BagError(f"{self.folder}: {error.strerror}") from error
-        self._sound = self._sink.position
+        self._sound = self._sink.tell()
         self._open = True
 
     def __enter__(self) -> Self:
@@ -430,16 +385,6 @@ class BagWriter:
 
     def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
         self.close()
-
-    @property
-    def message_count(self) -> int:
-        """Messages written to this bag by this writer."""
-        return self._counts.total()
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The topics added so far."""
-        return tuple(self._topics)
 
     def add_topic(self, topic: str, type_name: str, qos: Qos | Sequence[Qos] = quality.RELIABLE) -> None:
         """Announce a topic; once more with the same type changes nothing.
@@ -453,24 +398,21 @@ class BagWriter:
             BagError: the type is unknown, or the topic has another one already, or nothing can be written.
         """
         self._check()
-        known = self._topics.get(topic)
-        if known is not None:
-            if known.type_name != type_name:
-                raise BagError(f"{topic}: is recorded as {known.type_name}, not as {type_name}")
+        if topic in self._channels:
+            known = self._channels[topic][1]
+            if known != type_name:
+                raise BagError(f"{topic}: is recorded as {known}, not as {type_name}")
             return
         if not is_known(type_name):
             raise BagError(f"{topic}: message type {type_name!r} is unknown (no definition of it is at hand)")
-        offered = (qos,) if isinstance(qos, Qos) else tuple(qos)
-        metadata = {
-            "offered_qos_profiles": quality.dump(offered),
-            "topic_type_hash": _STORE.hash_rihs01(type_name),
-        }
+        offered = quality.dump((qos,) if isinstance(qos, Qos) else qos)
+        metadata = {"offered_qos_profiles": offered, "topic_type_hash": _type_hash(type_name)}
         with self._writing():
             if type_name not in self._schemas:
                 definition, _ = _STORE.generate_msgdef(type_name, ros_version=2)
                 self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.encode())
-            channel = self._mcap.register_channel(topic, "cdr", self._schemas[type_name], metadata)
-        self._topics[topic] = _Topic(channel, type_name, offered)
+            number = self._mcap.register_channel(topic, "cdr", self._schemas[type_name], metadata)
+        self._channels[topic] = number, type_name
 
     def write(self, topic: str, cdr: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> None:
         """Write one message.
@@ -485,16 +427,14 @@ class BagWriter:
             BagError: the topic was not added, a time is negative, or nothing can be written (any more).
         """
         self._check()
-        if topic not in self._topics:
+        if topic not in self._channels:
             raise BagError(f"{topic}: was not added to the bag")
         sent_ns = log_time_ns if publish_time_ns is None else publish_time_ns
         if not (0 <= log_time_ns <= MAX_TIME_NS and 0 <= sent_ns <= MAX_TIME_NS):
             raise BagError(f"{topic}: a bag cannot hold the time {min(log_time_ns, sent_ns)} ns")
         with self._writing():
-            self._mcap.add_message(self._topics[topic].channel, log_time_ns, cdr, sent_ns)
-        self._counts[topic] += 1
-        self._start_ns = min(self._start_ns, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+            self._mcap.add_message(self._channels[topic][0], log_time_ns, cdr, sent_ns)
+        self.message_count += 1
         if time.monotonic() - self._flushed_s >= self._interval_s:
             self.flush()
 
@@ -511,7 +451,7 @@ class BagWriter:
         self._check()
         with self._writing():
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            self._sink.synchronise()
+            os.fdatasync(self._sink.file.fileno())
         self._flushed_s = time.monotonic()
 
     def close(self) -> None:
@@ -523,19 +463,11 @@ class BagWriter:
         if not self._open:
             return
         self.flush()
-        entry = self._entry()
         with self._writing():
-            self._mcap.add_metadata("rosbag2", {"serialized_metadata": quality.dump_yaml(_information([entry]))})
             self._mcap.finish()  # type: ignore[no-untyped-call]
-            self._sink.synchronise()
+            os.fdatasync(self._sink.file.fileno())
         self._shut()
-        earlier = [path for path in sorted(self.folder.glob("*.mcap"), key=_natural) if path != self.path]
-        for path in earlier:
-            _finish_quietly(path)
-        try:
-            _write_metadata(self.folder, _information([*_entries(earlier), entry]))
-        except OSError as error:
-            raise BagError(f"{self.folder / METADATA}: {error.strerror}") from error
+        _close_folder(self.folder)
 
     def discard(self) -> None:
         """Stop, and delete the file that this writer made, and the folder if nothing else is in it."""
@@ -553,7 +485,7 @@ class BagWriter:
             return 0
         if not (overwrite or resume):
             raise BagError(f"{self.folder}: exists already")
-        parts = sorted(self.folder.glob("*.mcap"), key=_natural)
+        parts = _files(self.folder)
         if not parts and not (self.folder / METADATA).exists():
             raise BagError(f"{self.folder}: exists and is no bag")
         for path in parts:
@@ -574,130 +506,20 @@ class BagWriter:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """After a failure (disk full) the file ends with its last whole chunk, as after a power failure."""
         try:
             yield
         except OSError as error:
             with contextlib.suppress(OSError):
-                os.ftruncate(self._sink.descriptor, self._sound)
+                self._sink.file.truncate(self._sound)
             self.failure = BagError(f"{self.path}: {error.strerror}")
             self._shut()
             raise self.failure from error
-        self._sound = self._sink.position
+        self._sound = self._sink.tell()
 
     def _shut(self) -> None:
         if self._open:
             self._open = False
-            self._sink.close()
-
-    def _entry(self) -> _Entry:
-        return _Entry(
-            self.path.name,
-            self._start_ns,
-            max(0, self._end_ns - self._start_ns),
-            {
-                name: _Counted(topic.type_name, self._counts[name], topic.offered)
-                for name, topic in self._topics.items()
-            },
-        )
-
-
-# --- metadata
-
-
-@dataclass(frozen=True, slots=True)
-class _Counted:
-    type_name: str
-    count: int
-    offered: tuple[Qos, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """One file of a bag, as ``metadata.yaml`` tells of it; without messages the start is the latest possible time."""
-
-    name: str
-    start_ns: int
-    duration_ns: int
-    topics: dict[str, _Counted]
-
-    @property
-    def count(self) -> int:
-        return sum(topic.count for topic in self.topics.values())
-
-
-def _entries(paths: Sequence[Path]) -> list[_Entry]:
-    """What is in files that are there already; those that cannot be read are left out."""
-    entries = []
-    for path in paths:
-        try:
-            with BagReader(path) as reader:
-                start_ns = reader.start_ns if reader.message_count else MAX_TIME_NS
-                topics = {
-                    name: _Counted(topic.type_name, topic.count, topic.offered) for name, topic in reader.topics.items()
-                }
-                entries.append(_Entry(path.name, start_ns, reader.end_ns - reader.start_ns, topics))
-        except BagError:
-            continue
-    return entries
-
-
-def _information(entries: Sequence[_Entry]) -> dict[str, Any]:
-    """The content of ``metadata.yaml``, in the order in which rosbag2 writes it."""
-    topics: dict[str, _Counted] = {}
-    for entry in entries:
-        for name, topic in entry.topics.items():
-            if name in topics:
-                offered = tuple(dict.fromkeys(topics[name].offered + topic.offered))
-                topics[name] = _Counted(topics[name].type_name, topics[name].count + topic.count, offered)
-            else:
-                topics[name] = topic
-    start_ns = min((entry.start_ns for entry in entries), default=MAX_TIME_NS)
-    end_ns = max((entry.start_ns + entry.duration_ns for entry in entries if entry.count), default=start_ns)
-    return {
-        "version": METADATA_VERSION,
-        "storage_identifier": "mcap",
-        "duration": {"nanoseconds": end_ns - start_ns},
-        "starting_time": {"nanoseconds_since_epoch": start_ns},
-        "message_count": sum(entry.count for entry in entries),
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": name,
-                    "type": topic.type_name,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": quality.to_yaml(topic.offered),
-                    "type_description_hash": _STORE.hash_rihs01(topic.type_name) if is_known(topic.type_name) else "",
-                },
-                "message_count": topic.count,
-            }
-            for name, topic in topics.items()
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [entry.name for entry in entries],
-        "files": [
-            {
-                "path": entry.name,
-                "starting_time": {"nanoseconds_since_epoch": entry.start_ns},
-                "duration": {"nanoseconds": entry.duration_ns},
-                "message_count": entry.count,
-            }
-            for entry in entries
-        ],
-        "custom_data": None,
-        "ros_distro": ROS_DISTRO,
-    }
-
-
-def _write_metadata(folder: Path, information: dict[str, Any]) -> None:
-    """Replace ``metadata.yaml`` at once: it is whole at any time."""
-    draft = folder / f"{METADATA}.tmp"
-    with draft.open("w", encoding="utf-8") as file:
-        file.write(quality.dump_yaml({"rosbag2_bagfile_information": information}))
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(folder / METADATA)
+            self._sink.file.close()
 
 
 def remove_file(path: Path) -> None:
@@ -705,21 +527,6 @@ def remove_file(path: Path) -> None:
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
         path.parent.rmdir()
-
-
-def _refuse_if_in_use(path: Path) -> None:
-    """A writer holds a lock on its file for as long as its process lives."""
-    with open_regular(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BagError(f"{path}: is being recorded by another process") from error
-
-
-def _finish_quietly(path: Path) -> None:
-    """Close what a recorder left open; a file that cannot be closed stays as it is, and readable as far as it goes."""
-    with contextlib.suppress(BagError):
-        finish(path)
 
 
 def recover(folder: Path | str) -> BagReader:
@@ -734,17 +541,96 @@ def recover(folder: Path | str) -> BagReader:
         BagError: it is no bag, it is still being recorded, or it cannot be written.
     """
     folder = Path(folder)
-    paths = sorted(folder.glob("*.mcap"), key=_natural)
+    paths = _files(folder)
     if not paths:
         raise BagError(f"{folder}: no mcap file is in the folder")
     try:
         for path in paths:
             _refuse_if_in_use(path)
-            _finish_quietly(path)
-        entries = _entries(paths)
-        if not entries:
-            raise BagError(f"{folder}: none of its mcap files can be read")
-        _write_metadata(folder, _information(entries))
     except OSError as error:
         raise BagError(f"{folder}: {error.strerror}") from error
+    _close_folder(folder)
     return BagReader(folder)
+
+
+def _refuse_if_in_use(path: Path) -> None:
+    """A writer holds a lock on its file for as long as its process lives."""
+    with open_regular(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(f"{path}: is being recorded by another process") from error
+
+
+# --- metadata
+
+
+def _close_folder(folder: Path) -> None:
+    """Close what recorders left open, as far as it can be read, and list the files in ``metadata.yaml``.
+
+    Raises:
+        BagError: nothing in the folder can be read, or it cannot be written.
+    """
+    parts: list[BagReader] = []
+    for path in _files(folder):
+        with contextlib.suppress(BagError):
+            finish(path)
+        with contextlib.suppress(BagError), BagReader(path) as reader:
+            parts.append(reader)
+    if not parts:
+        raise BagError(f"{folder}: none of its mcap files can be read")
+    draft = folder / f"{METADATA}.tmp"
+    try:
+        with draft.open("w", encoding="utf-8") as file:
+            file.write(quality.dump_yaml({"rosbag2_bagfile_information": _information(parts)}))
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(folder / METADATA)  # at once: it is whole at any time
+    except OSError as error:
+        raise BagError(f"{folder / METADATA}: {error.strerror}") from error
+
+
+def _type_hash(type_name: str) -> str:
+    return _STORE.hash_rihs01(type_name) if is_known(type_name) else ""
+
+
+def _information(parts: Sequence[BagReader]) -> dict[str, Any]:
+    """The content of ``metadata.yaml`` for these files; where there are no messages the start is the latest time."""
+    topics: dict[str, TopicInfo] = {}
+    for part in parts:
+        for name, topic in part.topics.items():
+            _add(topics, name, topic)
+
+    def summary(files: Sequence[BagReader]) -> dict[str, Any]:
+        spans = [(file.start_ns, file.end_ns) for file in files if file.message_count] or [(MAX_TIME_NS, MAX_TIME_NS)]
+        start_ns = min(start for start, _ in spans)
+        return {
+            "starting_time": {"nanoseconds_since_epoch": start_ns},
+            "duration": {"nanoseconds": max(end for _, end in spans) - start_ns},
+            "message_count": sum(file.message_count for file in files),
+        }
+
+    return {
+        "version": METADATA_VERSION,
+        "storage_identifier": "mcap",
+        **summary(parts),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": name,
+                    "type": topic.type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": quality.to_yaml(topic.offered),
+                    "type_description_hash": _type_hash(topic.type_name),
+                },
+                "message_count": topic.count,
+            }
+            for name, topic in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [part.path.name for part in parts],
+        "files": [{"path": part.path.name, **summary([part])} for part in parts],
+        "custom_data": None,
+        "ros_distro": ROS_DISTRO,
+    }

@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking import graph
-from body_tracking.cdr import encode_angles, encode_model_state, encode_skeletons
+from body_tracking.cdr import encode_angles, encode_skeletons
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
 from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
+from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
@@ -151,7 +152,8 @@ def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
         skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
         # positions only, as a sensor's
         yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
-        yield log_ns, graph.TRUE_MODEL_STATE, encode_model_state(first.estimate(k), MODEL)
+        state = estimate_to_joint_state(first.estimate(k), MODEL, BAG_MESSAGES)
+        yield log_ns, graph.TRUE_MODEL_STATE, serialize(state)
         yield log_ns, graph.TRUE_ANGLES, encode_angles(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD)[0]
         if stamp_ns >= due_ns:
             due_ns += NANOSECONDS

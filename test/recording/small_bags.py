@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+from mcap.writer import CompressionType, Writer
+
+from body_tracking.recording import rosbag2
 from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, serialize
 
@@ -52,9 +57,15 @@ def messages(count: int) -> list[Stored]:
     ]
 
 
-def write(folder: Path, stored: Sequence[Stored], **options: Any) -> Path:
-    """A closed bag; the path of its file."""
-    with BagWriter(folder, **options) as writer:
+COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+
+
+def write(folder: Path, stored: Sequence[Stored], compression: str = "zstd", **options: Any) -> Path:
+    """A closed bag; the path of its file. ``ros2 bag`` can be told to compress otherwise than we do."""
+    with (
+        patch.object(rosbag2, "Writer", partial(Writer, compression=COMPRESSION[compression])),
+        BagWriter(folder, **options) as writer,
+    ):
         for topic, (type_name, qos) in TOPICS.items():
             writer.add_topic(topic, type_name, qos)
         for topic, cdr, log_time_ns in stored:

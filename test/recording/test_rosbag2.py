@@ -15,14 +15,15 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos as RosbagsQos
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from small_bags import TOPICS, Stored, message, messages, read, write
 
 from body_tracking.recording import qos as quality
-from body_tracking.recording.qos import INFINITE_NS, SENSOR_DATA, Qos
+from body_tracking.recording.qos import INFINITE_NS, Qos
 from body_tracking.recording.rosbag2 import (
     BAG_MESSAGES,
     BagError,
@@ -60,27 +61,15 @@ def test_what_is_written_is_read_in_the_order_of_log_times(drawn, compression, c
         write(Path(folder) / "bag", stored, compression=compression, chunk_bytes=chunk_bytes)
         with BagReader(Path(folder) / "bag") as reader:
             assert [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()] == expected
-            assert reader.warnings == [] and reader.whole
+            assert reader.warnings == []
             assert reader.message_count == len(stored)
-            assert {name: topic.type_name for name, topic in reader.topics.items()} == {
-                name: kind for name, (kind, _) in TOPICS.items()
-            }
-            assert {name: topic.qos for name, topic in reader.topics.items()} == {
-                name: qos for name, (_, qos) in TOPICS.items()
-            }
+            assert {name: (topic.type_name, topic.qos) for name, topic in reader.topics.items()} == TOPICS
             for name, topic in reader.topics.items():
                 assert topic.count == sum(item[0] == name for item in stored)
             if stored:
                 assert (reader.start_ns, reader.end_ns) == (expected[0][2], expected[-1][2])
         # The order among equal times is a matter of taste; everything else is not.
         assert sorted(rosbags_read(Path(folder) / "bag")) == sorted(stored)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.sampled_from(list(TOPICS)), texts, st.floats(allow_nan=False))
-def test_messages_survive_serialisation(topic, text, number):
-    original = message(topic, text, number)
-    assert deserialize(TOPICS[topic][0], serialize(original)) == original
 
 
 def test_selection_of_topics_and_start(tmp_path):
@@ -92,51 +81,19 @@ def test_selection_of_topics_and_start(tmp_path):
     assert found == [item for item in stored if item[0] == "/text" and item[2] >= start_ns]
 
 
-def test_publish_time_is_kept(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/text", "std_msgs/msg/String")
-        writer.write("/text", serialize(message("/text", "a", 0.0)), 20, 10)
-    with BagReader(tmp_path / "bag") as reader:
-        assert [(found.log_time_ns, found.publish_time_ns) for found in reader.messages()] == [(20, 10)]
-
-
 # --- with others
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_rosbags_reads_what_we_write(tmp_path, compression):
-    stored = messages(100)
-    write(tmp_path / "bag", stored, compression=compression, chunk_bytes=1000)
-    assert rosbags_read(tmp_path / "bag") == stored
-    with Reader(tmp_path / "bag") as reader:
-        assert reader.message_count == len(stored)
-        assert reader.start_time == stored[0][2]
-        assert reader.duration == stored[-1][2] - stored[0][2] + 1
-        for connection in reader.connections:
-            definition, _ = TYPES.generate_msgdef(connection.msgtype, ros_version=2)
-            assert connection.msgdef.data == definition
-            assert connection.digest == TYPES.hash_rihs01(connection.msgtype)
-            assert connection.ext.serialization_format == "cdr"
-
-
 @pytest.mark.parametrize("version", [8, 9])
-@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.STORAGE])
-def test_we_read_what_rosbags_writes(tmp_path, version, mode):
+def test_rosbags_and_we_read_what_the_other_writes(tmp_path, version):
     stored = messages(100)
-    infinite = QosTime(9223372036, 854775807)
+    write(tmp_path / "ours", stored, chunk_bytes=1000)
+    endless = QosTime(9223372036, 854775807)
     profile = RosbagsQos(
-        QosHistory.KEEP_LAST,
-        7,
-        QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL,
-        infinite,
-        infinite,
-        QosLiveliness.AUTOMATIC,
-        infinite,
-        False,
+        *(QosHistory.KEEP_LAST, 7, QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, endless, endless),
+        *(QosLiveliness.AUTOMATIC, endless, False),
     )
-    writer = Writer(tmp_path / "bag", version=version, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
+    writer = Writer(tmp_path / "theirs", version=version, storage_plugin=StoragePlugin.MCAP)
     with writer:
         connections = {
             name: writer.add_connection(name, kind, typestore=TYPES, offered_qos_profiles=[profile])
@@ -144,56 +101,84 @@ def test_we_read_what_rosbags_writes(tmp_path, version, mode):
         }
         for topic, cdr, at in stored:
             writer.write(connections[topic], at, cdr)
-    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
-        assert read(path) == stored
-    with BagReader(tmp_path / "bag") as reader:
-        assert reader.warnings == []
-        assert reader.topics["/pose"].offered == (Qos("best_effort", "transient_local", 7),)
+    for path in (tmp_path / "theirs", tmp_path / "theirs" / "theirs.mcap"):
+        with BagReader(path) as reader:
+            assert [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()] == stored
+            assert reader.topics["/pose"].offered == (Qos("best_effort", "transient_local", 7),)
+            assert reader.warnings == []
+    with Reader(tmp_path / "ours") as ours, Reader(tmp_path / "theirs") as theirs:
+        assert (ours.message_count, ours.start_time, ours.duration) == (100, theirs.start_time, theirs.duration)
+        for one, other in zip(ours.connections, sorted(theirs.connections, key=lambda each: each.topic), strict=True):
+            assert one[1:4] == other[1:4], "topic, type, definition"
+            assert one.digest == other.digest
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("size", [None, -2000])
+def test_files_of_other_recorders_are_read_and_recovered(tmp_path, chunked, size):
+    """``ros2 bag record --storage-preset-profile fastwrite`` writes no chunks."""
+    stored = messages(100)
+    path = tmp_path / "bag" / "bag_0.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=900, use_chunking=chunked)
+        writer.start("ros2")
+        channels = {
+            name: writer.register_channel(name, "cdr", writer.register_schema(kind, "ros2msg", b""))
+            for name, (kind, _) in TOPICS.items()
+        }
+        for topic, cdr, at in stored:
+            writer.add_message(channels[topic], at, cdr, at - 5)
+        writer.finish()
+    path.write_bytes(path.read_bytes()[:size])
+    found = read(path.parent)
+    assert found == (stored if size is None else stored[: len(found)]) and found
+    recover(path.parent).close()
+    assert read(path.parent) == rosbags_read(path.parent) == found
+    with BagReader(path) as reader:
+        assert {message.log_time_ns - message.publish_time_ns for message in reader.messages()} == {5}
 
 
 def test_metadata_has_the_form_that_jazzy_writes(tmp_path):
     stored = messages(30)
     write(tmp_path / "bag", stored)
     information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    start = {"nanoseconds_since_epoch": stored[0][2]}
-    duration = {"nanoseconds": stored[-1][2] - stored[0][2]}
+    span = {
+        "starting_time": {"nanoseconds_since_epoch": stored[0][2]},
+        "duration": {"nanoseconds": stored[-1][2] - stored[0][2]},
+        "message_count": 30,
+    }
     topics = information.pop("topics_with_message_count")
-    assert information == {
+    assert information == span | {
         "version": 9,
         "storage_identifier": "mcap",
-        "duration": duration,
-        "starting_time": start,
-        "message_count": 30,
         "compression_format": "",
         "compression_mode": "",
         "relative_file_paths": ["bag_0.mcap"],
-        "files": [{"path": "bag_0.mcap", "starting_time": start, "duration": duration, "message_count": 30}],
+        "files": [{"path": "bag_0.mcap"} | span],
         "custom_data": None,
         "ros_distro": "jazzy",
     }
     endless = {"sec": 9223372036, "nsec": 854775807}
-    assert topics[1] == {
-        "topic_metadata": {
-            "name": "/number",
-            "type": "std_msgs/msg/Float64",
-            "serialization_format": "cdr",
-            "offered_qos_profiles": [
-                {
-                    "history": "keep_last",
-                    "depth": 5,
-                    "reliability": "best_effort",
-                    "durability": "volatile",
-                    "deadline": endless,
-                    "lifespan": endless,
-                    "liveliness": "automatic",
-                    "liveliness_lease_duration": endless,
-                    "avoid_ros_namespace_conventions": False,
-                }
-            ],
-            "type_description_hash": TYPES.hash_rihs01("std_msgs/msg/Float64"),
-        },
-        "message_count": 10,
+    offered = {
+        "history": "keep_last",
+        "depth": 5,
+        "reliability": "best_effort",
+        "durability": "volatile",
+        "deadline": endless,
+        "lifespan": endless,
+        "liveliness": "automatic",
+        "liveliness_lease_duration": endless,
+        "avoid_ros_namespace_conventions": False,
     }
+    topic = {
+        "name": "/number",
+        "type": "std_msgs/msg/Float64",
+        "serialization_format": "cdr",
+        "offered_qos_profiles": [offered],
+        "type_description_hash": TYPES.hash_rihs01("std_msgs/msg/Float64"),
+    }
+    assert {"topic_metadata": topic, "message_count": 10} in topics
 
 
 def test_qos_of_older_bags_is_read():
@@ -252,15 +237,11 @@ def test_a_request_matches_every_offer_and_the_offer_every_request(offers):
 def test_a_bag_is_continued_in_its_next_file(tmp_path):
     stored = messages(90)
     for part in range(3):
-        write(tmp_path / "bag", stored[30 * part : 30 * part + 30], resume=True)
-    assert [path.name for path in sorted((tmp_path / "bag").iterdir())] == [
-        "bag_0.mcap",
-        "bag_1.mcap",
-        "bag_2.mcap",
-        "metadata.yaml",
-    ]
+        write(tmp_path / "bag", stored[part::3], resume=True)  # files of one time
+    names = [path.name for path in sorted((tmp_path / "bag").iterdir())]
+    assert names == ["bag_0.mcap", "bag_1.mcap", "bag_2.mcap", "metadata.yaml"]
     assert read(tmp_path / "bag") == stored
-    assert rosbags_read(tmp_path / "bag") == stored
+    assert sorted(rosbags_read(tmp_path / "bag")) == sorted(stored)
     information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert information["message_count"] == 90
     assert [file["message_count"] for file in information["files"]] == [30, 30, 30]
@@ -274,27 +255,23 @@ def test_continuing_closes_what_was_cut_off(tmp_path):
     before = read(tmp_path / "bag")
     assert 0 < len(before) <= 60
     write(tmp_path / "bag", stored[60:], resume=True)
-    assert read(tmp_path / "bag") == before + stored[60:]
     assert rosbags_read(tmp_path / "bag") == before + stored[60:]
     with BagReader(tmp_path / "bag") as reader:
-        assert reader.warnings == [] and reader.whole
+        assert reader.warnings == []
 
 
-def test_a_file_that_is_not_listed_yet_is_read(tmp_path):
+def test_what_the_listing_leaves_out_or_has_too_much_is_named(tmp_path):
     stored = messages(60)
     write(tmp_path / "bag", stored[:30])
-    listing = (tmp_path / "bag" / "metadata.yaml").read_bytes()
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    first = metadata.read_bytes()
     write(tmp_path / "bag", stored[30:], resume=True)
-    (tmp_path / "bag" / "metadata.yaml").write_bytes(listing)
+    both = metadata.read_bytes()
+    metadata.write_bytes(first)
     with BagReader(tmp_path / "bag") as reader:
         assert [found.cdr for found in reader.messages()] == [item[1] for item in stored]
         assert any("bag_1.mcap" in warning for warning in reader.warnings)
-
-
-def test_a_listed_file_that_is_missing_is_named(tmp_path):
-    stored = messages(60)
-    for part in range(2):
-        write(tmp_path / "bag", stored[30 * part : 30 * part + 30], resume=True)
+    metadata.write_bytes(both)
     (tmp_path / "bag" / "bag_0.mcap").unlink()
     with BagReader(tmp_path / "bag") as reader:
         assert [found.cdr for found in reader.messages()] == [item[1] for item in stored[30:]]
@@ -336,25 +313,23 @@ def test_a_file_cut_anywhere_opens_with_a_prefix_of_its_messages(tmp_path, compr
             assert found == stored[: len(found)], f"cut at {size}"
             assert len(found) >= longest, f"cut at {size}: fewer messages than in a shorter file"
             assert reader.message_count == len(found)
-            assert reader.warnings and not reader.whole and "cut off" in reader.warnings[0], f"cut at {size}"
+            assert reader.warnings and "cut off" in reader.warnings[0], f"cut at {size}"
         longest = len(found)
     assert longest == len(stored)
 
 
-@pytest.mark.parametrize("compression", ["zstd", "none"])
-def test_a_cut_file_is_closed_without_losing_a_message(tmp_path, compression):
+def test_a_cut_file_is_closed_without_losing_a_message(tmp_path):
     stored = messages(40)
-    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
+    data = write(tmp_path / "bag", stored, chunk_bytes=900, compression="none").read_bytes()
     folder = tmp_path / "cut"
     folder.mkdir()
     for size in offsets(len(data))[::12]:
         (folder / "cut_0.mcap").write_bytes(data[:size])
-        (folder / "metadata.yaml").unlink(missing_ok=True)
         before = read(folder)
         with recover(folder) as reader:
-            assert reader.warnings == [] and reader.whole, f"cut at {size}"
-            assert [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()] == before
-        assert rosbags_read(folder) == before, f"cut at {size}"
+            assert reader.warnings == [], f"cut at {size}"
+        assert read(folder) == rosbags_read(folder) == before, f"cut at {size}"
+        (folder / "metadata.yaml").unlink()
 
 
 def test_what_is_missing_of_a_cut_chunk_is_said(tmp_path):
@@ -376,7 +351,7 @@ def test_flipped_bits_never_bring_up_a_message_that_was_not_written(tmp_path, co
     data = write(tmp_path / "bag", stored, chunk_bytes=900, compression=compression).read_bytes()
     if not closed:
         # Up to the last chunk, as after kill -9.
-        data = data[: data.index(b"serialized_metadata") - 40]
+        data = data[: int.from_bytes(data[-28:-20], "little") - 13]
     path = tmp_path / "flipped.mcap"
     generator = random.Random(20)
     whole = 0
@@ -393,7 +368,7 @@ def test_flipped_bits_never_bring_up_a_message_that_was_not_written(tmp_path, co
                 assert found == [item for item in stored if item in found]
                 assert not lost or reader.warnings
         except BagError as error:
-            assert "not an mcap file" in str(error)
+            assert any(text in str(error) for text in ("not an mcap file", "nothing in it can be read"))
         else:
             whole += not lost
     assert 0 < whole < count
@@ -407,43 +382,26 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path):
     path.write_bytes(data)
     with BagReader(tmp_path / "bag") as reader:
         found = [item.cdr for item in reader.messages()]
-        assert len(reader.warnings) == 1 and "damaged chunk at byte" in reader.warnings[0]
-        list(reader.messages())
-        assert len(reader.warnings) == 1, "said once, however often it is read"
-        reader_message_count = reader.message_count
+        assert [item.cdr for item in reader.messages()] == found
+        (warning,) = reader.warnings  # said once, however often it is read
+        assert reader.message_count == len(stored), "the index still tells how many there were"
     lost = [item[1] for item in stored if item[1] not in found]
     assert stored[12][1] in lost and 0 < len(lost) < 20
-    assert reader_message_count == len(stored), "the index still tells how many there were"
-
-
-def test_verify_finds_the_damage_without_reading_messages(tmp_path):
-    stored = messages(40)
-    path = write(tmp_path / "bag", stored, chunk_bytes=900, compression="none")
-    data = bytearray(path.read_bytes())
-    data[data.index(stored[20][1])] ^= 255
-    path.write_bytes(data)
-    with BagReader(path) as reader:
-        reader.verify()
-        assert reader.warnings
+    assert "damaged chunk at byte" in warning and f"with {len(lost)} message(s), 1." in warning
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.binary(max_size=300))
-def test_any_bytes_after_the_magic_are_no_crash(data):
+@given(st.builds(struct.Struct("<BQ").pack, st.integers(0, 255), st.integers(0, 2**64 - 1)) | st.just(b""), st.binary())
+def test_any_bytes_after_the_magic_are_no_crash(head, data):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "random.mcap"
-        path.write_bytes(b"\x89MCAP0\r\n" + data)
-        with BagReader(path) as reader:
-            list(reader.messages())
-            assert reader.warnings
-
-
-def test_a_record_that_claims_to_be_huge_is_no_crash(tmp_path):
-    path = tmp_path / "huge.mcap"
-    for opcode in range(256):
-        path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", opcode, 2**63 + 5) + bytes(100))
-        with BagReader(path) as reader:
-            assert list(reader.messages()) == [] and reader.warnings
+        path.write_bytes(b"\x89MCAP0\r\n" + head + data)
+        try:
+            with BagReader(path) as reader:
+                list(reader.messages())
+                assert reader.warnings
+        except BagError as error:
+            assert "nothing in it can be read" in str(error)
 
 
 def test_what_is_no_recording_is_one_line(tmp_path):
@@ -480,16 +438,14 @@ def test_a_folder_that_is_there_is_refused(tmp_path):
 
 @pytest.mark.parametrize("option", ["overwrite", "resume"])
 def test_a_folder_that_is_no_bag_is_never_touched(tmp_path, option):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter.txt").write_text("precious")
+    (tmp_path / "chapter.txt").write_text("precious")
     with pytest.raises(BagError, match="no bag"):
-        BagWriter(tmp_path / "thesis", **{option: True})
-    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "precious"
+        BagWriter(tmp_path, **{option: True})
+    assert (tmp_path / "chapter.txt").read_text() == "precious"
 
 
 def test_two_writers_do_not_share_a_bag(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/text", "std_msgs/msg/String")
+    with BagWriter(tmp_path / "bag"):
         with pytest.raises(BagError, match="another process"):
             BagWriter(tmp_path / "bag", resume=True)
         with pytest.raises(BagError, match="another process"):
@@ -520,23 +476,17 @@ def test_what_cannot_be_written_is_an_error(tmp_path):
 
 
 def test_an_unfinished_bag_holds_what_was_flushed(tmp_path):
-    stored = messages(20)
-    with BagWriter(tmp_path / "bag", flush_interval_s=3600.0) as writer:
-        for topic, (kind, qos) in TOPICS.items():
-            writer.add_topic(topic, kind, qos)
-        for item in stored[:10]:
-            writer.write(*item)
-        assert read(tmp_path / "bag") == []
-        writer.flush()
-        for item in stored[10:]:
-            writer.write(*item)
-        assert read(tmp_path / "bag") == stored[:10]
-    with BagWriter(tmp_path / "eager", flush_interval_s=0.0) as writer:
-        for topic, (kind, qos) in TOPICS.items():
-            writer.add_topic(topic, kind, qos)
-        for count, item in enumerate(stored, start=1):
-            writer.write(*item)
-            assert read(tmp_path / "eager") == stored[:count]
+    stored = messages(10)
+    for interval_s, held in ((3600.0, 0), (0.0, 10)):
+        path = tmp_path / f"bag{held}"
+        with BagWriter(path, flush_interval_s=interval_s) as writer:
+            for topic, (kind, qos) in TOPICS.items():
+                writer.add_topic(topic, kind, qos)
+            for item in stored:
+                writer.write(*item)
+            assert read(path) == stored[:held]
+            writer.flush()
+            assert read(path) == stored[:10]
 
 
 WRITE_FOREVER = """
@@ -576,7 +526,7 @@ import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 from small_bags import TOPICS, messages
 from body_tracking.recording.rosbag2 import BagError, BagWriter
-writer = BagWriter(sys.argv[1], flush_interval_s=0.0, compression="none")
+writer = BagWriter(sys.argv[1], flush_interval_s=0.0)
 for topic, (kind, qos) in TOPICS.items():
     writer.add_topic(topic, kind, qos)
 try:
@@ -601,7 +551,3 @@ def test_a_full_disk_is_an_error_and_costs_nothing_written_before(tmp_path):
     assert "bag_0.mcap" in text
     found = read(tmp_path / "bag")
     assert len(found) == int(count) > 10 and found == messages(int(count))
-
-
-def test_sensor_data_is_the_usual_profile():
-    assert (SENSOR_DATA.reliability, SENSOR_DATA.durability, SENSOR_DATA.depth) == ("best_effort", "volatile", 5)
