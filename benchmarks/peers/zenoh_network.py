@@ -278,16 +278,18 @@ class Pair:
         status = Path(f"/proc/{self.receiver.pid}/status").read_text()
         return int(status.split("VmRSS:")[1].split()[0]) / 1e3
 
-    def figures(self, skip: float = 3.0, cuts: Sequence[tuple[float, float]] = ()) -> dict[str, Any]:
-        """Loss, delay and clock from some seconds after the start on, beside cuts."""
+    def figures(self, watch: Watch, cuts: Sequence[tuple[float, float]]) -> dict[str, Any]:
+        """Loss, delay and clock from three seconds after the start on, beside cuts and stalls of the machine."""
         sent = np.array([row for each in self.sent for row in each["rows"]], dtype=np.int64)
         rows = np.array([row for each in self.received for row in each["rows"]], dtype=np.int64).reshape(-1, 3)
 
         def use(wall_ns: Any) -> Any:
             wall = wall_ns / 1e9
-            good = (wall > sent[0, 1] / 1e9 + skip) & (wall < sent[-1, 1] / 1e9 - 1.0)
+            good = (wall > sent[0, 1] / 1e9 + 3.0) & (wall < sent[-1, 1] / 1e9 - 1.0)
             for begin, end in cuts:
                 good &= (wall < begin - 0.1) | (wall > end + 3.0)
+            for begin, end in watch.stalls:
+                good &= (wall < begin) | (wall > end)
             return good
 
         by_index = dict(sent.tolist())
@@ -297,6 +299,7 @@ class Pair:
         error = (rows[good, 1] - when[good]) / 1e6
         count = int(use(sent[:, 1]).sum())
         return {
+            "frames": count,
             "lost_percent": round(100.0 * (1.0 - good.sum() / count), 2),
             "delay_ms": [round(float(np.percentile(delay, q)), 2) for q in (50, 99, 100)],
             "later_than_33_ms_percent": round(100.0 * float((delay > 33.3).mean()), 2),
@@ -335,22 +338,30 @@ def pairs(kinds: Sequence[str], far: Sequence[str] | None) -> Iterator[list[Pair
 
 
 class Watch(threading.Thread):
-    """How late this process wakes up, ms: the machine's part in every delay. Above 5 ms (99 %) a run is void."""
+    """Finds when the machine stands still for everybody: this process wakes up more than 10 ms late.
+
+    Attributes:
+        stalls: wall times between which frames do not count, from the stall until half a second later.
+    """
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
-        self._late: list[float] = []
+        self.stalls: list[tuple[float, float]] = []
+        self.late_ms: list[float] = []
         self.start()
 
     def run(self) -> None:
         while True:
-            before = time.monotonic()
+            before = time.time()
             time.sleep(0.01)
-            self._late.append(1e3 * (time.monotonic() - before - 0.01))
+            after = time.time()
+            self.late_ms.append(1e3 * (after - before - 0.01))
+            if after - before > 0.02:
+                self.stalls.append((before - 0.1, after + 0.5))
 
     def figures(self) -> dict[str, Any]:
-        late = [round(float(np.percentile(self._late, q)), 2) for q in (50, 99, 100)]
-        return {"woken_late_ms": late, "void": late[1] > 5.0, "load": os.getloadavg()[0]}
+        late = [round(float(np.percentile(self.late_ms, q)), 2) for q in (50, 99, 100)]
+        return {"woken_late_ms": late, "stalls": len(self.stalls), "load": os.getloadavg()[0]}
 
 
 def link(loss: str = "0", seconds: str = "20", *lengths: str) -> dict[str, Any]:
@@ -369,7 +380,7 @@ def link(loss: str = "0", seconds: str = "20", *lengths: str) -> dict[str, Any]:
         for pair in made:
             pair.stop("sender")
             pair.stop("receiver")
-        return result | {pair.kind: pair.figures(cuts=cuts) for pair in made}
+        return result | {pair.kind: pair.figures(watch, cuts) for pair in made}
 
 
 def restart() -> dict[str, Any]:

@@ -13,6 +13,7 @@ package body_tracking). A receiver, network or sensor that is absent is waited f
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import ipaddress
 import os
@@ -348,15 +349,10 @@ def run() -> None:
         raise SenderError(f"--to {args.to}: expected HOST:PORT")
     protocol.sensor_bytes(args.sensor)
     key = protocol.read_key(args.key_file) if args.key_file else protocol.NO_KEY
-    source = Replay(args) if args.replay else Kinect()
-    try:
-        sender = Sender(args.sensor, host.strip("[]"), int(port), key)
-        try:
-            stream(sender, source)
-        finally:
-            sender.close()
-    finally:
-        source.close()
+    with contextlib.ExitStack() as stack:
+        source = stack.enter_context(contextlib.closing(Replay(args) if args.replay else Kinect()))
+        sender = stack.enter_context(contextlib.closing(Sender(args.sensor, host.strip("[]"), int(port), key)))
+        stream(sender, source)
 
 
 def main() -> int:
