@@ -199,6 +199,7 @@ def body(index: int) -> Body:
 def send(kind: str, host: str, first: int, folder: Path, out: Path) -> None:
     """Until SIGINT: a frame each thirtieth of a second; then when each was sent, by the wall."""
     rows = []
+    print("started", flush=True)
     began = time.time()
     sender: Any = (
         Sender(SENSOR, host, PORTS[kind], protocol.read_key(str(folder / "key")))
@@ -262,14 +263,21 @@ class Pair:
     def start_sender(self) -> None:
         before = [] if self.far is None else [*self.far, *hosts.command("shift", SHIFT)]
         self.sender = self._start("send", before, self.first, self.folder, self.folder / f"{self.kind}.sent")
+        self.sender.stdout.readline()  # type: ignore[union-attr]
         self.first += 10_000
 
     def stop(self, name: str) -> dict[str, Any]:
         """End one of the two; its report."""
         process, file = (self.sender, "sent") if name == "sender" else (self.receiver, "received")
+        path = self.folder / f"{self.kind}.{file}"
+        path.unlink(missing_ok=True)
         process.send_signal(signal.SIGINT)
-        process.wait(20.0)
-        report: dict[str, Any] = json.loads((self.folder / f"{self.kind}.{file}").read_text())
+        try:
+            process.wait(10.0)
+            report: dict[str, Any] = json.loads(path.read_text())
+        except subprocess.TimeoutExpired:  # it still waits for a connection
+            process.kill()
+            report = {"rows": [], "began": None, "cpu_s": 0.0, "s": 0.0}
         getattr(self, file).append(report)
         return report
 
@@ -413,12 +421,12 @@ def hostile(*kinds: str) -> dict[str, Any]:
     result: dict[str, Any] = {}
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     for kind in kinds or KINDS:
-        for method in ("none", *ATTACKS[kind]):
+        for method in ATTACKS[kind]:
             with pairs([kind], None) as (pair,):
                 time.sleep(4.0)
                 before, begin = pair.memory(), time.time()
                 used = _cpu(pair.receiver.pid)
-                command = [sys.executable, __file__, "attack", method, str(PORTS[kind]), "25", str(pair.folder)]
+                command = [sys.executable, __file__, "attack", kind, method, "25", str(pair.folder)]
                 attacker = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": "."})
                 watch = Watch()
                 time.sleep(15.0)
@@ -427,27 +435,30 @@ def hostile(*kinds: str) -> dict[str, Any]:
                 files = len(list(Path(f"/proc/{pair.receiver.pid}/fd").iterdir()))
                 pair.stop("sender")
                 pair.start_sender()
+                anew = time.time()
                 out, _ = attacker.communicate()
                 time.sleep(1.0)
                 pair.stop("sender")
                 last = pair.stop("receiver")
-                rows = np.array(last["rows"])
+                rows = np.array(last["rows"], dtype=np.int64).reshape(-1, 3)
                 sent = np.array(pair.sent[0]["rows"])
                 sent = sent[(sent[:, 1] > (begin + 1.0) * 1e9)]
                 when = dict(sent.tolist())
-                delays = [(row[2] - when[row[0]]) / 1e6 for row in rows.tolist() if row[0] in when]
+                delays = [
+                    ((row[2] - when[row[0]]) / 1e6, when[row[0]] / 1e9) for row in rows.tolist() if row[0] in when
+                ]
+                calm = [delay for delay, at in delays if not any(a < at < b for a, b in watch.stalls)]
                 again = rows[rows[:, 0] >= 10_000, 2]
                 result[f"{kind}, {method}"] = {
                     "machine": machine,
                     "attempts": json.loads(out),
                     "lost_percent": round(100.0 * (1.0 - len(delays) / len(sent)), 2),
-                    "delay_ms": [round(float(np.percentile(delays, q)), 2) for q in (50, 99, 100)] if delays else None,
+                    "calm_frames": len(calm),
+                    "delay_ms": [round(float(np.percentile(calm, q)), 2) for q in (50, 99, 100)] if calm else None,
                     "receiver_cpu_percent": round(100.0 * used, 1),
                     "memory_grew_mb": round(grown, 1),
                     "open_files": files,
-                    "new_sender_after_s": round(float(again[0]) / 1e9 - pair.sent[1]["began"], 2)
-                    if len(again)
-                    else None,
+                    "new_sender_after_s": round(float(again[0]) / 1e9 - anew, 2) if len(again) else None,
                 }
                 print(json.dumps({f"{kind}, {method}": result[f"{kind}, {method}"]}), file=sys.stderr)
     return result
@@ -461,78 +472,59 @@ def _cpu(process: int) -> float:
 # --- strangers
 
 
-def attack(method: str, port: int, seconds: float, folder: Path) -> dict[str, float]:
+ATTACKS = {
+    "own": {"none": 0, "forged packets": 5000, "random packets": 5000},
+    "tls": {"none": 0, "garbage": 200, "half-open": 50, "half a handshake": 50, "no certificate": 20},
+    "quic": {"none": 0, "random packets": 5000, "first packets of real clients": 5000},
+}
+"""Of each transport the attacks and their rate, 1/s."""
+
+
+def attack(kind: str, method: str, seconds: float, folder: Path) -> dict[str, float]:
     """Disturb a receiver; what was done."""
-    numbers, end, done = random.Random(1), time.monotonic() + seconds, 0
-    udp = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(50)]
-    header = Header(protocol.FRAME, SENSOR, 1, 1, 0)
-    forged = protocol.pack_frame(Frame(0, (body(1),)), header, b"another key another key")
-    if method == "first packets of real clients":
+    numbers, rate, to = random.Random(1), ATTACKS[kind][method], ("127.0.0.1", PORTS[kind])
+    packets = [numbers.randbytes(numbers.randrange(1, 1400)) for _ in range(200)]
+    if method == "forged packets":
+        header, key = Header(protocol.FRAME, SENSOR, 1, 1, 0), b"another key another key"
+        frame = protocol.pack_frame(Frame(0, (body(1),)), header, key)
+        answer = protocol.pack_clock(ClockTimes(1, 2, 3), header._replace(kind=protocol.CLOCK_ANSWER), key)
+        packets = [frame, frame[:200], frame + bytes(4000), answer]
+    elif method == "first packets of real clients":
         packets = _first_datagrams(folder)
-    elif method == "forged packets":
-        packets = [
-            forged,
-            forged[:200],
-            b"\0" * 700,
-            forged + b"\0" * 4000,
-            protocol.pack_clock(
-                ClockTimes(1, 2, 3), header._replace(kind=protocol.CLOCK_ANSWER), b"another key another key"
-            ),
-        ]
-    else:
-        packets = [numbers.randbytes(numbers.randrange(1, 1400)) for _ in range(200)]
-    kept: deque[socket.socket] = deque()
-    refused = 0
-    greeting = _client_hello() if method == "half a handshake" else b""
-    began = time.monotonic()
-    while time.monotonic() < end:
-        rate = {"half-open": 50, "half a handshake": 50, "garbage": 200, "no certificate": 20}.get(method, 5000)
-        if method == "none":
-            time.sleep(0.5)
-            continue
-        if done >= rate * (time.monotonic() - began):
+    udp = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(50)]
+    kept: deque[socket.socket] = deque(maxlen=900)
+    began, done = time.monotonic(), 0
+    while (passed := time.monotonic() - began) < seconds:
+        if done >= rate * passed:
             time.sleep(0.001)
             continue
         done += 1
-        if method in ("forged packets", "random packets", "first packets of real clients"):
-            numbers.choice(udp).sendto(numbers.choice(packets), ("127.0.0.1", port))
-            continue
-        try:
-            made = socket.create_connection(("127.0.0.1", port), timeout=0.5)
-        except OSError:
-            refused += 1
+        if kind != "tls":
+            numbers.choice(udp).sendto(numbers.choice(packets), to)
             continue
         with contextlib.suppress(OSError):
+            made = socket.create_connection(to, timeout=0.5)
             if method == "garbage":
-                made.sendall(numbers.randbytes(500))
+                made.sendall(numbers.choice(packets))
                 made.close()
             elif method == "no certificate":
-                context = ssl.create_default_context()
-                context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-                made = context.wrap_socket(made)
-                made.sendall(b"x" * 100)
-                made.close()
+                _stranger().wrap_socket(made).sendall(b"x" * 100)
             else:
-                made.sendall(greeting)
+                made.sendall(_client_hello() if method == "half a handshake" else b"")
                 kept.append(made)  # and is silent
-                if len(kept) > 900:
-                    kept.popleft().close()
-    return {"a second": round(done / (time.monotonic() - began)), "connections refused": refused, "open": len(kept)}
+    return {"a second": round(done / seconds), "open": len(kept)}
 
 
-ATTACKS = {
-    "own": ("forged packets", "random packets"),
-    "tls": ("garbage", "half-open", "half a handshake", "no certificate"),
-    "quic": ("random packets", "first packets of real clients"),
-}
+def _stranger() -> ssl.SSLContext:
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
 
 
 def _client_hello() -> bytes:
     out = ssl.MemoryBIO()
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with contextlib.suppress(ssl.SSLWantReadError):
-        context.wrap_bio(ssl.MemoryBIO(), out, server_hostname="127.0.0.1").do_handshake()
+        _stranger().wrap_bio(ssl.MemoryBIO(), out, server_hostname="127.0.0.1").do_handshake()
     return out.read()
 
 
@@ -560,7 +552,7 @@ def main() -> None:
     elif what == "receive":
         receive(words[0], words[1], Path(words[2]), Path(words[3]))
     elif what == "attack":
-        print(json.dumps(attack(words[0], int(words[1]), float(words[2]), Path(words[3]))), flush=True)
+        print(json.dumps(attack(words[0], words[1], float(words[2]), Path(words[3]))), flush=True)
         os._exit(0)
     elif "--inside" not in words:
         inside = hosts.in_own_network([sys.executable, __file__, what, "--inside", *words])
