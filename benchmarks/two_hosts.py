@@ -159,7 +159,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     up = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", options.filter, "--sensors", ",".join(names)]
     up += ["--params-file", str(parameters), "--calibration", str(folder / "received.yaml")]
     up += ["--record", str(folder / "live"), "--log-dir", str(folder), "--reliable"]
-    with hosts.hosts() as (outside, middle), contextlib.ExitStack() as stack:
+    with hosts.hosts(link.loss, link.jitter) as (outside, middleman), contextlib.ExitStack() as stack:
 
         def begin(name: str, command: Sequence[str]) -> subprocess.Popen[bytes]:
             with (folder / f"{name}.log").open("wb") as log:
@@ -167,7 +167,6 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
             stack.callback(_stop, made)
             return made
 
-        middleman = begin("relay", [*middle, *hosts.command("relay", link.loss, link.jitter, *ports.values())])
         graph_process = begin("up", up)
         # The sensors' nodes come last, when everybody listens to whom they should.
         end = time.monotonic() + READY_TIMEOUT
@@ -183,7 +182,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
         senders = {}
         for name in names:
             words = [*sender, "--replay", str(folder / "bag"), "--sensor", name, "--key-file", str(key)]
-            words += ["--to", f"{hosts.RELAY_OUT}:{ports[name]}", "--start-time", repr(start)]
+            words += ["--to", f"{hosts.INSIDE}:{ports[name]}", "--start-time", repr(start)]
             senders[name] = begin(name, [*outside, *hosts.command("shift", options.shift, *words)])
         while time.time() < start + recording.duration + 1.0:
             if graph_process.poll() is not None or middleman.poll() is not None:

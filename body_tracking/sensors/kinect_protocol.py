@@ -1,7 +1,7 @@
-"""What goes over the wire between a computer with a Kinect v2 and this one: UDP datagrams of a fixed, versioned layout.
+"""The UDP packets between a computer with a Kinect v2 and this one: a fixed, versioned, signed layout.
 
-Needs nothing but Python's standard library (3.8 or newer), so that this file and ``kinect_sender.py`` run as they are
-on a Windows computer without ROS, numpy and this package.
+Needs only Python's standard library (3.8 or newer), so that this file and ``kinect_sender.py`` run as they are on a
+Windows computer without ROS, numpy and this package.
 
 Every packet is little-endian: header, content, HMAC-SHA256 (RFC 2104, all 32 bytes) of everything before it.
 
@@ -25,10 +25,8 @@ joints in the SDK's order: position (3 float32, metres, Kinect camera space), or
 times 32767, zeros where the SDK has none), tracking state (uint8) and a zero byte.
 
 Clock messages are those of NTP (RFC 5905, section 8): a request holds t1, its answer t1, t2 and t3 (int64, ns), where
-t1 is by the clock of the asking side, and t2 and t3, receipt of the request and sending of the answer, by that of the
-sender of frames. An answer repeats the sender's session and the random number of the request: whoever has received a
-right one knows that this session is alive now, and not one that somebody recorded. A receiver takes no frame of a
-session before.
+t1 is by the clock of the receiver of frames, and t2 and t3, receipt of the request and sending of the answer, by that
+of their sender. An answer repeats session and random number of the request, which proves that the session is alive.
 
 A frame of one body has 690 bytes, one of two still fits into one Ethernet frame; six make 3.5 kB, which IP fragments.
 """
@@ -41,14 +39,12 @@ import math
 import os
 import stat
 import struct
-from collections import OrderedDict
 from pathlib import Path
 from typing import NamedTuple
 
 VERSION = 1
 MAGIC = b"BTKS"
 DEFAULT_PORT = 7525
-
 FRAME, CLOCK_REQUEST, CLOCK_ANSWER = 1, 2, 3
 
 N_JOINTS = 25
@@ -57,7 +53,7 @@ LEAST_KEY = 16
 """Bytes of the shortest key."""
 
 NO_KEY = b""
-"""Signs packets that never leave the machine: they are checked for damage, and anybody can make them."""
+"""Signs packets that never leave the machine: the signature finds damage, and anybody can make it."""
 
 _HEADER = struct.Struct("<4sBBH32sQQq")
 _FRAME = struct.Struct("<qBBxx4f")
@@ -71,23 +67,19 @@ _BODY_SIZE = _BODY.size + N_JOINTS * _JOINT.size
 
 MIN_PACKET = _HEADER.size + _CLOCK.size + _TAG
 MAX_PACKET = _HEADER.size + _FRAME.size + MAX_BODIES * _BODY_SIZE + _TAG
-"""Bytes; a receiver reads one more to know a larger packet."""
+"""Bytes; a receiver reads one more, by which it knows a larger packet."""
 
 
 class ProtocolError(ValueError):
-    """A packet, name or key that is none.
+    """Raised for an invalid packet, name or key; ``reason`` is one of a few words, by which refusals are counted."""
 
-    Attributes:
-        reason: one of a few words, to be counted; the text says more.
-    """
-
-    def __init__(self, reason: str, text: str = "") -> None:
-        super().__init__(text or reason)
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
         self.reason = reason
 
 
 class Header(NamedTuple):
-    """What every packet begins with; ``kind`` and the rest as in the table above."""
+    """The header of the table above, without what is constant."""
 
     kind: int
     sensor: str
@@ -97,7 +89,7 @@ class Header(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A body as the SDK tells it.
+    """A body of the SDK.
 
     Attributes:
         sdk_index: 0 to 5.
@@ -115,13 +107,13 @@ class Body(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What a sensor sees at one instant.
+    """The bodies that a sensor sees at one instant.
 
     Attributes:
         time_ns: by the sensor's own clock.
         bodies: none to six.
         floor: (x, y, z, w) of the plane ``x X + y Y + z Z + w = 0`` in camera space, metres, or None.
-        silent: the sender is there, and its sensor delivers nothing; then there are no bodies, and no time.
+        silent: the sender runs, and its sensor delivers nothing; then there are no bodies, and no time.
     """
 
     time_ns: int
@@ -145,7 +137,7 @@ def pack_frame(frame: Frame, header: Header, key: bytes) -> bytes:
     """A packet of kind FRAME.
 
     Raises:
-        ProtocolError: it cannot be written: too many bodies, another number of joints, a name that is none.
+        ProtocolError: too many bodies, another number of joints, an invalid name.
     """
     if len(frame.bodies) > MAX_BODIES:
         raise ProtocolError("bodies", f"{len(frame.bodies)} bodies, expected at most {MAX_BODIES}")
@@ -155,9 +147,9 @@ def pack_frame(frame: Frame, header: Header, key: bytes) -> bytes:
         if not len(body.positions) == len(body.states) == len(body.orientations) == N_JOINTS:
             raise ProtocolError("joints", f"a body of {len(body.positions)} joints, expected {N_JOINTS}")
         parts.append(_BODY.pack(body.sdk_index, body.tracking_id))
-        for k in range(N_JOINTS):
-            orientation = [_short(value) for value in body.orientations[k]]
-            parts.append(_JOINT.pack(*body.positions[k], *orientation, body.states[k]))
+        parts += [
+            _JOINT.pack(*body.positions[k], *map(_short, body.orientations[k]), body.states[k]) for k in range(N_JOINTS)
+        ]
     return _packet(header._replace(kind=FRAME), b"".join(parts), key)
 
 
@@ -165,7 +157,7 @@ def pack_clock(times: ClockTimes, header: Header, key: bytes) -> bytes:
     """A packet of kind CLOCK_REQUEST or CLOCK_ANSWER, as the header says.
 
     Raises:
-        ProtocolError: a name that is none.
+        ProtocolError: an invalid name.
     """
     return _packet(header, _CLOCK.pack(*times), key)
 
@@ -175,21 +167,21 @@ def _short(value: float) -> int:
 
 
 def _packet(header: Header, content: bytes, key: bytes) -> bytes:
-    name = sensor_bytes(header.sensor)
+    kind, sensor, *numbers = header
     size = _HEADER.size + len(content) + _TAG
-    head = _HEADER.pack(MAGIC, VERSION, header.kind, size, name, header.session, header.sequence, header.sent_ns)
-    return head + content + _tag(head + content, key)
+    data = _HEADER.pack(MAGIC, VERSION, kind, size, sensor_bytes(sensor), *numbers) + content
+    return data + _tag(data, key)
 
 
 def _tag(data: bytes, key: bytes) -> bytes:
     return hmac.new(key, data, hashlib.sha256).digest()
 
 
-# --- reading; in this order, the cheap first
+# --- reading, in this order: cheap checks first
 
 
 def read_header(packet: bytes) -> Header:
-    """The header of a packet of whatever origin, of which nothing is believed yet.
+    """The header of a packet of whatever origin, whose signature is still to be checked.
 
     Raises:
         ProtocolError: too long or too short, not ours, another version, an unknown kind, another size than it says.
@@ -198,7 +190,7 @@ def read_header(packet: bytes) -> Header:
         raise ProtocolError("too large", f"a packet of more than {MAX_PACKET} bytes")
     if len(packet) < MIN_PACKET:
         raise ProtocolError("too short", f"{len(packet)} bytes, expected {MIN_PACKET} at least")
-    magic, version, kind, size, name, session, sequence, sent_ns = _HEADER.unpack_from(packet)
+    magic, version, kind, size, padded, *numbers = _HEADER.unpack_from(packet)
     if magic != MAGIC:
         raise ProtocolError("not ours", "not a packet of this protocol")
     if version != VERSION:
@@ -207,14 +199,16 @@ def read_header(packet: bytes) -> Header:
         raise ProtocolError("kind", f"kind {kind}")
     if size != len(packet) or (kind != FRAME and size != MIN_PACKET):
         raise ProtocolError("wrong size", f"{len(packet)} bytes of {size}")
-    return Header(kind, _name(name), session, sequence, sent_ns)
+    name = padded.rstrip(b"\0").decode("ascii", "replace")
+    sensor_bytes(name)
+    return Header(kind, name, *numbers)
 
 
 def check_signature(packet: bytes, key: bytes) -> None:
-    """Whether somebody with the key made this packet, as it is.
+    """Check that somebody with the key made this packet, as it is.
 
     Raises:
-        ProtocolError: no.
+        ProtocolError: the signature is another one.
     """
     if not hmac.compare_digest(_tag(packet[:-_TAG], key), packet[-_TAG:]):
         raise ProtocolError("wrong signature", "signed with another key, or changed on its way")
@@ -226,19 +220,16 @@ def read_frame(packet: bytes) -> Frame:
     Raises:
         ProtocolError: sizes that contradict each other, an index or a state out of range, an index twice.
     """
-    end = len(packet) - _TAG
-    if end < _HEADER.size + _FRAME.size:
+    at, end = _HEADER.size + _FRAME.size, len(packet) - _TAG
+    if end < at:
         raise ProtocolError("wrong size", f"a frame of {len(packet)} bytes")
     time_ns, flags, count, *floor = _FRAME.unpack_from(packet, _HEADER.size)
-    at = _HEADER.size + _FRAME.size
     if count > MAX_BODIES or end - at != count * _BODY_SIZE:
         raise ProtocolError("wrong size", f"{len(packet)} bytes for {count} bodies")
     bodies = []
-    for _ in range(count):
-        index, tracking_id = _BODY.unpack_from(packet, at)
-        at += _BODY.size
-        joints = list(_JOINT.iter_unpack(packet[at : at + N_JOINTS * _JOINT.size]))
-        at += N_JOINTS * _JOINT.size
+    for start in range(at, end, _BODY_SIZE):
+        index, tracking_id = _BODY.unpack_from(packet, start)
+        joints = list(_JOINT.iter_unpack(packet[start + _BODY.size : start + _BODY_SIZE]))
         states = tuple(joint[7] for joint in joints)
         if index >= MAX_BODIES or max(states) > 2:
             raise ProtocolError("out of range", f"body {index}, tracking state {max(states)}")
@@ -246,7 +237,7 @@ def read_frame(packet: bytes) -> Frame:
         bodies.append(Body(index, tracking_id, tuple(joint[:3] for joint in joints), states, orientations))
     if len({body.sdk_index for body in bodies}) < count:
         raise ProtocolError("out of range", "a body twice")
-    known = bool(flags & _FLOOR_KNOWN) and all(math.isfinite(value) for value in floor)
+    known = bool(flags & _FLOOR_KNOWN) and all(map(math.isfinite, floor))
     return Frame(time_ns, tuple(bodies), tuple(floor) if known else None, bool(flags & _SENSOR_SILENT))
 
 
@@ -270,29 +261,19 @@ def sensor_bytes(name: str) -> bytes:
     return data.ljust(32, b"\0")
 
 
-def _name(data: bytes) -> str:
-    name = data.rstrip(b"\0").decode("ascii", "replace")
-    try:
-        sensor_bytes(name)
-    except ProtocolError:
-        raise ProtocolError("sensor", "a sensor's name that is none") from None
-    return name
-
-
 def read_key(path: str) -> bytes:
     """The key in a file: its bytes without white space around them.
 
     Raises:
-        ProtocolError: no such file, one that others may read, or too short a key; the text never holds the key.
+        ProtocolError: no regular file, one that others may read, or too short a key; the text never holds the key.
     """
     try:
         mode = Path(path).stat().st_mode
         if not stat.S_ISREG(mode):
             raise ProtocolError("key", f"{path}: no regular file")
         if os.name == "posix" and mode & 0o077:
-            raise ProtocolError(
-                "key", f"{path}: others may read or write it (chmod 600 {path}); make a new key if they did"
-            )
+            text = f"{path}: others may read or write it (chmod 600 {path}); make a new key if they did"
+            raise ProtocolError("key", text)
         with Path(path).open("rb") as file:
             key = file.read(4096).strip()
     except OSError as error:
@@ -300,70 +281,3 @@ def read_key(path: str) -> bytes:
     if len(key) < LEAST_KEY:
         raise ProtocolError("key", f"{path}: a key of {len(key)} bytes, expected {LEAST_KEY} at least")
     return key
-
-
-# --- what protects a socket
-
-
-class RateLimit:
-    """A token bucket per source, of which only so many are kept: the one that was heard longest ago is forgotten.
-
-    Args:
-        rate: packets per second that a source may send for long.
-        burst: packets at once.
-        sources: how many are kept.
-    """
-
-    def __init__(self, rate: float, burst: float, sources: int = 256) -> None:
-        self._rate, self._burst, self._sources = rate, burst, sources
-        self._buckets: OrderedDict[object, tuple[float, int]] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._buckets)
-
-    def allows(self, source: object, now_ns: int) -> bool:
-        """Whether one more packet of a source is within its limit; the time must not run backwards."""
-        left, since_ns = self._buckets.pop(source, (self._burst, now_ns))
-        left = min(self._burst, left + (now_ns - since_ns) * 1e-9 * self._rate)
-        allowed = left >= 1.0
-        self._buckets[source] = (left - 1.0 if allowed else left, now_ns)
-        if len(self._buckets) > self._sources:
-            self._buckets.popitem(last=False)
-        return allowed
-
-
-class SequenceWindow:
-    """Which sequence numbers came: the newest one and a bit for each of those before it (RFC 4303, section 3.4.3).
-
-    Attributes:
-        newest: 0 before the first.
-        lost: numbers since the first one that have not come.
-    """
-
-    SIZE = 64
-
-    def __init__(self) -> None:
-        self.newest = 0
-        self.lost = 0
-        self._first = 0
-        self._seen = 0
-
-    def has(self, sequence: int) -> bool:
-        """Whether a number came before, as far as that is known."""
-        age = self.newest - sequence
-        return age >= 0 and (age >= self.SIZE or bool(self._seen >> age & 1))
-
-    def take(self, sequence: int) -> str:
-        """``new`` for one beyond all others, ``late`` for one that was missing, else ``replayed``."""
-        if sequence > self.newest:
-            self._first = self._first or sequence
-            step = sequence - self.newest if self.newest else 1
-            self.lost += step - 1
-            self._seen = ((self._seen << step) | 1) & ((1 << self.SIZE) - 1) if step < self.SIZE else 1
-            self.newest = sequence
-            return "new"
-        if self.has(sequence):
-            return "replayed"
-        self._seen |= 1 << self.newest - sequence
-        self.lost -= sequence > self._first
-        return "late"

@@ -7,12 +7,13 @@ install PyKinect2 (docs/sensors.md says which), and
     python kinect_sender.py --sensor kinect1 --to 192.168.1.20:7525 --key-file kinect.key
 
 The receiving computer needs the same key file. With --replay a recording takes the place of the sensor (needs the
-package body_tracking). What is absent, receiver, network or sensor, is waited for.
+package body_tracking). A receiver, network or sensor that is absent is waited for.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import ipaddress
 import os
@@ -34,12 +35,14 @@ else:  # a plain file beside kinect_protocol.py
 STATUS_PERIOD = 5.0
 RETRY_PERIOD = 2.0
 SILENT_AFTER, SILENT_PERIOD = 2.0, 0.5
-"""Seconds without a frame after which the receiver is told that the sensor is silent, and how often."""
+"""Seconds without a frame after which the receiver hears that the sensor is silent, and how often."""
 
-_REQUEST_RATE, _REQUEST_BURST = 100.0, 50.0
+_ANSWER_PERIOD_NS = 1_000_000
+"""Requests are answered once a millisecond at most; a receiver asks every 50 ms."""
+
 _POLL = 0.002
 _TICKS_NS = 100
-"""The SDK counts its ``RelativeTime`` in units of 100 ns."""
+"""Unit of the SDK's ``RelativeTime``, ns."""
 
 
 class SenderError(Exception):
@@ -57,6 +60,8 @@ def now_ns() -> int:
 class Kinect:
     """The sensor, by PyKinect2."""
 
+    ended = False
+
     def __init__(self) -> None:
         # PyKinect2 was last released in 2014 and uses names that have gone since from Python and numpy.
         try:
@@ -73,8 +78,6 @@ class Kinect:
             ) from error
         self._sensor: Any = None
 
-    ended = False
-
     def read(self, timeout: float) -> protocol.Frame | None:
         """The next frame; None when none is within the timeout, seconds."""
         try:
@@ -82,12 +85,11 @@ class Kinect:
                 self._sensor = self._runtime.PyKinectRuntime(self._api.FrameSourceTypes_Body)
             end = time.perf_counter() + timeout
             while time.perf_counter() < end:
-                if self._sensor.has_new_body_frame():
-                    seen = self._sensor.get_last_body_frame()
-                    if seen is not None:
-                        return self._frame(seen)
+                seen = self._sensor.get_last_body_frame() if self._sensor.has_new_body_frame() else None
+                if seen is not None:
+                    return self._frame(seen)
                 time.sleep(_POLL)
-        except Exception as error:  # whatever COM says when there is no sensor
+        except Exception as error:  # whatever COM raises without a sensor
             print(f"kinect_sender: the sensor cannot be read ({error}); trying again", file=sys.stderr)
             self._sensor = None
             time.sleep(timeout)
@@ -99,24 +101,19 @@ class Kinect:
             if not body.is_tracked:
                 continue
             joints = [body.joints[k] for k in range(protocol.N_JOINTS)]
+            positions = tuple((each.Position.x, each.Position.y, each.Position.z) for each in joints)
             turned = [body.joint_orientations[k].Orientation for k in range(protocol.N_JOINTS)]
-            bodies.append(
-                protocol.Body(
-                    index,
-                    int(body.tracking_id) % (1 << 64),
-                    tuple((joint.Position.x, joint.Position.y, joint.Position.z) for joint in joints),
-                    tuple(int(joint.TrackingState) for joint in joints),
-                    tuple((each.x, each.y, each.z, each.w) for each in turned),
-                )
-            )
+            orientations = tuple((each.x, each.y, each.z, each.w) for each in turned)
+            states = tuple(int(each.TrackingState) for each in joints)
+            tracking_id = int(body.tracking_id) % (1 << 64)
+            bodies.append(protocol.Body(index, tracking_id, positions, states, orientations))
         floor = seen.floor_clip_plane
-        plane = None if floor is None else (floor.x, floor.y, floor.z, floor.w)
-        # The SDK tells of no floor by a normal of zero.
-        known = plane is not None and any(plane[:3])
+        plane = (0.0,) if floor is None else (floor.x, floor.y, floor.z, floor.w)
+        known = any(plane[:3])  # the SDK marks an unknown floor by a normal of zero
         return protocol.Frame(int(seen.relative_time) * _TICKS_NS, tuple(bodies), plane if known else None)
 
     def close(self) -> None:
-        """Let go of the sensor."""
+        """Release the sensor."""
         if self._sensor is not None:
             self._sensor.close()
 
@@ -127,22 +124,15 @@ class Replay:
     def __init__(self, args: argparse.Namespace) -> None:
         try:
             importlib.import_module("body_tracking.recording.source")  # registers the backend
-            self._live: Any = importlib.import_module("body_tracking.sensors.live")
+            live: Any = importlib.import_module("body_tracking.sensors.live")
             self._kinect: Any = importlib.import_module("body_tracking.sensors.kinect")
-            self._errors: Any = importlib.import_module("body_tracking.errors")
+            errors: Any = importlib.import_module("body_tracking.errors")
         except ImportError as error:
             raise SenderError(f"--replay needs the package body_tracking ({error})") from error
-        settings = self._live.SourceSettings(
-            args.sensor,
-            file=args.replay,
-            recorded_sensor=args.recorded_sensor,
-            rate=args.rate,
-            loop=args.loop,
-            start_time=args.start_time,
-        )
+        how = {name: getattr(args, name) for name in ("recorded_sensor", "rate", "loop", "start_time")}
         try:
-            self._source: Any = self._live.open_source("recording", settings)
-        except self._errors.BodyTrackingError as error:
+            self._source: Any = live.open_source("recording", live.SourceSettings(args.sensor, file=args.replay, **how))
+        except errors.BodyTrackingError as error:
             raise SenderError(str(error)) from error
         self._rate = args.rate
         self._zero_ns = self._recorded_ns = self._last_ns = 0
@@ -161,22 +151,16 @@ class Replay:
         if not self._zero_ns or stamp_ns < self._last_ns:
             self._zero_ns, self._recorded_ns = now_ns(), stamp_ns
         self._last_ns = stamp_ns
-        time_ns = self._zero_ns + round((stamp_ns - self._recorded_ns) / self._rate)
         bodies = []
         for index, skeleton in enumerate(frame.skeletons[: protocol.MAX_BODIES]):
-            bodies.append(
-                protocol.Body(
-                    skeleton.body if skeleton.body < protocol.MAX_BODIES else index,
-                    skeleton.body,
-                    tuple(map(tuple, self._kinect.camera_space_to_optical(skeleton.positions).tolist())),
-                    tuple(skeleton.states.tolist()),
-                    ((0.0, 0.0, 0.0, 0.0),) * protocol.N_JOINTS,
-                )
-            )
-        return protocol.Frame(time_ns, tuple(bodies))
+            positions = tuple(map(tuple, self._kinect.camera_space_to_optical(skeleton.positions).tolist()))
+            sdk_index = skeleton.body if skeleton.body < protocol.MAX_BODIES else index
+            none = ((0.0, 0.0, 0.0, 0.0),) * protocol.N_JOINTS
+            bodies.append(protocol.Body(sdk_index, skeleton.body, positions, tuple(skeleton.states.tolist()), none))
+        return protocol.Frame(self._zero_ns + round((stamp_ns - self._recorded_ns) / self._rate), tuple(bodies))
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._source.close()
 
 
@@ -198,10 +182,9 @@ class Sender:
 
     def __init__(self, sensor: str, host: str, port: int, key: bytes) -> None:
         self._sensor, self._host, self._port, self._key = sensor, host, port, key
-        self._session = secrets.randbits(64)
-        self._sequence = 0
-        self._limit = protocol.RateLimit(_REQUEST_RATE, _REQUEST_BURST, 16)
-        self._lock = threading.Lock()
+        self._session, self._sequence = secrets.randbits(64), 0
+        self._answered: deque[int] = deque(maxlen=256)
+        self._next_answer_ns = 0
         self._socket: socket.socket | None = None
         self._address: Any = None
         self._retry_at = 0.0
@@ -212,7 +195,7 @@ class Sender:
         threading.Thread(target=self._answer, daemon=True).start()
 
     def _open(self) -> None:
-        """Look the receiver up and make a socket; what fails is tried again later."""
+        """Look the receiver up and make a socket; a failure is followed by another trial later."""
         try:
             family, kind, number, _, address = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
@@ -221,11 +204,9 @@ class Sender:
         loopback = ipaddress.ip_address(address[0]).is_loopback
         if not self._key and not loopback:
             raise SenderError(f"{self._host} is another computer: frames for it are signed; give --key-file")
-        old = self._socket
-        made = socket.socket(family, kind, number)
+        old, made = self._socket, socket.socket(family, kind, number)
         made.bind((address[0] if loopback else "", 0))
-        with self._lock:
-            self._socket, self._address = made, address
+        self._address, self._socket = address, made
         if old is not None:
             old.close()
 
@@ -252,38 +233,33 @@ class Sender:
 
     def _answer(self) -> None:
         """In a thread of its own: answer clock requests as soon as they come, each once."""
-        answered: deque[int] = deque(maxlen=256)  # a receiver asks four times a second
         while not self._closed.is_set():
-            with self._lock:
-                current = self._socket
+            current = self._socket
             if current is None:
                 self._closed.wait(0.1)
                 continue
             try:
-                if not select.select([current], [], [], 0.2)[0]:
-                    continue
-                packet, source = current.recvfrom(protocol.MAX_PACKET + 1)
-                received_ns = now_ns()
-                header = protocol.read_header(packet)
-                if (header.kind, header.sensor, header.session) != (
-                    protocol.CLOCK_REQUEST,
-                    self._sensor,
-                    self._session,
-                ):
-                    continue
-                protocol.check_signature(packet, self._key)  # before anything is counted against the source
-                if header.sequence in answered or not self._limit.allows(source, received_ns):
-                    continue
-                answered.append(header.sequence)
-                asked_ns = protocol.read_clock(packet).asked_ns
-                reply = header._replace(kind=protocol.CLOCK_ANSWER)
-                times = protocol.ClockTimes(asked_ns, received_ns, now_ns())
-                current.sendto(protocol.pack_clock(times, reply, self._key), source)
-                self.answered += 1
+                if select.select([current], [], [], 0.2)[0]:
+                    packet, source = current.recvfrom(protocol.MAX_PACKET + 1)
+                    self._answer_one(current, packet, source, now_ns())
             except protocol.ProtocolError:
                 continue
             except (OSError, ValueError):
-                self._closed.wait(0.01)  # nobody listens at the other end, or the socket was made anew
+                self._closed.wait(0.01)  # nobody listens at the other end, or the socket was replaced
+
+    def _answer_one(self, current: socket.socket, packet: bytes, source: Any, received_ns: int) -> None:
+        header = protocol.read_header(packet)
+        if header[:3] != (protocol.CLOCK_REQUEST, self._sensor, self._session):
+            return
+        protocol.check_signature(packet, self._key)
+        if header.sequence in self._answered or received_ns < self._next_answer_ns:
+            return
+        self._next_answer_ns = received_ns + _ANSWER_PERIOD_NS
+        self._answered.append(header.sequence)
+        times = protocol.ClockTimes(protocol.read_clock(packet).asked_ns, received_ns, now_ns())
+        answer = protocol.pack_clock(times, header._replace(kind=protocol.CLOCK_ANSWER), self._key)
+        current.sendto(answer, source)
+        self.answered += 1
 
     def close(self) -> None:
         """Stop answering."""
@@ -300,36 +276,26 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="kinect_sender", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    made.add_argument(
-        "--to",
-        metavar="HOST:PORT",
-        default=f"127.0.0.1:{protocol.DEFAULT_PORT}",
-        help="the computer that runs kinect_skeleton, and its port (default %(default)s)",
-    )
-    made.add_argument(
-        "--sensor", default="kinect1", metavar="NAME", help="the sensor's name there (default %(default)s)"
-    )
+    to = f"127.0.0.1:{protocol.DEFAULT_PORT}"
+    said = "the computer that runs kinect_skeleton, and its port (default %(default)s)"
+    made.add_argument("--to", metavar="HOST:PORT", default=to, help=said)
+    said = "the sensor's name there (default %(default)s)"
+    made.add_argument("--sensor", default="kinect1", metavar="NAME", help=said)
     made.add_argument("--key-file", metavar="FILE", help="the shared key; not needed for 127.0.0.1")
     made.add_argument("--make-key", metavar="FILE", help="write a new key into a new file, and end")
     replay = made.add_argument_group("a recording in place of the sensor")
     replay.add_argument("--replay", metavar="FILE", help="a bag, a .csv, .csv.gz or .skeleton file")
-    replay.add_argument(
-        "--recorded-sensor", default="", metavar="NAME", help="the sensor's name in it (default: --sensor)"
-    )
+    said = "the sensor's name in it (default: --sensor)"
+    replay.add_argument("--recorded-sensor", default="", metavar="NAME", help=said)
     replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="play it X times as fast (default 1)")
     replay.add_argument("--loop", action="store_true", help="begin again at its end")
-    replay.add_argument(
-        "--start-time",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="wall time, seconds, at which it begins, to keep several in step (default: now)",
-    )
+    said = "wall time, seconds, at which it begins, to keep several in step (default: now)"
+    replay.add_argument("--start-time", type=float, default=0.0, metavar="S", help=said)
     return made
 
 
 def make_key(path: str) -> None:
-    """A new key in a new file that only its owner may read.
+    """Write a new key into a new file that only its owner may read.
 
     Raises:
         SenderError: the file is there already, or cannot be written.
@@ -344,7 +310,7 @@ def make_key(path: str) -> None:
 
 
 def stream(sender: Sender, source: Any) -> None:
-    """Until the source ends: its frames, and a line on stderr now and then that says how it is going."""
+    """Send the frames of a source until it ends, with a line of status on stderr every few seconds."""
     begin = last = time.monotonic()
     silent_at = begin + SILENT_AFTER
     while not source.ended:
@@ -359,24 +325,12 @@ def stream(sender: Sender, source: Any) -> None:
         if now - last >= STATUS_PERIOD:
             last = now
             bodies = "the sensor is silent" if frame is None else f"{len(frame.bodies)} bodies"
-            heard = (
+            asked = (
                 f"answered {sender.answered} clock requests" if sender.answered else "the receiver has not asked yet"
             )
             error = f"; {sender.last_error}, {sender.failures} times" if sender.failures else ""
-            text = f"{now - begin:.0f} s: sent {sender.sent} frames, {bodies}, {heard}{error}"
+            text = f"{now - begin:.0f} s: sent {sender.sent} frames, {bodies}, {asked}{error}"
             print(f"kinect_sender: {text}", file=sys.stderr, flush=True)
-
-
-def main() -> int:
-    """The command: 0 at the end of a recording or on Ctrl-C, 2 with one line when it cannot start."""
-    try:
-        run()
-    except (SenderError, protocol.ProtocolError) as error:
-        print(f"kinect_sender: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        pass
-    return 0
 
 
 def run() -> None:
@@ -395,15 +349,22 @@ def run() -> None:
         raise SenderError(f"--to {args.to}: expected HOST:PORT")
     protocol.sensor_bytes(args.sensor)
     key = protocol.read_key(args.key_file) if args.key_file else protocol.NO_KEY
-    source = Replay(args) if args.replay else Kinect()
+    with contextlib.ExitStack() as stack:
+        source = stack.enter_context(contextlib.closing(Replay(args) if args.replay else Kinect()))
+        sender = stack.enter_context(contextlib.closing(Sender(args.sensor, host.strip("[]"), int(port), key)))
+        stream(sender, source)
+
+
+def main() -> int:
+    """The command: 0 at the end of a recording or on Ctrl-C, 2 with one line when it cannot start."""
     try:
-        sender = Sender(args.sensor, host.strip("[]"), int(port), key)
-        try:
-            stream(sender, source)
-        finally:
-            sender.close()
-    finally:
-        source.close()
+        run()
+    except (SenderError, protocol.ProtocolError) as error:
+        print(f"kinect_sender: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,11 +1,9 @@
 """The backend ``network``: skeletons that ``kinect_sender`` streams from a computer with a Kinect v2.
 
-The protocol is that of ``kinect_protocol``. Whoever has no key gets no further than the signature: size, header, name
-of the sensor, signature, session and sequence, content. No limit on packets comes before the signature, for anybody can
-write the sender's address into a packet, and what he sends would use up what the sender may send; a packet that was
-recorded and is sent again uses up nothing either. A signature takes some ten microseconds: 5,000 forged packets a
-second cost a twentieth of a processor. A session counts only after its sender has answered a question that was never
-asked before, so that packets which somebody recorded are worth nothing, not even when this side was started anew.
+Packets are checked in the order size, header, name of the sensor, signature, session and sequence, content, so that a
+stranger without the key gets no further than the signature, which takes ten microseconds. No rate is limited before
+it: anybody can write the sender's address into a packet, and would use up the sender's share. A session counts only
+after its sender has answered a new question, so that recorded packets are worth nothing, even after a restart.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from body_tracking.skeleton import MAX_RANGE, NANOSECONDS, Skeleton, TrackingSta
 Address: TypeAlias = tuple[str, int]
 
 TAKEOVER_NS = NANOSECONDS // 2
-"""A sender that was started anew takes the place of one that has been silent for so long."""
+"""A sender that was started anew replaces one that has been silent for so long."""
 
 SILENCE_NS = NANOSECONDS
 """From when on a stream that has stopped is a problem."""
@@ -42,44 +40,42 @@ SILENCE_NS = NANOSECONDS
 _REFUSAL_SHOWN_NS = 10 * NANOSECONDS
 _ANSWER_TIMEOUT_NS = 2 * NANOSECONDS
 _EARLIEST_NS, _LATEST_NS = NANOSECONDS, 5 * NANOSECONDS
-"""A frame that was sent earlier or later than so before its receipt is none to track anybody by."""
+"""A frame is refused that was sent so long after its receipt, or so long before."""
 _FIRST_ASKS, _ASK_FAST_NS, _ASK_NS = 20, NANOSECONDS // 20, NANOSECONDS // 4
 """A new session is asked every 50 ms at first, later four times a second."""
 
-# A sender sends 30 frames a second and some answers; its sequence numbers go up no faster than it may send. Of each
-# session that is not the one that is listened to, few frames are answered with a question.
-_KNOWN_RATE, _KNOWN_BURST = 600.0, 120.0
-_CHALLENGE_RATE, _CHALLENGE_BURST = 10.0, 5.0
+_CHALLENGE_NS, _CHALLENGED = NANOSECONDS // 10, 64
+"""How often an unknown session is asked whether it is alive, and how many of them are remembered."""
+
+_MAX_RATE, _MAX_JUMP = 600, 120
+"""Frames per second, and at once, by which sequence numbers go up at most; a Kinect makes 30 a second."""
+
 _RECEIVE_BUFFER = 1 << 20
 _SHORTEST_WAIT = 0.001
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedFrame:
-    """An accepted frame and when its capture was, by the local clock of stamps (ns)."""
+    """An accepted frame and the time of its capture, by the local clock of stamps (ns)."""
 
     frame: protocol.Frame
     stamp_ns: int
 
 
 class _Session:
-    """What is known of the sender that is listened to."""
+    """State of the sender whose frames are taken: number, address, clocks, the newest frame and answer."""
 
     def __init__(self, number: int, address: Address, least_delay_ns: int, now_ns: int) -> None:
         self.number, self.address = number, address
-        self.window = protocol.SequenceWindow()
-        self.trips = RoundTrips()
-        self.clock = CaptureClock(least_delay_ns)
-        self.last_ns = self.last_frame_ns = now_ns
-        self.last_answer = 0
-        self.asked = 0
-        self.next_ask_ns = now_ns
+        self.trips, self.clock = RoundTrips(), CaptureClock(least_delay_ns)
+        self.newest = self.last_answer = self.asked = 0
+        self.last_ns = self.last_frame_ns = self.next_ask_ns = now_ns
 
 
 class Receiver:
-    """Judges packets; knows no socket, and the time only as it is told.
+    """Judges packets; knows neither socket nor clock. Its memory is bounded, whatever comes.
 
-    Times are nanoseconds of the local monotonic clock, but for stamps. Whatever comes, memory stays bounded.
+    Times are nanoseconds of the local monotonic clock, but for stamps.
 
     Args:
         sensor: whose frames are taken; others are refused.
@@ -87,28 +83,26 @@ class Receiver:
         least_delay_ns: see :class:`CaptureClock`.
 
     Attributes:
-        counters: accepted frames, and what was refused by reason.
-        refusal: what was wrong with the packet refused last, and whose it was.
+        counters: accepted frames, and refused packets by reason.
+        lost: frames of the sessions so far that did not come, or came after a later one.
+        refusal: why the last refused packet was refused, and whose it was.
         refused_ns: when that was.
         silent: whether the sender says that its sensor delivers nothing.
         floor: of the last frame that had one, see :class:`~body_tracking.sensors.kinect_protocol.Frame`.
-        outgoing: packets to be sent and where to; whoever sends them empties the list.
+        outgoing: packets to be sent and their addresses; the caller empties the list.
     """
 
     def __init__(self, sensor: str, key: bytes, least_delay_ns: int = 0) -> None:
         self.counters: Counter[str] = Counter()
         self.refusal, self.refused_ns = "", 0
-        self.silent = False
+        self.lost, self.silent = 0, False
         self.floor: tuple[float, ...] | None = None
         self.outgoing: list[tuple[bytes, Address]] = []
         self._sensor, self._key, self._least_delay_ns = sensor, key, least_delay_ns
         self._secret = secrets.token_bytes(16)
         self._session: _Session | None = None
-        self._lost_before = 0
-        self._unknown_ns, self._challenged_ns = 0, 0
-        self._last_frame_ns = 0
-        self._known = protocol.RateLimit(_KNOWN_RATE, _KNOWN_BURST, 1)
-        self._challenges = protocol.RateLimit(_CHALLENGE_RATE, _CHALLENGE_BURST, 64)
+        self._unknown_ns = self._challenged_ns = self._last_frame_ns = 0
+        self._challenges: dict[tuple[Address, int], int] = {}
 
     # --- packets
 
@@ -117,9 +111,9 @@ class Receiver:
 
         Args:
             packet: at most one byte more than the largest one.
-            source: where it came from, as the network has it.
+            source: its address, as the network has it.
             now_ns: its receipt.
-            wall_ns: the same by the clock in which stamps are to be.
+            wall_ns: its receipt by the clock of stamps.
         """
         try:
             header = protocol.read_header(packet)
@@ -128,60 +122,57 @@ class Receiver:
             if header.sensor != self._sensor:
                 raise ProtocolError("another sensor", f"frames of {header.sensor!r}, expected {self._sensor!r}")
             protocol.check_signature(packet, self._key)
+            session = self._session
             if header.kind == protocol.CLOCK_ANSWER:
                 self._take_answer(header, protocol.read_clock(packet), source, now_ns)
-                return None
-            return self._take_frame(header, packet, source, now_ns, wall_ns - now_ns)
+            elif session is None or header.session != session.number:
+                self._challenge(header.session, source, now_ns)
+            else:
+                return self._take_frame(session, header, packet, source, now_ns, wall_ns - now_ns)
         except (ArithmeticError, ValueError) as failure:  # numbers that no clock shows, and ProtocolError
             error = failure if isinstance(failure, ProtocolError) else ProtocolError("out of range", str(failure))
             self.counters[f"rejected, {error.reason}"] += 1
             self.refusal, self.refused_ns = f"{error} (from {source[0]} port {source[1]})", now_ns
-            return None
+        return None
 
     def _take_frame(
-        self, header: Header, packet: bytes, source: Address, now_ns: int, wall_offset_ns: int
+        self, session: _Session, header: Header, packet: bytes, source: Address, now_ns: int, wall_offset_ns: int
     ) -> ReceivedFrame | None:
-        session = self._session
-        if session is None or header.session != session.number:
-            self._challenge(header.session, source, now_ns)
+        most = session.newest + _MAX_JUMP + _MAX_RATE * (now_ns - session.last_frame_ns) // NANOSECONDS
+        if session.newest and header.sequence > most:
+            raise ProtocolError("wrong sequence", f"frame {header.sequence} soon after frame {session.newest}")
+        if header.sequence <= session.newest:
+            self.counters["late or repeated, not used"] += 1
             return None
-        window = session.window
-        most = window.newest + _KNOWN_BURST + _KNOWN_RATE * (now_ns - session.last_frame_ns) / NANOSECONDS
-        if window.newest and header.sequence > most:
-            raise ProtocolError("wrong sequence", f"frame {header.sequence} soon after frame {window.newest}")
-        if window.has(header.sequence):
-            raise ProtocolError("replayed", "a frame that was there before")
         offset_ns = session.trips.offset_ns(header.sent_ns)
         if not -_EARLIEST_NS < now_ns - header.sent_ns - offset_ns < _LATEST_NS:
             raise ProtocolError("wrong time", "a frame that was sent long ago, or later than now")
         frame = protocol.read_frame(packet)
-        place = window.take(header.sequence)
-        if not self._known.allows(None, now_ns):
-            raise ProtocolError("too many", "more frames than a sensor sends")
+        self.lost += header.sequence - session.newest - 1 if session.newest else 0
+        session.newest = header.sequence
         session.address, session.last_ns = source, now_ns
         session.last_frame_ns = self._last_frame_ns = now_ns
-        if place == "late":
-            self.counters["late, not used"] += 1
-            return None
         self.silent = frame.silent
         if frame.silent:
             return None
         self.counters["accepted"] += 1
         self.floor = frame.floor or self.floor
-        stamp_ns = session.clock.stamp(frame.time_ns, header.sent_ns, offset_ns + wall_offset_ns)
-        return ReceivedFrame(frame, stamp_ns)
+        return ReceivedFrame(frame, session.clock.stamp(frame.time_ns, header.sent_ns, offset_ns + wall_offset_ns))
 
     # --- sessions and clocks
 
     def _challenge(self, session: int, source: Address, now_ns: int) -> None:
-        """Ask whether a session is alive; nothing is kept of the question, its random number holds what was asked."""
+        """Ask whether a session is alive; nothing is kept of the question, its random number holds the question."""
         self.counters["of unknown sessions"] += 1
         if now_ns - self._unknown_ns > SILENCE_NS:
             self._challenged_ns = now_ns
         self._unknown_ns = now_ns
-        if self._challenges.allows(
-            (source, session), now_ns
-        ):  # a session that somebody recorded takes no other's place
+        asked = source, session  # so that a recorded session uses up no other's share
+        if now_ns - self._challenges.get(asked, -_CHALLENGE_NS) >= _CHALLENGE_NS:
+            self._challenges.pop(asked, None)  # the newest ones last
+            self._challenges[asked] = now_ns
+            if len(self._challenges) > _CHALLENGED:
+                del self._challenges[next(iter(self._challenges))]
             self._ask(session, source, now_ns)
 
     def _ask(self, session: int, address: Address, now_ns: int) -> None:
@@ -201,10 +192,8 @@ class Receiver:
         session = self._session
         if session is None or header.session != session.number:
             if session is not None and now_ns - session.last_ns < TAKEOVER_NS:
-                raise ProtocolError(
-                    "another sender", "a second sender of the same sensor; the first one is listened to"
-                )
-            self._lost_before += 0 if session is None else session.window.lost
+                text = "a second sender of the same sensor; the first one is listened to"
+                raise ProtocolError("another sender", text)
             self.counters["sessions"] += 1
             session = self._session = _Session(header.session, source, self._least_delay_ns, now_ns)
         if times.asked_ns <= session.last_answer:
@@ -220,29 +209,20 @@ class Receiver:
             session.next_ask_ns = now_ns + (_ASK_FAST_NS if session.asked < _FIRST_ASKS else _ASK_NS)
             self._ask(session.number, session.address, now_ns)
 
-    # --- what is to be said
-
-    @property
-    def lost(self) -> int:
-        """Frames that were sent and did not come, by their sequence numbers."""
-        return self._lost_before + (self._session.window.lost if self._session is not None else 0)
+    # --- diagnostics
 
     def problem(self, now_ns: int) -> str:
         """What keeps the stream from being as it should, in a line; empty if nothing does."""
+        refused = self.refusal and now_ns - self.refused_ns < _REFUSAL_SHOWN_NS
+        refusal = f"packets are refused: {self.refusal}" if refused else ""
         if not self._last_frame_ns or now_ns - self._last_frame_ns > SILENCE_NS:
             seconds = (now_ns - self._last_frame_ns) // NANOSECONDS
             text = f"no frame for {seconds} s" if self._last_frame_ns else "no frame yet"
             asked_for_long = self._unknown_ns - self._challenged_ns > _ANSWER_TIMEOUT_NS
             if asked_for_long and now_ns - self._unknown_ns < SILENCE_NS:
                 return f"{text}; a sender is there, but answers no clock requests: does its firewall let UDP in?"
-            return f"{text}{self._refused_lately(now_ns)}"
-        if self.silent:
-            return "the sender is there, but its sensor delivers nothing"
-        return self._refused_lately(now_ns).removeprefix("; ")
-
-    def _refused_lately(self, now_ns: int) -> str:
-        lately = self.refusal and now_ns - self.refused_ns < _REFUSAL_SHOWN_NS
-        return f"; packets are refused: {self.refusal}" if lately else ""
+            return "; ".join(filter(None, (text, refusal)))
+        return "the sender is there, but its sensor delivers nothing" if self.silent else refusal
 
     def values(self, now_ns: int) -> dict[str, object]:
         """For diagnostics."""
@@ -251,11 +231,14 @@ class Receiver:
             values["last frame s ago"] = f"{(now_ns - self._last_frame_ns) / NANOSECONDS:.2f}"
         session = self._session
         if session is not None:
-            values["sender"] = f"{session.address[0]} port {session.address[1]}"
-            values["round trip ms"] = f"{session.trips.round_trip_ns / 1e6:.3f}"
-            values["clock offset s"] = f"{session.trips.offset_ns(session.trips.remote_ns) / NANOSECONDS:.6f}"
-            values["clock drift ppm"] = f"{session.trips.drift * 1e6:.1f}"
-            values["clock set"] = session.trips.steps
+            trips = session.trips
+            values |= {
+                "sender": f"{session.address[0]} port {session.address[1]}",
+                "round trip ms": f"{trips.round_trip_ns / 1e6:.3f}",
+                "clock offset s": f"{trips.offset_ns(trips.remote_ns) / NANOSECONDS:.6f}",
+                "clock drift ppm": f"{trips.drift * 1e6:.1f}",
+                "clock set": trips.steps,
+            }
         if self.floor is not None:
             values["floor x y z w"] = " ".join(f"{value:.3f}" for value in self.floor)
         return values
@@ -265,28 +248,25 @@ class Receiver:
 
 
 class NetworkSource:
-    """A socket and a :class:`Receiver`.
-
-    Stamps are capture times in this computer's wall clock.
+    """A socket and a :class:`Receiver`; stamps are capture times in this computer's wall clock.
 
     Args:
         settings: ``sensor``, ``device`` (the sensor's name at the sender; empty for the same), ``address``, ``port``,
             ``key_file`` and ``least_delay`` count.
 
     Raises:
-        SensorNameError: a name that cannot be a sensor's.
-        SourceError: likewise, as packets hold it; no key for an address beyond this computer, a key file that is none,
-            an address or port that cannot be had.
+        SensorNameError: an invalid name of the sensor.
+        SourceError: an invalid name at the sender, no key for an address beyond this computer, an invalid key file, an
+            address or port that cannot be had.
     """
 
     def __init__(self, settings: SourceSettings) -> None:
-        check_sensor_name(settings.sensor)
+        self._sensor = check_sensor_name(settings.sensor)
         sent_as = settings.device or settings.sensor
         try:
             protocol.sensor_bytes(sent_as)
         except ProtocolError as error:
             raise SourceError(str(error)) from None
-        self._sensor = settings.sensor
         self._where = f"{settings.address} port {settings.port}"
         self._receiver = Receiver(sent_as, _key(settings), round(settings.least_delay * NANOSECONDS))
         self._closed = threading.Event()
@@ -343,7 +323,9 @@ class NetworkSource:
             wall_ns = time.time_ns()
             received = self._receiver.take(packet, source[:2], time.monotonic_ns(), wall_ns)
             if received is not None and received.frame.bodies:
-                return self._converted(received, wall_ns)
+                name, stamp_ns = optical_frame(self._sensor), received.stamp_ns
+                skeletons = tuple(skeleton_of(body, stamp_ns, name) for body in received.frame.bodies)
+                return RecordedFrame(self._sensor, wall_ns, skeletons)
         self._socket.close()
         return None
 
@@ -355,14 +337,9 @@ class NetworkSource:
                 self._receiver.counters["requests that could not be sent"] += 1
         self._receiver.outgoing.clear()
 
-    def _converted(self, received: ReceivedFrame, received_ns: int) -> RecordedFrame:
-        name, stamp_ns = optical_frame(self._sensor), received.stamp_ns
-        skeletons = tuple(skeleton_of(body, stamp_ns, name) for body in received.frame.bodies)
-        return RecordedFrame(self._sensor, received_ns, skeletons)
-
 
 def skeleton_of(body: protocol.Body, stamp_ns: int, frame_id: str) -> Skeleton:
-    """A body as it came, in the package's conventions; a joint without sound coordinates is NaN and not tracked."""
+    """A body in the package's conventions; a joint without sound coordinates is NaN and not tracked."""
     positions = camera_space_to_optical(np.array(body.positions, dtype=np.float64))
     unsound = ~(np.abs(positions) < MAX_RANGE).all(axis=1)
     positions[unsound] = np.nan
@@ -380,9 +357,8 @@ def _key(settings: SourceSettings) -> bytes:
     try:
         loopback = ipaddress.ip_address(settings.address).is_loopback
     except ValueError:
-        raise SourceError(
-            f"parameter 'address': {settings.address!r}, expected an IP address of this computer"
-        ) from None
+        text = f"parameter 'address': {settings.address!r}, expected an IP address of this computer"
+        raise SourceError(text) from None
     if not loopback:
         raise SourceError(
             f"parameter 'address': {settings.address} is reached from other computers, which needs the parameter "

@@ -17,15 +17,7 @@ from hypothesis import strategies as st
 from senders import KEY, body
 
 from body_tracking.sensors import kinect_protocol as protocol
-from body_tracking.sensors.kinect_protocol import (
-    Body,
-    ClockTimes,
-    Frame,
-    Header,
-    ProtocolError,
-    RateLimit,
-    SequenceWindow,
-)
+from body_tracking.sensors.kinect_protocol import Body, ClockTimes, Frame, Header, ProtocolError
 from body_tracking.skeleton import N_JOINTS
 
 HEADER = Header(protocol.FRAME, "kinect1", 2**64 - 1, 1, -5)
@@ -91,7 +83,7 @@ def test_the_layout_is_the_documented_one() -> None:
     assert struct.unpack_from("<B7xQ", packet, 92) == (3, body(3).tracking_id)
     assert struct.unpack_from("<3f4hBx", packet, 108 + 22)[7] == body(3).states[1]
     assert protocol.VERSION == 1
-    assert protocol.MAX_PACKET == 64 + 28 + 6 * 566 + 32
+    assert protocol.MAX_PACKET == 64 + 28 + 6 * 566 + 32 < 65507  # of a datagram
 
 
 def test_any_changed_bit_is_noticed() -> None:
@@ -110,13 +102,6 @@ def test_another_key_does_not_do(key: bytes) -> None:
     protocol.check_signature(packet, KEY)
     with pytest.raises(ProtocolError, match="another key"):
         protocol.check_signature(packet, key)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.binary(max_size=protocol.MAX_PACKET + 50))
-def test_no_random_bytes_are_a_packet(packet: bytes) -> None:
-    with pytest.raises(ProtocolError):
-        protocol.read_header(packet)
 
 
 def test_who_has_the_key_still_cannot_send_nonsense() -> None:
@@ -171,49 +156,16 @@ def test_a_key_is_read_without_its_line_end_and_never_shown(tmp_path: Path) -> N
         protocol.read_key(str(tmp_path / "none"))
 
 
-# --- rates and sequences
-
-
-@given(st.lists(st.integers(0, 10**9), min_size=1, max_size=200))
-def test_a_source_gets_no_more_than_its_rate_and_a_burst(steps: list[int]) -> None:
-    limit, now, allowed = RateLimit(10.0, 5.0), 0, 0
-    for step in steps:
-        now += step
-        allowed += limit.allows("a", now)
-        assert allowed <= 5 + now * 10e-9 + 1e-6
-
-
-def test_a_slow_source_is_never_refused_and_one_source_does_not_take_from_another() -> None:
-    limit = RateLimit(10.0, 5.0)
-    for k in range(1000):
-        limit.allows("loud", k * 1_000_000)
-        if k % 100 == 0:
-            assert limit.allows("slow", k * 1_000_000)
-
-
-def test_memory_is_bounded_however_many_sources_there_are() -> None:
-    limit = RateLimit(10.0, 5.0, 256)
-    for k in range(10_000):
-        limit.allows(k, k)
-    assert len(limit) == 256
-
-
-@given(st.lists(st.integers(1, 150), max_size=300))
-def test_no_number_is_taken_twice_and_lost_ones_are_those_that_never_came(numbers: list[int]) -> None:
-    window, taken = SequenceWindow(), set()
-    for number in numbers:
-        place = window.take(number)
-        if place == "replayed":
-            # it came before, or so long ago that nobody remembers
-            assert number in taken or window.newest - number >= SequenceWindow.SIZE
-            continue
-        assert number not in taken
-        assert (place == "new") == (not taken or number > max(taken))
-        taken.add(number)
-        assert window.newest == max(taken)
-    if taken:
-        first = next(number for number in numbers)
-        assert window.lost == len(set(range(first, max(taken) + 1)) - taken)
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "kinect.key"
+    file.write_bytes(KEY)
+    for mode in (0o640, 0o604, 0o620, 0o610):
+        file.chmod(mode)
+        with pytest.raises(ProtocolError, match="others may read or write it"):
+            protocol.read_key(str(file))
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(ProtocolError, match="no regular file"):
+        protocol.read_key(str(tmp_path / "pipe"))
 
 
 # --- on Windows
@@ -230,25 +182,3 @@ def test_it_needs_nothing_but_an_old_pythons_standard_library() -> None:
             for module in modules:
                 known = module.partition(".")[0] in sys.stdlib_module_names
                 assert known or (name, module) == ("kinect_sender", "body_tracking.sensors"), module
-
-
-def test_six_people_fit_into_one_datagram_all_of_which_is_signed() -> None:
-    packet = protocol.pack_frame(Frame(0, tuple(body(k) for k in range(6))), HEADER, KEY)
-    assert len(packet) == protocol.MAX_PACKET < 65507
-    for at in range(0, len(packet) - 32, 97):
-        changed = bytearray(packet)
-        changed[at] ^= os.urandom(1)[0] or 1
-        with pytest.raises(ProtocolError):
-            protocol.check_signature(bytes(changed), KEY)
-
-
-def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "kinect.key"
-    file.write_bytes(KEY)
-    for mode in (0o640, 0o604, 0o620, 0o610):
-        file.chmod(mode)
-        with pytest.raises(ProtocolError, match="others may read or write it"):
-            protocol.read_key(str(file))
-    os.mkfifo(tmp_path / "pipe", 0o600)
-    with pytest.raises(ProtocolError, match="no regular file"):
-        protocol.read_key(str(tmp_path / "pipe"))
