@@ -16,7 +16,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from rclpy.qos import QoSProfile  # noqa: E402
-from running import RELIABLE, Running, environment, stop  # noqa: E402
+from running import RELIABLE, Running, environment, refusal, stop  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
@@ -28,6 +28,21 @@ from body_tracking.skeleton import Joint, TrackingState  # noqa: E402
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
 NO_NAMESPACES = 77
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        (("port:=0",), "parameter 'port': 0, expected 1 to 65535"),
+        (("backend:=network", "address:=0.0.0.0"), "needs the parameter 'key_file'"),
+        (("backend:=network", "key_file:=/nowhere"), "parameter 'key_file': /nowhere: cannot be read"),
+    ],
+)
+def test_a_receiver_that_would_not_be_safe_does_not_start(
+    tmp_path: Path, parameters: tuple[str, ...], said: str
+) -> None:
+    words = [word for parameter in parameters for word in ("-p", parameter)]
+    assert said in refusal(tmp_path, "kinect_skeleton", *words)
 
 
 def free_port() -> int:

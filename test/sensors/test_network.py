@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -401,3 +402,46 @@ def test_an_address_that_cannot_be_had_is_named(tmp_path: Path) -> None:
     source.read(0.0)
     with pytest.raises(BodyTrackingError, match=r"cannot listen on 192\.0\.2\.7"):
         open_network(address="192.0.2.7", key_file=key_file(tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("forging", [False, True])
+def test_5000_forged_packets_a_second_cost_at_most_one_frame_in_a_hundred(tmp_path: Path, forging: bool) -> None:
+    file = key_file(tmp_path)
+    source = open_network(key_file=file, device="kinect1")
+    sender = Sender("kinect1", *source.address, protocol.read_key(file))
+    forged = Partner(Receiver("kinect1", KEY), key=b"another key another key").frame(0)
+    ended = threading.Event()
+    sent = 0
+
+    def attack() -> None:
+        nonlocal sent
+        begin = time.monotonic()
+        while not ended.wait(0.002):
+            while sent < 5000 * (time.monotonic() - begin):
+                sender._socket.sendto(forged, source.address)  # type: ignore[union-attr]  # from the sender's address
+                sent += 1
+
+    def stream() -> None:
+        while not ended.wait(1.0 / 30.0):
+            sender.send(Frame(time.perf_counter_ns(), (body(),)))
+
+    stamps: list[int] = []
+    threads = [threading.Thread(target=each) for each in ((stream, attack) if forging else (stream,))]
+    for thread in threads:
+        thread.start()
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end:
+        frame = source.read(0.05)
+        if frame is not None:
+            stamps.append(frame.skeletons[0].stamp_ns)
+    ended.set()
+    for thread in threads:
+        thread.join()
+    values = dict(source.counters)
+    print(f"{sender.sent} sent, {len(stamps)} taken, {sent / 20.0:.0f} forged a second, {values}")
+    sender.close()
+    source.close()
+    source.read(0.0)
+    assert sender.sent - len(stamps) <= 4 + 0.01 * sender.sent  # the first ones are asked for, and not taken
+    assert not forging or sent > 90_000
