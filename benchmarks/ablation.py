@@ -53,8 +53,7 @@ from body_tracking.graph import FILTERED
 from body_tracking.kinematics import posture
 from body_tracking.measurement import left_right_axes
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import replay
-from body_tracking.recording.stages import ReplaySettings
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import SHIPPED, write_bag
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint
 

@@ -47,7 +47,7 @@ from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.recording.stages import FilterAndAngles, ReplaySettings, Upstream
+from body_tracking.recording.replay import FilterAndAngles, ReplaySettings, Upstream
 from body_tracking.simulation.kinect import KinectErrors, parameters
 from body_tracking.simulation.layouts import NUMBERS, layout
 from body_tracking.simulation.occlusion import cover

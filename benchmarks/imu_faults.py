@@ -32,14 +32,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from body_tracking.imu_tracking import ImuSettings
 from imu_only import ANGLES, Angles, angle_errors, angle_variances, rms, true_configurations
 from tqdm import tqdm
 
 from body_tracking import graph
 from body_tracking.cdr import decode_covariance, decode_model_state, decode_skeletons
-from body_tracking.imu_tracking import ImuSettings
+from body_tracking.recording.replay import FilterAndAngles, ReplaySettings, Upstream
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.recording.stages import FilterAndAngles, ReplaySettings, Upstream
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.imus import Iron, SimulatedImu, Slip, Surroundings, usual_mounting
 from body_tracking.simulation.layouts import Layout, around

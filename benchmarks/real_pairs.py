@@ -27,9 +27,8 @@ from body_tracking.measurement import left_right_axes
 from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import replay
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}

@@ -44,9 +44,8 @@ from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.graph import FUSED
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import replay, sensor_topics, skeletons_of
+from body_tracking.recording.replay import ReplaySettings, replay, sensor_topics, skeletons_of
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.random_people import (
     MODEL,
     MeasurementErrors,

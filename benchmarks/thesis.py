@@ -48,9 +48,8 @@ from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.recording.replay import replay
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.bags import SEED, SHIPPED, shipped, write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState

@@ -529,7 +529,11 @@ FLOW: tuple[str, ...] = (
 
 
 def parameters_of(executable: str) -> tuple[Parameter, ...]:
-    """The parameters of an executable, from its own module, which needs ROS to import."""
+    """The parameters of an executable: from its stage, or from its own module, which needs ROS to import."""
+    from body_tracking.pipeline.registry import STAGES, stage_class
+
+    if executable in STAGES:
+        return stage_class(executable).PARAMETERS
     table: tuple[Parameter, ...] = importlib.import_module(f"body_tracking.nodes.{executable}").PARAMETERS
     return table
 

@@ -17,12 +17,12 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import yaml
 
@@ -32,17 +32,8 @@ from body_tracking.executables import signals_held
 from body_tracking.filters import FILTERS
 from body_tracking.graph import GraphOptions, NodeSpec
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
-from body_tracking.parameters import (
-    SECTION,
-    Parameter,
-    ParameterError,
-    Value,
-    check_all,
-    is_ros_own,
-    is_wildcard,
-    read_file,
-    to_ros,
-)
+from body_tracking.node_parameters import parameters_for
+from body_tracking.parameters import SECTION, Value, to_ros
 from body_tracking.recording.rig import RigReader
 from body_tracking.skeleton import NANOSECONDS
 
@@ -145,56 +136,6 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
     return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
 
 
-def parameters_for(
-    specs: Sequence[NodeSpec],
-    file: Path | None,
-    defaults: Mapping[str, Mapping[str, Value]] | None = None,
-    absent: Sequence[NodeSpec] = (),
-) -> dict[str, dict[str, Value]]:
-    """Every parameter that is set, for each node: the graph's defaults, then the file, then what the graph needs.
-
-    Args:
-        specs: the nodes.
-        file: a ROS parameters file, or None.
-        defaults: more defaults by node name.
-        absent: nodes that the file may be about too, although they are not started.
-
-    Raises:
-        ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
-            allowed.
-    """
-    if file is None:  # what we set ourselves, each node checks
-        return {
-            spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
-        }
-    possible = {spec.name: spec for spec in (*absent, *specs)}
-    tables = {
-        name: {item.name: item for item in graph.parameters_of(spec.executable)} for name, spec in possible.items()
-    }
-    sections = read_file(file)
-    for pattern, values in sections.items():
-        about = [spec for spec in possible.values() if spec.meant_by(pattern)]
-        if not about:
-            there = ", ".join(spec.full_name for spec in possible.values())
-            raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
-        known: dict[str, Parameter] = {}
-        for spec in about:
-            known |= tables[spec.name]
-        _check(known.values(), {n: v for n, v in values.items() if not is_ros_own(n)}, f"{file}: {pattern}")
-    result: dict[str, dict[str, Value]] = {}
-    for spec in specs:
-        given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
-        for pattern, values in graph.in_order(sections):
-            if spec.meant_by(pattern):
-                wildcard = is_wildcard(pattern)
-                given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
-        given |= spec.parameters
-        own: dict[str, Any] = {name: given.pop(name) for name in list(given) if is_ros_own(name)}
-        checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}")
-        result[spec.name] = {**own, **{name: checked[name] for name in given}}
-    return result
-
-
 def all_parameters(
     options: GraphOptions,
     specs: Sequence[NodeSpec],
@@ -225,13 +166,6 @@ def all_parameters(
                 f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
             )
     return result
-
-
-def _check(table: Iterable[Parameter], given: Mapping[str, object], where: str) -> dict[str, Value]:
-    try:
-        return check_all(tuple(table), given)
-    except ParameterError as error:
-        raise ParameterError(f"{where}: {error}") from None
 
 
 # --- one process

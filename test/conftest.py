@@ -88,8 +88,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     """The bag that the offline graph makes of ``wave`` with its default settings."""
-    from body_tracking.recording.replay import replay
-    from body_tracking.recording.stages import ReplaySettings
+    from body_tracking.recording.replay import ReplaySettings, replay
 
     folder = tmp_path_factory.mktemp("replayed") / "wave"
     replay(wave, folder, ReplaySettings(()))

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.fusion.association import HOLD, Association
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
 from body_tracking.fusion.subject import ALL, FIRST, MAX_PEOPLE, NEAREST, SUBJECTS, SubjectSelector
+from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 _PRESENT = round(0.2 * NANOSECONDS)
@@ -105,6 +106,20 @@ class _Sensor(Placement):
         self.used: SensorPose | None = None
         self.pending: deque[tuple[int, SensorPose, Skeleton]] = deque(maxlen=_PENDING)
         self.selector.reset()
+
+
+PEOPLE = parameters_from(PeopleParameters)
+"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
+
+
+def people_from(values: Mapping[str, Value]) -> PeopleParameters:
+    """Whom to track, of the values of :data:`PEOPLE`.
+
+    Raises:
+        ParameterError: one of them is out of its range.
+    """
+    given = {item.name: item.check(values[item.name]) for item in PEOPLE}
+    return PeopleParameters(**fields_of(PeopleParameters, given))
 
 
 class People:

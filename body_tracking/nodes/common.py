@@ -68,16 +68,19 @@ from body_tracking.parameters import (
     to_ros,
     unknown_parameter,
 )
+from body_tracking.pipeline.shared import BODY, FRAMES_KEPT, REFERENCE, RELIABLE, SENSORS, WORLD_FRAME
+from body_tracking.pipeline.shared import result_qos as shared_result_qos
+from body_tracking.pipeline.shared import skeleton_qos as shared_skeleton_qos
+from body_tracking.pipeline.stage import JUMP_BACK_NS
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.recording.qos import SENSOR_DATA, Qos
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
+__all__ = ["BODY", "REFERENCE", "RELIABLE", "SENSORS", "WORLD_FRAME"]
+
 RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_FRAMES_KEPT = 16
-"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
-that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
 _TICKS = 1000
 """Ticks of simulated time that may wait while a node is busy: each message is to be handled by the time at which it was
 sent."""
@@ -88,9 +91,6 @@ _LEAVE_S = 5.0
 
 _FORGOTTEN_S = 25.0
 """Seconds after which DDS has forgotten a process that was killed: Fast DDS's lease of 20 s, and some more."""
-
-JUMP_BACK_NS = 1 * NANOSECONDS
-"""A stamp further behind than this is a backward jump of time (a loop, another recording), not a late frame."""
 
 GAP_NS = 50_000_000
 """Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
@@ -105,37 +105,6 @@ _LOOK_S = 0.2
 _FAILURES = 10
 """Callbacks of one input that fail one after the other, after which the node forgets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
-
-RELIABLE = Parameter(
-    "reliable",
-    False,
-    "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
-    fixed="a topic keeps the quality of service that it was made with",
-)
-WORLD_FRAME = Parameter(
-    "world_frame",
-    "world",
-    "name of the world frame; map for REP-155",
-    fixed="what is published in this frame would lie in two",
-)
-BODY = Parameter(
-    "body",
-    "body1",
-    "the id of the person in topics and names of angles (REP-155)",
-    fixed="the names of topics and angles hold it",
-)
-SENSORS = Parameter(
-    "sensors",
-    ("kinect1", "kinect2"),
-    "the sensors; the node listens to /<sensor>/skeleton of each",
-    fixed="every node of the graph must have the same sensors",
-)
-REFERENCE = Parameter(
-    "reference",
-    "",
-    "the sensor that defines world and its time; empty for the first one",
-    fixed="world and its time would jump for everyone who uses them",
-)
 
 
 class Monitor:
@@ -501,11 +470,11 @@ class GraphNode(Node):
 
     def skeleton_qos(self) -> QoSProfile:
         """Of skeleton topics, by the parameter ``reliable``."""
-        return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else graph.SKELETON)
+        return to_profile(shared_skeleton_qos(self.values))
 
     def result_qos(self) -> QoSProfile:
         """Of results, which are reliable; as deep as skeletons by the parameter ``reliable``."""
-        return to_profile(graph.RELIABLE_SKELETON if self.values["reliable"] else RELIABLE_QOS)
+        return to_profile(shared_result_qos(self.values))
 
     def full_name(self, topic: str) -> str:
         """The full name of a topic of the graph, in this node's namespace and as it is remapped."""
@@ -560,7 +529,7 @@ class GraphNode(Node):
             handle(skeletons, sent_ns)
 
         qos = self.skeleton_qos()
-        qos.depth = max(qos.depth, _FRAMES_KEPT)
+        qos.depth = max(qos.depth, FRAMES_KEPT)
         subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
         if not self.values["reliable"]:
             self._droppable[subscription] = name

@@ -11,39 +11,32 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters
+from body_tracking.calibration.storage import load
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.filtering import (
-    ANGLES,
-    FILTER,
-    INPUT,
-    ORDER_WAIT,
-    ORIENTATIONS,
-    PEOPLE,
-    PREDICT_AFTER,
-    filter_parameters,
-    filter_table,
-    people_from,
-)
-from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.filters import DEFAULT_FILTER, FILTERS, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
+from body_tracking.fusion.people import PeopleParameters
 from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.imu_tracking import IMU_PARAMETERS, ImuSettings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.node_parameters import parameters_for as parameters_of_nodes
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.pipeline.registry import STAGES, stage_class
+from body_tracking.pipeline.stage import JUMP_BACK_NS
+from body_tracking.recording import forked
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
-from body_tracking.recording.stages import JUMP_BACK_NS, ReplaySettings, Sink, Upstream, start_downstream
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage, deserialize
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 _P = TypeVar("_P")
@@ -51,6 +44,81 @@ _P = TypeVar("_P")
 
 class ReplayError(BodyTrackingError):
     """The bag holds nothing to run the graph on."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySettings:
+    """What the offline graph is to do; defaults as the nodes'.
+
+    Attributes:
+        sensors: the first is the reference unless ``reference`` says otherwise; all of the bag when empty.
+        reference: or empty.
+        filter_name: one of the filters.
+        convention: of the joint angles; ``graph.AUTO`` for the filter's own.
+        filter_input, angles_input: as the parameters ``input`` of ``skeleton_filter`` and ``joint_angles``.
+        calibration_file: start from this calibration; None for none.
+        imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
+        people: whom to track.
+        calibration, fusion, tracking: parameters of the calibration, the fusion and the inertial sensors.
+        filter_parameters: parameters of the filter, without its prefix.
+        parameters: further parameters by node; they hold against all of the above.
+        model_covariance: write the covariance of the filter's model, too.
+    """
+
+    sensors: tuple[str, ...] = ()
+    reference: str = ""
+    filter_name: str = DEFAULT_FILTER
+    convention: str = graph.AUTO
+    filter_input: str = graph.AUTO
+    angles_input: str = graph.AUTO
+    calibration_file: Path | None = None
+    imus: tuple[str, ...] = ()
+    people: PeopleParameters = field(default_factory=PeopleParameters)
+    calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
+    fusion: FusionParameters = field(default_factory=FusionParameters)
+    tracking: TrackingParameters = field(default_factory=TrackingParameters)
+    filter_parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
+    model_covariance: bool = False
+
+    def options(self) -> graph.GraphOptions:
+        """The graph that runs."""
+        return graph.GraphOptions(
+            sensors=self.sensors or graph.DEFAULT_SENSORS,
+            filter_name=self.filter_name,
+            filter_input=self.filter_input,
+            convention=self.convention,
+            angles_input=self.angles_input,
+            imus=self.imus,
+            calibration_file="" if self.calibration_file is None else str(self.calibration_file),
+            external=True,
+        )
+
+    def values(self) -> dict[str, dict[str, Value]]:
+        """All parameters of each stage, by its name.
+
+        Raises:
+            BodyTrackingError: they do not go together.
+        """
+        specs = graph.nodes_for(self.options())
+        prefix = parameter_prefix(self.filter_name)
+        people = asdict(self.people)
+        own: dict[str, dict[str, Any]] = {
+            "calibration": asdict(self.calibration),
+            "fusion": {**asdict(self.fusion), **people},
+            "imu_skeleton": {**asdict(self.tracking), "subject": self.people.subject},
+            "skeleton_filter": {f"{prefix}{name}": each for name, each in self.filter_parameters.items()} | people,
+            "joint_angles": {"subject": self.people.subject, "people": self.people.people},
+        }
+        found = {}
+        for spec in specs:
+            if spec.name in STAGES:
+                given = {**spec.defaults, **own[spec.name], **spec.parameters, "reference": self.reference}
+                given |= self.parameters.get(spec.name, {})
+                table = stage_class(spec.name).PARAMETERS
+                known = {item.name for item in table}
+                found[spec.name] = check_all(table, {name: each for name, each in given.items() if name in known})
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,46 +166,56 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
     return {graph.skeleton_topic(name): name for name in names}
 
 
-def frames_of(
-    bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
-) -> Iterator[tuple[str, tuple[Skeleton, ...], int, bytes]]:
-    """Each sensor's frames in log-time order: sensor, the bodies in it, log time, the message itself.
+class _Frames:
+    """Decodes the frames of sensors, and counts those of no use.
 
-    Malformed messages are counted and skipped, with the last reason in ``counters`` only as a number per topic; so are
-    frames without a body.
+    Args:
+        topics: sensor name by topic.
+        counters: counts malformed messages, time jumps and frames without a body.
     """
-    last: dict[str, int] = {}
-    for raw in bag.messages(topics.keys()):
-        sensor = topics[raw.topic]
+
+    def __init__(self, topics: Mapping[str, str], counters: Counter[str]) -> None:
+        self._topics, self._counters = topics, counters
+        self._last: dict[str, int] = {}
+
+    def skeletons(self, raw: RawMessage) -> tuple[Skeleton, ...] | None:
+        """The bodies in a frame; None for one of no use."""
         try:
             skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except BodyTrackingError:
-            counters[f"malformed {raw.topic}"] += 1
-            continue
+            self._counters[f"malformed {raw.topic}"] += 1
+            return None
         stamp = skeletons[0].stamp_ns
-        if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
-            counters["time jumps"] += 1
-        last[sensor] = stamp
+        if stamp < self._last.get(raw.topic, stamp) - JUMP_BACK_NS:
+            self._counters["time jumps"] += 1
+        self._last[raw.topic] = stamp
         if not any(skeleton.valid.any() for skeleton in skeletons):
-            counters["frames without a body"] += 1
-            continue
-        yield sensor, skeletons, raw.log_time_ns, raw.cdr
+            self._counters["frames without a body"] += 1
+            return None
+        return skeletons
 
 
 def skeletons_of(
     bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
 ) -> Iterator[tuple[str, Skeleton, int, bytes]]:
-    """The same with the body that is nearest to the sensor, as long as it is there, instead of all."""
+    """Each sensor's frames in log-time order: sensor, the body that is nearest to it, log time, and the message.
+
+    A body stays the nearest one for as long as it is there. Frames of no use are counted and skipped.
+    """
     subjects = {sensor: SubjectSelector() for sensor in topics.values()}
     last: dict[str, int] = {}
-    for sensor, skeletons, log_time_ns, cdr in frames_of(bag, topics, counters):
+    frames = _Frames(topics, counters)
+    for raw in bag.messages(topics.keys()):
+        skeletons, sensor = frames.skeletons(raw), topics[raw.topic]
+        if skeletons is None:
+            continue
         stamp = skeletons[0].stamp_ns
         if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
             subjects[sensor].reset()
         last[sensor] = stamp
         subject = subjects[sensor].pick(skeletons)
         assert subject is not None  # a body is there
-        yield sensor, subject, log_time_ns, cdr
+        yield sensor, subject, raw.log_time_ns, raw.cdr
 
 
 class Progress:
@@ -181,41 +259,47 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         topics = sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
-        inertial = () if settings.imus is None else graph.played_imu_topics(settings.imus.segments, bag.topics)
-        kept = (*topics, *truth, *inertial)
+        kept = (*topics, *truth, *graph.played_imu_topics(settings.imus, bag.topics))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
-        upstream = Upstream(settings)  # before `out` is touched
-        downstream = start_downstream(settings, out, passed, overwrite=overwrite)
+        if settings.calibration_file is not None:
+            load(settings.calibration_file)  # it has to be there
+        values = settings.values()
+        stages = [
+            stage_class(name)(values[name]) for name in values if name not in forked.STAGES
+        ]  # before `out` is touched
+        stages.sort(key=lambda stage: STAGES.index(stage.NAME))
+        written_by_us = {
+            p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
+        }
+        job = forked.Job(values, out, {**passed, **written_by_us}, overwrite, settings.model_covariance)
+        downstream = forked.start_downstream(job)
         try:
-            upstream.sink = downstream
-            progress = Progress(bag.start_ns, bag.end_ns)
-            beside = _Passed(bag, truth, downstream)
-            felt = _Felt(bag, inertial, downstream, upstream, counters)
+            runner = OfflineRunner(stages, BAG_WIRE, downstream.take)
+            progress, frames = Progress(bag.start_ns, bag.end_ns), _Frames(topics, counters)
             started = False
-            for sensor, skeletons, log_time_ns, cdr in frames_of(bag, topics, counters):
-                beside.until(log_time_ns)
-                felt.until(log_time_ns)
-                if not started:
-                    started = True
-                    upstream.start(log_time_ns)
-                downstream.take(graph.skeleton_topic(sensor), cdr, log_time_ns)
-                upstream.push(sensor, skeletons, log_time_ns)
-                progress.at(log_time_ns)
-            beside.until(None)
-            felt.until(None)
-            upstream.finish(bag.end_ns)
-            written = downstream.finish()
+            for raw in bag.messages(kept):
+                if raw.topic in topics:
+                    if frames.skeletons(raw) is None:
+                        continue
+                    if not started:
+                        started = True
+                        runner.start(raw.log_time_ns)
+                downstream.take(raw.topic, raw.cdr, raw.log_time_ns)
+                runner.push(raw.topic, raw.cdr, raw.log_time_ns)
+                progress.at(raw.log_time_ns)
+            runner.finish(bag.end_ns)
+            written = downstream.finish(bag.end_ns)
         except BaseException:
             downstream.abandon()
             raise
         progress.end()
+        counters.update(runner.counters)
         if not written.frames:
             raise ReplayError(
                 f"{bag_path}: no frame of {', '.join(settings.sensors)} came through ({_listed(counters)})"
             )
-        if upstream.imus is not None:
-            counters.update({f"inertial {name}": count for name, count in upstream.imus.tracker.counters.items()})
-        counters.update({f"fusion {name}": count for name, count in upstream.fusion.counters.items()})
+        for stage in stages:
+            counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters.update({f"filter {name}": count for name, count in written.counters.items()})
         return ReplayReport(
             written.frames,
@@ -224,41 +308,6 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             {name: count for name, count in sorted(counters.items()) if count},
             tuple(bag.warnings),
         )
-
-
-class _Passed:
-    """Messages that go from one bag to the other as they are, in step with the rest."""
-
-    def __init__(self, bag: BagReader, topics: Collection[str], sink: Sink) -> None:
-        self._messages = iter(bag.messages(topics)) if topics else iter(())
-        self._next = next(self._messages, None)
-        self._sink = sink
-
-    def until(self, log_time_ns: int | None) -> None:
-        """All up to a log time, or all."""
-        while self._next is not None and (log_time_ns is None or self._next.log_time_ns <= log_time_ns):
-            self._pass(self._next)
-            self._next = next(self._messages, None)
-
-    def _pass(self, message: RawMessage) -> None:
-        self._sink.take(message.topic, message.cdr, message.log_time_ns)
-
-
-class _Felt(_Passed):
-    """Likewise messages of inertial sensors, which are tracked besides; malformed ones are counted."""
-
-    def __init__(
-        self, bag: BagReader, topics: Collection[str], sink: Sink, upstream: Upstream, counters: Counter[str]
-    ) -> None:
-        super().__init__(bag, topics, sink)
-        self._upstream, self._counters = upstream, counters
-
-    def _pass(self, message: RawMessage) -> None:
-        super()._pass(message)
-        try:
-            self._upstream.feel(message.topic, message.cdr, message.log_time_ns)
-        except BodyTrackingError:
-            self._counters[f"malformed {message.topic}"] += 1
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -301,68 +350,42 @@ def values_for(
     return check_all(table, {name: value for name, value in given.items() if name not in own}), others
 
 
-_SHARED: dict[str, Value] = {
-    "use_sim_time": False,
-    "reliable": False,
-    "world_frame": "",
-    "sensors": (),
-    "reference": "",
-}
-
-
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings that a command line asks for."""
-    file = args.params_file
-    calibration, _ = parameters_for("calibration", CalibrationParameters, file, {**_SHARED, "calibration_file": ""})
-    whom: dict[str, Value] = {item.name: item.default for item in PEOPLE}
-    fusion, shared = parameters_for("fusion", FusionParameters, file, {**_SHARED, **whom})
-    own = {**_SHARED, "body": ""}
-    table = (FILTER, INPUT, ORDER_WAIT, PREDICT_AFTER, ORIENTATIONS, *PEOPLE, *filter_table())
-    filtering, _ = values_for("skeleton_filter", table, file, own)
-    values_for("joint_angles", ANGLES, file, {**own, **whom})
-    # What one node is told and another must know: from the command line, else from the file.
-    options = graph.GraphOptions(
-        filter_name=args.filter or "", convention=args.convention or "", subject=args.subject or "", people=args.people
+    asked = graph.GraphOptions(
+        filter_name=args.filter or "",
+        convention=args.convention or "",
+        subject=args.subject or "",
+        people=args.people,
+        external=True,
     )
-    chosen = graph.with_file(options, file)
-    if chosen.subject:
-        filtering["subject"] = chosen.subject
-    if chosen.people:
-        filtering["people"] = chosen.people
-    filter_name = chosen.filter_name or DEFAULT_FILTER
-    imus = _imus_from(chosen, file)
+    chosen = graph.with_file(asked, args.params_file)
+    specs = [spec for spec in graph.nodes_for(chosen) if spec.name in STAGES]
+    given = parameters_of_nodes(specs, args.params_file, absent=graph.all_nodes_for(chosen))
+    left = ("use_sim_time", "sensors", "calibration_file")
+    parameters = {
+        node: {name: value for name, value in values.items() if name not in left} for node, values in given.items()
+    }
+    whom = given["skeleton_filter"]
+    people = {name: whom[name] for name in ("subject", "people", "hold") if name in whom}
+    for node in ("skeleton_filter", "joint_angles"):
+        parameters[node]["body"] = args.body
+    if args.reference:
+        for values in parameters.values():
+            values["reference"] = args.reference
     return ReplaySettings(
         tuple(args.sensors.split(",")) if args.sensors else (),
-        args.reference or str(shared.get("reference", "")),
-        filter_name,
-        chosen.filter_input or graph.AUTO,
-        float(str(filtering["predict_after"])),
-        float(str(filtering["order_wait"])),
+        args.reference or "",
+        chosen.filter_name or DEFAULT_FILTER,
         chosen.convention or graph.AUTO,
+        chosen.filter_input or graph.AUTO,
         chosen.angles_input or graph.AUTO,
-        args.body,
-        calibration,
-        fusion,
-        filter_parameters(filter_name, filtering),
         args.calibration,
-        imus,
-        _names(filtering["orientations"]) or tuple(each.segment for each in graph.imu_topics(chosen.imus)),
-        people_from(filtering),
-        args.model_covariance,
+        chosen.imus,
+        PeopleParameters(**people),  # type: ignore[arg-type]
+        parameters=parameters,
+        model_covariance=args.model_covariance,
     )
-
-
-def _imus_from(chosen: graph.GraphOptions, file: Path | None) -> ImuSettings | None:
-    """The inertial sensors that a parameters file lists; None where it lists none."""
-    values, _ = values_for("imu_skeleton", IMU_PARAMETERS, file, {**_SHARED, "subject": ""})
-    if not chosen.imus:
-        return None
-    parameters: dict[str, Any] = fields_of(TrackingParameters, values)
-    return ImuSettings(chosen.imus, _names(values["mountings"]), TrackingParameters(**parameters))
-
-
-def _names(value: Value) -> tuple[str, ...]:
-    return value if isinstance(value, tuple) else ()
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -89,6 +89,21 @@ def deserialize(type_name: str, cdr: bytes) -> Any:
         raise BagError(f"{len(cdr)} bytes are no {type_name}: {error}") from error
 
 
+class BagWire:
+    """Serialisation by ``rosbags``, where there is no ROS."""
+
+    types = BAG_MESSAGES
+
+    def serialize(self, type_name: str, message: Any) -> bytes:
+        return serialize(message)
+
+    def deserialize(self, type_name: str, cdr: bytes) -> Any:
+        return deserialize(type_name, cdr)
+
+
+BAG_WIRE = BagWire()
+
+
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
     """A topic of a bag.

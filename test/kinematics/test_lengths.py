@@ -17,9 +17,8 @@ from body_tracking.kinematics.lengths import LengthEstimate, SegmentLengths, Ske
 from body_tracking.kinematics.upper_body import LENGTHS
 from body_tracking.measurement import BASE_STDDEV
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import replay
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.recording.stages import ReplaySettings
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson, capture_times, truth_of
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint
 

@@ -9,10 +9,9 @@ import pytest
 from body_tracking import cli, graph, names
 from body_tracking.doctor import PROBLEM
 from body_tracking.doctor.bags import bag as examined
-from body_tracking.recording.replay import replay
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, RawMessage
-from body_tracking.recording.stages import ReplaySettings
 
 
 def copied(bag: Path, folder: Path, *namespaces: str) -> Path:

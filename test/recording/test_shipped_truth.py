@@ -9,8 +9,7 @@ import pytest
 
 from body_tracking.evaluation.summary import Tracked, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
-from body_tracking.recording.replay import replay
-from body_tracking.recording.stages import ReplaySettings
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import SHIPPED
 from body_tracking.skeleton import FloatArray
 from draws import some

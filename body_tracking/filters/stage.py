@@ -1,26 +1,18 @@
-"""What the node ``skeleton_filter`` does, without ROS: skeletons and calibrations in, serialised messages out.
+"""Fused skeletons, or every sensor's skeletons and orientations, to filtered ones and the state of a body model.
 
-The node and the offline replay run this same class, so that they publish the same.
+The stage of the node ``skeleton_filter``.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
 from body_tracking import graph
 from body_tracking.calibration.result import ClockModel, SensorPose
-from body_tracking.cdr import (
-    encode_covariance,
-    encode_model_state,
-    encode_model_stddev,
-    encode_segments,
-    encode_skeletons,
-    encode_string,
-)
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,
@@ -33,13 +25,38 @@ from body_tracking.filters.prediction import Prediction
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
-from body_tracking.fusion.people import People, PeopleParameters
+from body_tracking.fusion.people import PEOPLE, People, PeopleParameters, people_from
+from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.fusion.subject import ALL, HeldSubject
 from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, segment_poses
-from body_tracking.messages.base import POINT_CLOUD
+from body_tracking.kinematics.tracking import LengthChanges
 from body_tracking.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.pipeline.codecs import (
+    Ids,
+    ModelCovariance,
+    ModelState,
+    ModelStddev,
+    Orientation,
+    Segments,
+    Skeletons,
+    Text,
+)
+from body_tracking.pipeline.shared import (
+    BODY,
+    REFERENCE,
+    RELIABLE,
+    SENSORS,
+    WORLD_FRAME,
+    names_in,
+    result_qos,
+    sensors_of,
+    skeleton_input,
+    skeleton_qos,
+)
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.recording.qos import Qos
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
@@ -82,28 +99,6 @@ ORIENTATIONS = Parameter(
     (),
     "ekf: segments whose orientations by inertial sensors it takes, from /imu/<segment>/orientation",
 )
-PEOPLE = parameters_from(PeopleParameters)
-"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
-
-ANGLES = (
-    Parameter(
-        "convention",
-        graph.AUTO,
-        "which angles: the model's own, those of the ISB, of REP-155, of Schlagenhauf (2017), or angles between joint "
-        "positions; auto: model where they are made of a model's state, else positional",
-        choices=(graph.AUTO, *ALL_CONVENTIONS),
-        live=True,
-    ),
-    Parameter(
-        "input",
-        graph.AUTO,
-        "what they are made of: the state of the filter's model, or filtered skeletons, to which a model is fitted "
-        "(positional angles need none); auto: what the filter publishes, also where that changes",
-        choices=(graph.AUTO, graph.SKELETON_INPUT, graph.MODEL_INPUT),
-        live=True,
-    ),
-)
-"""The parameters of ``joint_angles`` that the offline graph has too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,16 +143,6 @@ def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
     return {graph.orientation_topic(segment): segment for segment in segments}
 
 
-def people_from(values: Mapping[str, Value]) -> PeopleParameters:
-    """Whom to track, of the values of :data:`PEOPLE`.
-
-    Raises:
-        ParameterError: one of them is out of its range.
-    """
-    given = {item.name: item.check(values[item.name]) for item in PEOPLE}
-    return PeopleParameters(**fields_of(PeopleParameters, given))
-
-
 def filter_table() -> tuple[Parameter, ...]:
     """The parameters of all filters, as ``skeleton_filter`` has them."""
     return tuple(
@@ -173,43 +158,12 @@ def filter_parameters(name: str, values: Mapping[str, Value]) -> dict[str, Any]:
     return fields_of(parameter_classes()[prefix], values, prefix=prefix)
 
 
-def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[str, AngleStream]:
-    """Joint angles in one convention, of each person who may be tracked, by id.
-
-    Args:
-        convention: one of ``ALL_CONVENTIONS``.
-        body: the id of one subject.
-        people: whom to track.
-
-    Raises:
-        ConventionError: another one.
-    """
-    if people.subject != ALL:
-        return {body: AngleStream(convention)}
-    return {each: AngleStream(convention, _AWAY / NANOSECONDS) for each in graph.bodies(people.people)}
-
-
-def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: bool) -> Iterator[tuple[str, Skeleton]]:
-    """The skeletons of one message, each with the id of its person.
-
-    Args:
-        skeletons: as ``/filtered/skeleton`` has them.
-        ids: of those who may be in it, in the order of their numbers.
-        several: whether ``body`` is the number of a person; else the first skeleton is that of the only one.
-    """
-    for number, body in enumerate(ids, 1):
-        if not several:
-            yield body, skeletons[0]
-            return
-        yield from ((body, skeleton) for skeleton in skeletons if skeleton.body == number)
-
-
-class FilterStage:
-    """Feeds a filter and publishes what it makes.
+class PersonFilter:
+    """Feeds the filter of one person and publishes its output.
 
     Args:
         settings: which one.
-        publish: takes a topic, a serialised message and its capture time.
+        publish: takes a topic, the content of a message and its capture time.
         wanted: whether to make messages of a topic at all; always when None.
         one_of_several: gets the filtered skeletons instead of ``publish``, of one of several people; frames are of this
             person alone then, and topics below the person's name.
@@ -228,7 +182,7 @@ class FilterStage:
     def __init__(
         self,
         settings: FilterSettings,
-        publish: Callable[[str, bytes, int], None],
+        publish: Callable[[str, Any, int], None],
         wanted: Callable[[str], bool] | None = None,
         one_of_several: Callable[[Skeleton], None] | None = None,
     ) -> None:
@@ -283,16 +237,25 @@ class FilterStage:
         if self.alignment is not None:
             self.alignment.set_clock(sensor, valid_from_ns, clock)
 
-    def inherit(self, before: FilterStage | PeopleStage) -> None:
-        """Take over what is known of the sensors from the stage that was there before: latched poses come once."""
-        if self.by_sensor and before.by_sensor and isinstance(before, FilterStage):
+    def inherit(self, before: PersonFilter | PeopleFilter) -> None:
+        """Take over what is known of the sensors from the filter that was there before: latched poses come once."""
+        if self.by_sensor and before.by_sensor and isinstance(before, PersonFilter):
             self.alignment, self.people = before.alignment, before.people
 
-    @property
-    def topics(self) -> dict[str, str]:
-        """What it publishes, and of which type."""
-        topics = {graph.FILTERED: POINT_CLOUD}
-        return topics | self._topics.types() if self.models else topics
+    def outputs(self, skeletons: Qos, results: Qos) -> tuple[Port, ...]:
+        """The topics that it publishes, where skeletons and results have these qualities of service."""
+        filtered = (Port(graph.FILTERED, Skeletons(), skeletons, measured=True),)
+        if self._model_filter is None:
+            return filtered
+        model, topics = self._model_filter.model, self._topics
+        return (
+            *filtered,
+            Port(topics.state, ModelState(model), skeletons, measured=True),
+            Port(topics.stddev, ModelStddev(model), skeletons),
+            Port(topics.covariance, ModelCovariance(model), skeletons),
+            Port(topics.segments, Segments(model), results),
+            Port(topics.urdf, Text(), graph.URDF_QOS),
+        )
 
     @property
     def tracked(self) -> tuple[str, ...]:
@@ -315,25 +278,12 @@ class FilterStage:
         elif (filtered := self._filter.update(skeleton)) is not None:
             self._skeleton(filtered)
 
-    def on_sensor(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
-        """One frame of one sensor.
+    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """Keep one frame of one sensor: the next :meth:`poll` takes all that are here, in the order of their stamps.
 
         Args:
             sensor: its name.
             skeletons: the bodies in it, in the sensor's own frame and clock.
-            now_ns: as above.
-        """
-        aligned = self._aligned(sensor, skeletons)
-        if aligned is not None:
-            self.poll(now_ns)
-            self._take(self._ordering.push(sensor, aligned, now_ns), now_ns)
-
-    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
-        """The same for one of several frames that are here: the next :meth:`poll` takes them together, in their order.
-
-        Args:
-            sensor: as above.
-            skeletons: as above.
             now_ns: as above.
         """
         aligned = self._aligned(sensor, skeletons)
@@ -430,33 +380,26 @@ class FilterStage:
                 from body_tracking.kinematics.urdf import urdf
 
                 text = urdf(self._model_filter.model, estimate.lengths, self._body)
-                self._publish(self._topics.urdf, encode_string(text), estimate.stamp_ns)
+                self._publish(self._topics.urdf, text, estimate.stamp_ns)
 
     def _publish_skeleton(self, skeleton: Skeleton) -> None:
-        self._publish(graph.FILTERED, encode_skeletons([skeleton]), skeleton.stamp_ns)
+        self._publish(graph.FILTERED, (skeleton,), skeleton.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
         """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""
         assert self._model_filter is not None
-        model, stamp_ns = self._model_filter.model, estimate.stamp_ns
         if self._wanted(graph.FILTERED):
             skeleton = skeleton or self._model_filter.filtered
             assert skeleton is not None
             self._skeleton(skeleton)
         topics = self._topics
-        if self._wanted(topics.state):
-            self._publish(topics.state, encode_model_state(estimate, model), stamp_ns)
-        if self._wanted(topics.stddev):
-            self._publish(topics.stddev, encode_model_stddev(estimate, model), stamp_ns)
-        if self._wanted(topics.covariance):
-            self._publish(topics.covariance, encode_covariance(estimate), stamp_ns)
-        if self._wanted(topics.segments):
-            placed = segment_poses(estimate, model)
-            self._publish(topics.segments, encode_segments(estimate, model.segment_names, *placed), stamp_ns)
+        for topic in (topics.state, topics.stddev, topics.covariance, topics.segments):
+            if self._wanted(topic):
+                self._publish(topic, estimate, estimate.stamp_ns)
 
 
-class PeopleStage:
-    """A :class:`FilterStage` of each person; each gives what it would give if there were nobody else.
+class PeopleFilter:
+    """A :class:`PersonFilter` of each person; each gives what it would give if there were nobody else.
 
     Arguments and errors as there.
 
@@ -468,12 +411,14 @@ class PeopleStage:
     def __init__(
         self,
         settings: FilterSettings,
-        publish: Callable[[str, bytes, int], None],
+        publish: Callable[[str, Any, int], None],
         wanted: Callable[[str], bool] | None = None,
     ) -> None:
         ids = graph.bodies(settings.people.people)
-        self._stages = [FilterStage(replace(settings, body=body), publish, wanted, self._told) for body in ids]
-        first = self._stages[0]
+        self._persons = [
+            PersonFilter(replace(settings, body=body), publish, wanted, self._filtered_one) for body in ids
+        ]
+        first = self._persons[0]
         self.by_sensor, self.models = first.by_sensor, first.models
         self._ids = ids
         self._publish = publish
@@ -484,31 +429,31 @@ class PeopleStage:
         if first.alignment is not None:
             self.people = People(settings.sensors, settings.people, first.alignment.reference, self._gone)
 
-    def inherit(self, before: FilterStage | PeopleStage) -> None:
-        """Take over what is known of the sensors from the stage that was there before: latched poses come once."""
-        if isinstance(before, PeopleStage) and self.people is not None and before.people is not None:
+    def inherit(self, before: PersonFilter | PeopleFilter) -> None:
+        """Take over what is known of the sensors from the filter that was there before: latched poses come once."""
+        if isinstance(before, PeopleFilter) and self.people is not None and before.people is not None:
             self.people, self.people.gone = before.people, self._gone
-            for stage, former in zip(self._stages, before._stages, strict=True):
-                stage.inherit(former)
+            for person, former in zip(self._persons, before._persons, strict=True):
+                person.inherit(former)
 
-    @property
-    def topics(self) -> dict[str, str]:
-        """What it publishes, and of which type."""
-        return {topic: kind for stage in self._stages for topic, kind in stage.topics.items()}
+    def outputs(self, skeletons: Qos, results: Qos) -> tuple[Port, ...]:
+        """As of :class:`PersonFilter`."""
+        ports = (port for person in self._persons for port in person.outputs(skeletons, results))
+        return tuple({port.topic: port for port in ports}.values())
 
     @property
     def tracked(self) -> tuple[str, ...]:
         """The ids of the people who are there."""
         if self.people is not None:
             return tuple(self._ids[number - 1] for number in self.people.tracked)
-        return tuple(body for stage in self._stages for body in stage.tracked)
+        return tuple(body for person in self._persons for body in person.tracked)
 
     @property
     def counters(self) -> dict[str, int]:
         """What happened since the construction, to all together."""
         total: Counter[str] = Counter()
-        for stage in self._stages:
-            total.update(stage.counters)
+        for person in self._persons:
+            total.update(person.counters)
         if self.people is not None:
             total.update({f"association {name}": count for name, count in self.people.counters.items()})
         return dict(total)
@@ -517,15 +462,15 @@ class PeopleStage:
         """A sensor's pose, in force from its time on."""
         if self.people is not None:
             self.people.set_pose(pose)
-        for stage in self._stages:
-            stage.set_pose(pose)
+        for person in self._persons:
+            person.set_pose(pose)
 
     def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
         """A sensor's clock, in force from a reference time on."""
         if self.people is not None:
             self.people.set_clock(sensor, valid_from_ns, clock)
-        for stage in self._stages:
-            stage.set_clock(sensor, valid_from_ns, clock)
+        for person in self._persons:
+            person.set_clock(sensor, valid_from_ns, clock)
 
     def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """One fused frame.
@@ -540,63 +485,56 @@ class PeopleStage:
             if stamp_ns - last_ns > _AWAY:  # somebody else may have the number now
                 self._gone(number)
         for skeleton in skeletons:
-            if 1 <= skeleton.body <= len(self._stages):
+            if 1 <= skeleton.body <= len(self._persons):
                 self._last_ns[skeleton.body] = stamp_ns
-                self._stages[skeleton.body - 1].on_fused([skeleton], now_ns)
-        self.poll(now_ns)
-
-    def on_sensor(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
-        """One frame of one sensor, with all bodies in it; arguments as of :meth:`FilterStage.on_sensor`."""
-        assert self.people is not None
-        for number, body in self.people.sort(sensor, skeletons):
-            self._stages[number - 1].on_sensor(sensor, [replace(body, body=number)], now_ns)
+                self._persons[skeleton.body - 1].on_fused([skeleton], now_ns)
         self.poll(now_ns)
 
     def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
-        """The same for one of several frames that are here; see :meth:`FilterStage.hold`."""
+        """As of :class:`PersonFilter`, with all bodies in the frame."""
         assert self.people is not None
         for number, body in self.people.sort(sensor, skeletons):
-            self._stages[number - 1].hold(sensor, [replace(body, body=number)], now_ns)
+            self._persons[number - 1].hold(sensor, [replace(body, body=number)], now_ns)
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """The orientation of one segment of the one who wears the sensors: who is nearest to the reference sensor."""
         wearer = self._wearer.body if self.people is None else self.people.nearest
-        if wearer is not None and wearer <= len(self._stages):
-            self._stages[wearer - 1].on_orientation(measurement, now_ns)
+        if wearer is not None and wearer <= len(self._persons):
+            self._persons[wearer - 1].on_orientation(measurement, now_ns)
             self._flush()
 
     def poll(self, now_ns: int) -> None:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
-        for stage in self._stages:
-            stage.poll(now_ns)
+        for person in self._persons:
+            person.poll(now_ns)
         self._flush()
 
     def settle(self) -> None:
-        """As of :class:`FilterStage`."""
-        for stage in self._stages:
-            stage.settle()
+        """As of :class:`PersonFilter`."""
+        for person in self._persons:
+            person.settle()
 
     @property
     def deadline_ns(self) -> int | None:
-        """As of :class:`FilterStage`, of whoever comes first."""
-        return min((at for stage in self._stages if (at := stage.deadline_ns) is not None), default=None)
+        """As of :class:`PersonFilter`, of whoever comes first."""
+        return min((at for person in self._persons if (at := person.deadline_ns) is not None), default=None)
 
     @property
     def due_ns(self) -> int | None:
-        """As of :class:`FilterStage`, of whoever comes first."""
-        return min((at for stage in self._stages if (at := stage.due_ns) is not None), default=None)
+        """As of :class:`PersonFilter`, of whoever comes first."""
+        return min((at for person in self._persons if (at := person.due_ns) is not None), default=None)
 
     def reset(self) -> None:
         """Forget everybody, because time jumped back; poses and clocks stay."""
         self._last_ns.clear()
-        for stage in self._stages:
-            stage.reset()
+        for person in self._persons:
+            person.reset()
 
     def _gone(self, number: int) -> None:
         self._last_ns.pop(number, None)
-        self._stages[number - 1].forget()
+        self._persons[number - 1].forget()
 
-    def _told(self, skeleton: Skeleton) -> None:
+    def _filtered_one(self, skeleton: Skeleton) -> None:
         self._filtered.append(skeleton)
 
     def _flush(self) -> None:
@@ -604,14 +542,149 @@ class PeopleStage:
         filtered, self._filtered = self._filtered, []
         filtered.sort(key=lambda each: (each.stamp_ns, each.body))
         for stamp_ns, together in groupby(filtered, key=lambda each: each.stamp_ns):
-            self._publish(graph.FILTERED, encode_skeletons(list(together)), stamp_ns)
+            self._publish(graph.FILTERED, tuple(together), stamp_ns)
 
 
-def make_stage(
+def filter_of(
     settings: FilterSettings,
-    publish: Callable[[str, bytes, int], None],
+    publish: Callable[[str, Any, int], None],
     wanted: Callable[[str], bool] | None = None,
-) -> FilterStage | PeopleStage:
-    """The stage that the settings ask for; arguments and errors as of :class:`FilterStage`."""
-    stage = PeopleStage if settings.people.subject == ALL else FilterStage
-    return stage(settings, publish, wanted)
+) -> PersonFilter | PeopleFilter:
+    """The filter that the settings ask for; arguments and errors as of :class:`PersonFilter`."""
+    of_people = settings.people.subject == ALL
+    return PeopleFilter(settings, publish, wanted) if of_people else PersonFilter(settings, publish, wanted)
+
+
+_CALIBRATIONS = 1000
+"""Poses, and clocks, that may wait while the filter is busy; none is to be lost."""
+_ORIENTATIONS = 32
+"""Orientations of a segment that may wait likewise: half a second of them."""
+
+
+class FilterStage(Stage):
+    """Filters fused skeletons, or what every sensor sees."""
+
+    NAME = "skeleton_filter"
+    PARAMETERS = (
+        FILTER,
+        INPUT,
+        SENSORS,
+        REFERENCE,
+        WORLD_FRAME,
+        BODY,
+        ORDER_WAIT,
+        PREDICT_AFTER,
+        ORIENTATIONS,
+        *PEOPLE,
+        *filter_table(),
+        RELIABLE,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self._published: list[Output] = []
+        self._tracked: tuple[str, ...] = ()
+        self._t_poses = 0
+        self._stamp_ns = 0
+        self.filter = self._made(values)
+        self._connect(values)
+
+    def _made(self, values: Mapping[str, Value]) -> PersonFilter | PeopleFilter:
+        given: dict[str, Any] = dict(values)
+        name = given["filter"]
+        settings = FilterSettings(
+            name,
+            filter_parameters(name, values),
+            given["input"],
+            sensors_of(values),
+            given["reference"],
+            given["world_frame"],
+            graph.check_body(given["body"]),
+            given["predict_after"],
+            given["order_wait"],
+            people_from(values),
+        )
+        return filter_of(settings, self._publish, self.wanted)
+
+    def _connect(self, values: Mapping[str, Value]) -> None:
+        """Take what the filter needs, and nothing else."""
+        orientations = orientation_topics(names_in(values["orientations"]))
+        self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors_of(values)}
+        qos = skeleton_qos(values)
+        if self.filter.by_sensor:
+            self.inputs = (
+                *calibration_inputs(len(self._sensors), _CALIBRATIONS),
+                *(skeleton_input(topic, values) for topic in self._sensors),
+                *(Port(topic, Orientation(each), qos, _ORIENTATIONS) for topic, each in orientations.items()),
+            )
+        else:
+            self.inputs = (skeleton_input(graph.FUSED, values),)
+        self.outputs = (
+            *self.filter.outputs(qos, result_qos(values)),
+            Port(graph.TRACKED, Ids(), RELIABLE_QOS, optional=True),
+        )
+
+    def change(self, values: Mapping[str, Value]) -> None:
+        """A new filter starts from the next frame on."""
+        made = self._made(values)
+        made.inherit(self.filter)
+        self.filter, self.values = made, values
+        self._connect(values)
+
+    def _publish(self, topic: str, payload: Any, stamp_ns: int) -> None:
+        self._published.append(Output(topic, payload, stamp_ns))
+
+    def _taken(self) -> Iterable[Output]:
+        """What the filter has published, and the ids of those who are tracked where these are others now."""
+        published, self._published = self._published, []
+        if published:
+            self._stamp_ns = published[-1].stamp_ns or self._stamp_ns
+        if self.filter.tracked != self._tracked:
+            self._tracked = self.filter.tracked
+            payload = self._stamp_ns, str(self.values["world_frame"]), self._tracked
+            published.append(Output(graph.TRACKED, payload, self._stamp_ns))
+        return published
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        if topic == graph.CALIBRATION_CLOCK:
+            self.filter.set_clock(*payload)
+        elif topic == graph.CALIBRATION:
+            self.filter.set_pose(payload)
+        elif topic == graph.FUSED:
+            self.filter.on_fused(payload, now.steady_ns)
+        elif topic in self._sensors:
+            self.filter.hold(self._sensors[topic], payload, now.steady_ns)
+        else:
+            self.filter.on_orientation(payload, now.steady_ns)
+        return self._taken()
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        self.filter.poll(steady_ns)
+        return self._taken()
+
+    @property
+    def deadline_ns(self) -> int | None:
+        return self.filter.deadline_ns
+
+    @property
+    def due_ns(self) -> int | None:
+        return self.filter.due_ns
+
+    def settle(self) -> None:
+        self.filter.settle()
+
+    def reset(self, topic: str) -> None:
+        """Of a sensor, the alignment finds out by itself."""
+        if topic == graph.FUSED:
+            self.filter.reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        counters = self.filter.counters
+        before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
+        if self._t_poses > before:
+            self.events.append("learnt from a T-pose where sensors see this person's joints: angles are better now")
+        return 0, str(self.values["filter"]), {"tracked": ", ".join(self.filter.tracked), **counters}
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return self.filter.counters

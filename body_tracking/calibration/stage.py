@@ -1,0 +1,114 @@
+"""All ``/<sensor>/skeleton`` to the poses and clocks of the sensors: the stage of the node ``calibration``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from body_tracking import graph
+from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
+from body_tracking.calibration.storage import load, save
+from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.names import TF_STATIC
+from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.pipeline.codecs import Clock, Pose, Poses, SensorClock
+from body_tracking.pipeline.shared import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, sensors_of, skeleton_input
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.recording.qos import LATCHED, Qos
+
+_LEVEL = "world would tilt or move under everyone who uses it"
+_MEMORY = "the frames remembered so far were chosen by it"
+_STAMPS = "by it a recording gives offline what it gave live"
+_FIXED = {
+    "method": "what one method has estimated is no start for the other",
+    **dict.fromkeys(("reference_height", "reference_pitch", "reference_roll"), _LEVEL),
+    **dict.fromkeys(("history", "pairs_per_place", "capacity"), _MEMORY),
+    **dict.fromkeys(("settle_time", "activation_delay"), _STAMPS),
+}
+
+
+class CalibrationStage(Stage):
+    """Estimates where the sensors stand and how their clocks run, from a person who moves."""
+
+    NAME = "calibration"
+    PARAMETERS = (
+        SENSORS,
+        REFERENCE,
+        Parameter(
+            "calibration_file",
+            "",
+            "YAML file: loaded at the start if it exists, saved when the result changes; or empty",
+            fixed="it is loaded at the start",
+        ),
+        WORLD_FRAME,
+        *parameters_from(CalibrationParameters, live=True, fixed=_FIXED),
+        RELIABLE,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        sensors = sensors_of(values)
+        parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
+        self.calibration = OnlineCalibration(sensors, parameters, str(values["reference"]) or None)
+        self._file = Path(str(values["calibration_file"])).expanduser() if values["calibration_file"] else None
+        if self._file is not None and self._file.exists():
+            self.calibration.load(load(self._file))
+        self._unsaved = False
+        self._subjects = {sensor: SubjectSelector() for sensor in sensors}
+        self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
+        self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
+        world = str(values["world_frame"])
+        # Two batches: who comes late needs the one in force while the latest one is in force only later.
+        kept = Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(sensors)))
+        self.outputs = (
+            Port(graph.CALIBRATION_CLOCK, Clock(), kept),
+            Port(graph.CALIBRATION, Pose(world), kept, measured=True),
+            Port(TF_STATIC, Poses(world), LATCHED, optional=True),
+        )
+        self.services = {graph.START_SERVICE: self.calibration.start, graph.RESET_SERVICE: self.calibration.reset}
+
+    def change(self, values: Mapping[str, Value]) -> None:
+        """From the next frame on; what was estimated stays."""
+        self.calibration.parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
+        self.values = values
+
+    def start(self, now: Now) -> Iterable[Output]:
+        return self._published([self.calibration.current_update()])
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        sensor = self._sensors[topic]
+        subject = self._subjects[sensor].pick(payload)
+        if subject is None:
+            return ()
+        updates = self.calibration.push(sensor, subject, now.ros_ns)
+        self._unsaved |= bool(updates)
+        self.events += self.calibration.events
+        self.calibration.events.clear()
+        return self._published(updates)
+
+    def _published(self, updates: Iterable[CalibrationUpdate]) -> Iterator[Output]:
+        for update in updates:
+            result = update.result
+            # Clocks first: with a pose comes the first use.
+            for sensor, clock in result.clocks.items():
+                if sensor != result.reference:
+                    yield Output(graph.CALIBRATION_CLOCK, SensorClock(sensor, update.valid_from_ns, clock))
+            for pose in result.poses.values():
+                yield Output(graph.CALIBRATION, pose)
+            yield Output(TF_STATIC, tuple(result.poses.values()))
+
+    def reset(self, topic: str) -> None:
+        """The calibration itself sees the jump in the stamps; only who the subject is may have changed."""
+        for subject in self._subjects.values():
+            subject.reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        return self.calibration.status()
+
+    def save(self) -> None:
+        """Write the file, if anything changed."""
+        if self._file is not None and self._unsaved:
+            # What is published, not the estimate that it still moves toward: a restart must not jump.
+            save(self.calibration.current_update().result, self._file)
+            self._unsaved = False

@@ -1,0 +1,156 @@
+"""``sensor_msgs/Imu`` per segment to orientations and a skeleton: the stage of the node ``imu_skeleton``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from body_tracking import graph
+from body_tracking.errors import BodyTrackingError
+from body_tracking.fusion.association import HOLD
+from body_tracking.fusion.people import PEOPLE
+from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
+from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.tracking import InertialTracker
+from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.pipeline.codecs import Field, Orientation, Reading, Skeletons
+from body_tracking.pipeline.shared import (
+    REFERENCE,
+    RELIABLE,
+    SENSORS,
+    WORLD_FRAME,
+    names_in,
+    skeleton_input,
+    skeleton_qos,
+)
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.sensors.imu import ImuSample
+from body_tracking.skeleton import NANOSECONDS, FloatArray
+
+SEGMENTS = Parameter(
+    "segments",
+    (),
+    "segments with an inertial sensor, each as SEGMENT (topics /SEGMENT/imu/data, data_raw and mag), SEGMENT:NAME (the "
+    "same of another name) or SEGMENT:/TOPIC",
+)
+MOUNTINGS = Parameter(
+    "mountings",
+    (),
+    "SEGMENT:AXES of sensors that are not put on as usual: where their x and z point on the hanging arm or the upright "
+    "trunk of somebody who looks along x with y to the left, as in forearm_left:-z+y",
+)
+IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters))
+_READINGS = 64
+"""Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
+_FIELD_NS = NANOSECONDS // 20
+"""A magnetic field goes with a reading no further away than this."""
+
+
+class ImuStage(Stage):
+    """Tracks the segments of a body by inertial sensors."""
+
+    NAME = "imu_skeleton"
+    PARAMETERS = (
+        *IMU_PARAMETERS,
+        *(item for item in PEOPLE if item.name == "subject"),
+        SENSORS,
+        REFERENCE,
+        WORLD_FRAME,
+        RELIABLE,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        parameters: dict[str, Any] = fields_of(TrackingParameters, values)
+        sensors = graph.imu_topics(names_in(values["segments"]))
+        self.tracker = InertialTracker(
+            tuple(each.segment for each in sensors),
+            TrackingParameters(**parameters),
+            names_in(values["mountings"]),
+            str(values["world_frame"]),
+        )
+        self._readings = {topic: each.segment for each in sensors for topic in each.imu}
+        self._mags = {each.mag: each.segment for each in sensors}
+        self._fields: dict[str, tuple[int, FloatArray]] = {}
+        self._refused: Counter[str] = Counter()
+        # of several people, who is nearest to the reference sensor wears them
+        self._wearer = HeldSubject(HOLD) if values["subject"] == ALL else SubjectSelector()
+        reference = str(values["reference"]) or next(iter(names_in(values["sensors"])), "")
+        self._reference = graph.skeleton_topic(reference) if reference else ""
+        qos = skeleton_qos(values)
+        ports = []
+        for each in sensors:
+            ports.append(Port(each.mag, Field(), qos, _READINGS, absolute=each.absolute))
+            ports += [Port(topic, Reading(), qos, _READINGS, absolute=each.absolute) for topic in each.imu]
+        # the reference sensor's frames first: what they say of its clock holds for the skeleton that is made of them
+        frames = [self._reference] if reference else []
+        self.inputs = (*ports, *(skeleton_input(topic, values) for topic in (*frames, graph.FUSED)))
+        self.outputs = (
+            Port(graph.IMU_SKELETON, Skeletons(), qos, measured=True),
+            *(Port(graph.orientation_topic(s.segment), Orientation(s.segment), qos, measured=True) for s in sensors),
+        )
+        self.services = {graph.ALIGN_SERVICE: self._align}
+
+    def _align(self) -> str:
+        line = self.tracker.align()
+        self.events.append(line)
+        return line
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        if topic in self._mags:
+            # goes with the next reading of its sensor
+            self._fields[self._mags[topic]] = payload[0], payload[2]
+        elif topic in self._readings:
+            return self._read(self._readings[topic], payload, now.ros_ns)
+        elif topic == self._reference:
+            self.tracker.hear(payload[0].stamp_ns, now.ros_ns)
+        else:
+            wearer = self._wearer.pick(payload)
+            if wearer is not None:
+                self.tracker.see(wearer, now.ros_ns)
+        return ()
+
+    def _read(self, segment: str, sample: ImuSample, received_ns: int) -> Iterable[Output]:
+        field = self._field_at(segment, sample.stamp_ns)
+        if field is not None:
+            sample = replace(sample, magnetic_field=field)
+        try:
+            told = self.tracker.add(segment, sample, received_ns, skeleton=self.wanted(graph.IMU_SKELETON))
+        except BodyTrackingError:
+            self._refused[f"refused of {segment}"] += 1
+            raise
+        outputs = []
+        if told.orientation is not None:
+            # its segment is another one where two sensors were found to be exchanged
+            topic = graph.orientation_topic(told.orientation.segment)
+            outputs.append(Output(topic, told.orientation, told.orientation.stamp_ns))
+        if told.skeleton is not None:
+            outputs.append(Output(graph.IMU_SKELETON, (told.skeleton,), told.skeleton.stamp_ns))
+        return outputs
+
+    def _field_at(self, segment: str, at_ns: int) -> FloatArray | None:
+        """The latest field, once, if it is of about the same time."""
+        stamp_ns, vector = self._fields.pop(segment, (0, None))
+        return vector if vector is not None and abs(at_ns - stamp_ns) < _FIELD_NS else None
+
+    def refused(self, topic: str) -> None:
+        """A message of a sensor is none."""
+        if topic in self._readings:
+            self._refused[f"refused of {self._readings[topic]}"] += 1
+        elif topic in self._mags:
+            self._refused[f"refused fields of {self._mags[topic]}"] += 1
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """What is wrong with which sensor, and how well they are aligned."""
+        problems = self.tracker.problems(ros_ns)
+        values: dict[str, object] = {f"problem {number}": line for number, line in enumerate(problems, start=1)}
+        values |= self.tracker.counters
+        values |= self._refused
+        values |= self.tracker.state()
+        return (1 if problems else 0), "; ".join(problems), values
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return self.tracker.counters

@@ -1,0 +1,213 @@
+"""Filtered skeletons, or the state of the filter's model, to joint angles: the stage of the node ``joint_angles``."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from body_tracking import graph
+from body_tracking.fusion.association import HOLD
+from body_tracking.fusion.people import PEOPLE, PeopleParameters, people_from
+from body_tracking.fusion.subject import ALL
+from body_tracking.kinematics.angles import JointAngles
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, state_estimate
+from body_tracking.parameters import Parameter, Value
+from body_tracking.pipeline.codecs import Angles, ModelCovariance, ModelState
+from body_tracking.pipeline.shared import BODY, RELIABLE, result_qos, skeleton_input, skeleton_qos
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.skeleton import Skeleton
+
+ANGLES = (
+    Parameter(
+        "convention",
+        graph.AUTO,
+        "which angles: the model's own, those of the ISB, of REP-155, of Schlagenhauf (2017), or angles between joint "
+        "positions; auto: model where they are made of a model's state, else positional",
+        choices=(graph.AUTO, *ALL_CONVENTIONS),
+        live=True,
+    ),
+    Parameter(
+        "input",
+        graph.AUTO,
+        "what they are made of: the state of the filter's model, or filtered skeletons, to which a model is fitted "
+        "(positional angles need none); auto: what the filter publishes, also where that changes",
+        choices=(graph.AUTO, graph.SKELETON_INPUT, graph.MODEL_INPUT),
+        live=True,
+    ),
+)
+"""The parameters of ``joint_angles`` that the offline graph has too."""
+
+
+_AWAY_S = 1.0
+"""Of somebody who is away from the frames for this long, seconds, nothing is kept with several people."""
+_UNPAIRED = 1000
+"""States and covariances of a person that may wait for each other: as many as reliable topics keep, because a message
+that was lost and is sent again comes late."""
+
+
+def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[str, AngleStream]:
+    """Joint angles in one convention, of each person who may be tracked, by id.
+
+    Args:
+        convention: one of ``ALL_CONVENTIONS``.
+        body: the id of one subject.
+        people: whom to track.
+
+    Raises:
+        ConventionError: another one.
+    """
+    if people.subject != ALL:
+        return {body: AngleStream(convention)}
+    return {each: AngleStream(convention, _AWAY_S) for each in graph.bodies(people.people)}
+
+
+def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: bool) -> Iterator[tuple[str, Skeleton]]:
+    """The skeletons of one message, each with the id of its person.
+
+    Args:
+        skeletons: as ``/filtered/skeleton`` has them.
+        ids: of those who may be in it, in the order of their numbers.
+        several: whether ``body`` is the number of a person; else the first skeleton is that of the only one.
+    """
+    for number, body in enumerate(ids, 1):
+        if not several:
+            yield body, skeletons[0]
+            return
+        yield from ((body, skeleton) for skeleton in skeletons if skeleton.body == number)
+
+
+class AnglesStage(Stage):
+    """Computes the angles of one skeleton, or one state of the model, per message and person."""
+
+    NAME = "joint_angles"
+    PARAMETERS = (BODY, *(item for item in PEOPLE if item.name in ("subject", "people")), *ANGLES, RELIABLE)
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        # which input the filter publishes: settled, and at the last look
+        self._published = self._seen = ""
+        self._unpaired = 0
+        # of each person, state and covariance by stamp, in the order of arrival
+        self._waiting: dict[str, OrderedDict[int, dict[str, Any]]] = {}
+        self._configure(values)
+        qos = result_qos(values)
+        self.outputs = tuple(
+            Port(topic, Angles(body, part, lambda: self.convention), qos, measured=part == 0)
+            for body in self.streams
+            for part, topic in enumerate((graph.joint_states_topic(body), graph.joint_states_stddev_topic(body)))
+        )
+
+    @property
+    def convention(self) -> str:
+        """Of the angles that are published."""
+        return next(iter(self.streams.values())).convention
+
+    def change(self, values: Mapping[str, Value]) -> None:
+        """New angles start from the next message on."""
+        self._configure(values)
+        self.values = values
+
+    def _configure(self, values: Mapping[str, Value]) -> None:
+        asked = str(values["convention"])
+        known = self._published if values["input"] == graph.AUTO else str(values["input"])
+        convention, source = graph.angles_for(asked, known or graph.SKELETON_INPUT)
+        # Not before it is known what to take: angles of another convention than all later ones could come.
+        self.source = source if known or asked == graph.POSITIONAL else ""
+        people = people_from({**values, "hold": HOLD})
+        self._several = people.subject == ALL
+        self.streams = angle_streams(convention, graph.check_body(str(values["body"])), people)
+        self._waiting = {body: OrderedDict() for body in self.streams}
+        self._states: dict[str, str] = {}
+        self._covariances: dict[str, str] = {}
+        if self.source == graph.SKELETON_INPUT:
+            self.inputs = (skeleton_input(graph.FILTERED, values),)
+        elif self.source == graph.MODEL_INPUT:
+            qos, perishable = skeleton_qos(values), not values["reliable"]
+            ports = []
+            for body, stream in self.streams.items():
+                topics = graph.model_topics(body, self._several)
+                self._states[topics.state], self._covariances[topics.covariance] = body, body
+                ports += [
+                    Port(topics.state, ModelState(stream.model), qos, perishable=perishable),
+                    Port(topics.covariance, ModelCovariance(stream.model), qos, perishable=perishable),
+                ]
+            self.inputs = tuple(ports)
+        else:
+            self.inputs = ()
+
+    @property
+    def _covariance(self) -> str:
+        """The topic that only a filter with a model publishes."""
+        return graph.model_topics(next(iter(self.streams)), self._several).covariance
+
+    def look(self, published: Callable[[str], bool]) -> bool:
+        """Follow the filter to what it publishes, once that is the same at two looks: topics are found one by one.
+
+        While no filter is there, as when it is started again, nothing changes.
+        """
+        before, self._seen = self._seen, ""
+        for source, topic in ((graph.MODEL_INPUT, self._covariance), (graph.SKELETON_INPUT, graph.FILTERED)):
+            if published(topic):
+                self._seen = source
+                break
+        if self._seen != before or self._seen in ("", self._published):
+            return False
+        self._published = self._seen
+        if self.values["input"] != graph.AUTO:
+            return False
+        self._configure(self.values)
+        return True
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        if topic in self._states:
+            return self._pair(self._states[topic], payload[0], "state", payload)
+        if topic in self._covariances:
+            return self._pair(self._covariances[topic], payload[0], "covariance", payload[1])
+        found = by_person(payload, self.streams, several=self._several)
+        angles = ((body, self.streams[body].of_skeleton(skeleton)) for body, skeleton in found)
+        return [output for body, each in angles if each is not None for output in _published(body, each)]
+
+    def _pair(self, body: str, stamp_ns: int, part: str, value: Any) -> Iterable[Output]:
+        """Compute once both are there; what came before and is not complete will never be."""
+        waiting, stream = self._waiting[body], self.streams[body]
+        found = waiting.setdefault(stamp_ns, {})
+        found[part] = value
+        if len(found) == 2:
+            while waiting.popitem(last=False)[0] != stamp_ns:
+                self._unpaired += 1
+            _, frame_id, q, velocity = found["state"]
+            estimate = state_estimate(stream.model, stamp_ns, frame_id, q, velocity, found["covariance"])
+            return _published(body, stream.of_estimate(estimate))
+        if len(waiting) > _UNPAIRED:
+            waiting.popitem(last=False)
+            self._unpaired += 1
+        return ()
+
+    def reset(self, topic: str) -> None:
+        for stream in self.streams.values():
+            stream.reset()
+        for waiting in self._waiting.values():
+            waiting.clear()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """The convention, and what fits say of themselves."""
+        fits: Counter[str] = Counter()
+        for stream in self.streams.values():
+            fits.update(stream.fit.counters)
+        values: dict[str, object] = {f"fit {name}": count for name, count in fits.items()}
+        if self._unpaired:
+            values["unpaired"] = self._unpaired
+        if not self.source:
+            return 1, "no filter publishes anything", values
+        text = f"{self.convention} angles of {self.source}"
+        if self.source == graph.MODEL_INPUT != self._seen:
+            return 1, f"{text}, but no filter publishes {self._covariance}", values
+        return 0, text, values
+
+
+def _published(body: str, angles: JointAngles) -> tuple[Output, Output]:
+    return (
+        Output(graph.joint_states_topic(body), angles, angles.stamp_ns),
+        Output(graph.joint_states_stddev_topic(body), angles, angles.stamp_ns),
+    )

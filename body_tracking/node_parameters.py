@@ -1,0 +1,76 @@
+"""The parameters of a graph's nodes, from the graph's defaults, a parameters file and what the graph needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from body_tracking import graph
+from body_tracking.graph import NodeSpec
+from body_tracking.parameters import (
+    Parameter,
+    ParameterError,
+    Value,
+    check_all,
+    is_ros_own,
+    is_wildcard,
+    read_file,
+)
+
+
+def parameters_for(
+    specs: Sequence[NodeSpec],
+    file: Path | None,
+    defaults: Mapping[str, Mapping[str, Value]] | None = None,
+    absent: Sequence[NodeSpec] = (),
+) -> dict[str, dict[str, Value]]:
+    """Every parameter that is set, for each node: the graph's defaults, then the file, then what the graph needs.
+
+    Args:
+        specs: the nodes.
+        file: a ROS parameters file, or None.
+        defaults: more defaults by node name.
+        absent: nodes that the file may be about too, although they are not started.
+
+    Raises:
+        ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
+            allowed.
+    """
+    if file is None:  # what we set ourselves, each node checks
+        return {
+            spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
+        }
+    possible = {spec.name: spec for spec in (*absent, *specs)}
+    tables = {
+        name: {item.name: item for item in graph.parameters_of(spec.executable)} for name, spec in possible.items()
+    }
+    sections = read_file(file)
+    for pattern, values in sections.items():
+        about = [spec for spec in possible.values() if spec.meant_by(pattern)]
+        if not about:
+            there = ", ".join(spec.full_name for spec in possible.values())
+            raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
+        known: dict[str, Parameter] = {}
+        for spec in about:
+            known |= tables[spec.name]
+        _check(known.values(), {n: v for n, v in values.items() if not is_ros_own(n)}, f"{file}: {pattern}")
+    result: dict[str, dict[str, Value]] = {}
+    for spec in specs:
+        given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
+        for pattern, values in graph.in_order(sections):
+            if spec.meant_by(pattern):
+                wildcard = is_wildcard(pattern)
+                given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
+        given |= spec.parameters
+        own: dict[str, Any] = {name: given.pop(name) for name in list(given) if is_ros_own(name)}
+        checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}")
+        result[spec.name] = {**own, **{name: checked[name] for name in given}}
+    return result
+
+
+def _check(table: Iterable[Parameter], given: Mapping[str, object], where: str) -> dict[str, Value]:
+    try:
+        return check_all(tuple(table), given)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None

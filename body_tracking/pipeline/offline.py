@@ -1,0 +1,128 @@
+"""The offline runner: stages that are connected by their messages, as nodes are, in one process and one order."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.pipeline.codecs import Wire
+from body_tracking.pipeline.stage import JUMP_BACK_NS, Now, Output, Port, Stage
+
+_LOOKS = 2
+"""What a stage follows has to be the same at so many looks."""
+
+
+class OfflineRunner:
+    """Feeds stages with messages, and hands over what they publish.
+
+    What a stage publishes goes to the others as the message that it becomes, in single precision where messages have
+    no more, so that the numbers are those of the live graph.
+
+    Args:
+        stages: in the order in which each message goes to them.
+        wire: for messages that this package does not write itself.
+        sink: gets topic, message and time of everything that is published.
+        published: topics that others publish.
+
+    Attributes:
+        counters: inputs that could not be used, by topic.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[Stage],
+        wire: Wire,
+        sink: Callable[[str, bytes, int], None],
+        published: Iterable[str] = (),
+    ) -> None:
+        self.counters: Counter[str] = Counter()
+        self._stages, self._wire, self._sink = stages, wire, sink
+        self._queue: deque[tuple[str, bytes]] = deque()
+        self._last_ns: dict[tuple[str, int], int] = {}
+        there = {port.topic for stage in stages for port in stage.outputs} | set(published)
+        for stage in stages:
+            for _ in range(_LOOKS):
+                stage.look(there.__contains__)
+        self._outputs = [{port.topic: port for port in stage.outputs} for stage in stages]
+        self._inputs: dict[str, list[tuple[int, Stage, Port]]] = {}
+        for number, stage in enumerate(stages):
+            for port in stage.inputs:
+                self._inputs.setdefault(port.topic, []).append((number, stage, port))
+
+    @property
+    def outputs(self) -> tuple[Port, ...]:
+        """Everything that the stages publish."""
+        return tuple(port for ports in self._outputs for port in ports.values())
+
+    def start(self, at_ns: int) -> None:
+        """Publish what holds before the first message."""
+        for number, stage in enumerate(self._stages):
+            self._publish(number, stage.start(Now(at_ns, at_ns)), at_ns)
+        self._deliver(at_ns)
+
+    def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        """One message from outside, at the time at which it was recorded."""
+        self._poll(at_ns)
+        self._queue.append((topic, cdr))
+        self._deliver(at_ns)
+
+    def finish(self, at_ns: int) -> None:
+        """Publish what still waits for messages that do not come."""
+        for number, stage in enumerate(self._stages):
+            self._publish(number, stage.drain(), at_ns)
+            self._deliver(at_ns)
+
+    def _poll(self, at_ns: int) -> None:
+        """Let every stage do what is due by now."""
+        for number, stage in enumerate(self._stages):
+            due_ns = stage.deadline_ns if stage.deadline_ns is not None else stage.due_ns
+            if due_ns is not None and due_ns <= at_ns:
+                self._guarded(number, stage, "what waited", stage.poll, at_ns, at_ns=at_ns)
+                self._deliver(at_ns)
+
+    def _deliver(self, at_ns: int) -> None:
+        """Hand over what is published, and what follows from it, in the order of publication."""
+        now = Now(at_ns, at_ns)
+        while self._queue:
+            topic, cdr = self._queue.popleft()
+            decoded: dict[type, Any] = {}
+            for number, stage, port in self._inputs.get(topic, ()):
+                kind = type(port.codec)
+                if kind not in decoded:
+                    try:
+                        decoded[kind] = port.codec.decode(cdr, self._wire)
+                    except BodyTrackingError:
+                        self.counters[f"malformed {topic}"] += 1
+                        stage.refused(topic)
+                        continue
+                payload = decoded[kind]
+                self._reset_where_time_jumped(number, stage, port, payload)
+                self._guarded(number, stage, topic, stage.take, topic, payload, now, at_ns=at_ns)
+                self._guarded(number, stage, "what waited", stage.poll, at_ns, at_ns=at_ns)
+
+    def _guarded(
+        self, number: int, stage: Stage, where: str, call: Callable[..., Iterable[Output]], *given: Any, at_ns: int
+    ) -> None:
+        try:
+            self._publish(number, call(*given), at_ns)
+        except BodyTrackingError:
+            self.counters[f"refused {where}"] += 1
+
+    def _reset_where_time_jumped(self, number: int, stage: Stage, port: Port, payload: Any) -> None:
+        stamp_ns = port.codec.stamp_ns(payload)
+        if stamp_ns is None:
+            return
+        key = port.topic, number
+        if stamp_ns < self._last_ns.get(key, stamp_ns) - JUMP_BACK_NS:
+            stage.reset(port.topic)
+        self._last_ns[key] = stamp_ns
+
+    def _publish(self, number: int, outputs: Iterable[Output], at_ns: int) -> None:
+        for output in outputs:
+            port = self._outputs[number][output.topic]
+            if not port.optional:
+                cdr = port.codec.encode(output.payload, self._wire)
+                self._sink(output.topic, cdr, at_ns)
+                self._queue.append((output.topic, cdr))

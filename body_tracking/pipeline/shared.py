@@ -1,0 +1,78 @@
+"""Parameters that several nodes have, and the quality of service that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from body_tracking import graph
+from body_tracking.parameters import Parameter, Value
+from body_tracking.pipeline.codecs import Skeletons
+from body_tracking.pipeline.stage import Port
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.recording.qos import Qos
+from body_tracking.sensors import check_sensor_name
+
+RELIABLE = Parameter(
+    "reliable",
+    False,
+    "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
+    fixed="a topic keeps the quality of service that it was made with",
+)
+WORLD_FRAME = Parameter(
+    "world_frame",
+    "world",
+    "name of the world frame; map for REP-155",
+    fixed="what is published in this frame would lie in two",
+)
+BODY = Parameter(
+    "body",
+    "body1",
+    "the id of the person in topics and names of angles (REP-155)",
+    fixed="the names of topics and angles hold it",
+)
+SENSORS = Parameter(
+    "sensors",
+    ("kinect1", "kinect2"),
+    "the sensors; the node listens to /<sensor>/skeleton of each",
+    fixed="every node of the graph must have the same sensors",
+)
+REFERENCE = Parameter(
+    "reference",
+    "",
+    "the sensor that defines world and its time; empty for the first one",
+    fixed="world and its time would jump for everyone who uses them",
+)
+
+FRAMES_KEPT = 16
+"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
+that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
+
+
+def names_in(value: Value) -> tuple[str, ...]:
+    """The value of a parameter that is a list of names."""
+    return value if isinstance(value, tuple) else ()
+
+
+def sensors_of(values: Mapping[str, Value]) -> tuple[str, ...]:
+    """The names of the sensors.
+
+    Raises:
+        SensorNameError: a name that cannot be a sensor's.
+    """
+    return tuple(check_sensor_name(sensor) for sensor in names_in(values["sensors"]))
+
+
+def skeleton_qos(values: Mapping[str, Value]) -> Qos:
+    """Of skeleton topics."""
+    return graph.RELIABLE_SKELETON if values["reliable"] else graph.SKELETON
+
+
+def result_qos(values: Mapping[str, Value]) -> Qos:
+    """Of results, which are reliable; as deep as those of skeletons by the parameter ``reliable``."""
+    return graph.RELIABLE_SKELETON if values["reliable"] else RELIABLE_QOS
+
+
+def skeleton_input(topic: str, values: Mapping[str, Value]) -> Port:
+    """A skeleton topic that a stage takes."""
+    best_effort = not values["reliable"]
+    return Port(topic, Skeletons(), skeleton_qos(values), FRAMES_KEPT, droppable=best_effort, perishable=best_effort)

@@ -1,0 +1,215 @@
+"""The second half of the offline graph, filter, angles and the bag that is written, in a process of its own.
+
+Each half takes about half of the time; the messages, their order and the numbers are the same in one process.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import threading
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from body_tracking import graph
+from body_tracking.parameters import Value
+from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.pipeline.registry import stage_class
+from body_tracking.recording.qos import Qos
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remove_file
+
+STAGES = ("skeleton_filter", "joint_angles")
+"""Those of the second half."""
+
+_BATCH = 128
+"""Messages that go through the pipe at once: each trip costs as much as several of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What the second half did.
+
+    Attributes:
+        frames: joint angle messages.
+        counters: of the filter, and what could not be used.
+    """
+
+    frames: int
+    counters: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is to be run and written.
+
+    Attributes:
+        values: parameters of each stage, by its name.
+        out: the bag to be made.
+        topics: type and QoS of further topics that will be written.
+        overwrite: replace ``out`` if it is there.
+        model_covariance: write the covariance of the filter's model, too.
+    """
+
+    values: Mapping[str, Mapping[str, Value]]
+    out: Path
+    topics: Mapping[str, tuple[str, Qos]]
+    overwrite: bool
+    model_covariance: bool
+
+
+class Downstream:
+    """Writes every message, and runs the second half on it.
+
+    Args:
+        job: what is to be done.
+
+    Raises:
+        BodyTrackingError: ``out`` cannot be written, or the parameters make no sense.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._stages = [stage_class(name)(job.values[name]) for name in STAGES]
+        self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
+        self._covariance = job.model_covariance
+        self._frames = 0
+        self._writer = BagWriter(job.out, overwrite=job.overwrite)
+        own = {p.topic: (p.codec.type_name, p.qos) for p in self._runner.outputs if not p.optional}
+        for topic, (type_name, qos) in {**job.topics, **own}.items():
+            if self._written(topic):
+                self._writer.add_topic(topic, type_name, qos)
+
+    def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        """One message."""
+        self._writer.write(topic, cdr, at_ns)
+        self._runner.push(topic, cdr, at_ns)
+
+    def _written(self, topic: str) -> bool:
+        return self._covariance or not graph.is_model_covariance(topic)
+
+    def _published(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        self._frames += topic.endswith("/joint_states")
+        if self._written(topic):
+            self._writer.write(topic, cdr, at_ns)
+
+    def finish(self, at_ns: int) -> Written:
+        """Close the bag; one without angles is removed again."""
+        self._runner.finish(at_ns)
+        if self._frames:
+            self._writer.close()
+        else:
+            self._writer.discard()
+        return Written(self._frames, {**self._stages[0].counters, **self._runner.counters})
+
+    @property
+    def path(self) -> Path:
+        """The file that is written."""
+        return self._writer.path
+
+    def abandon(self) -> None:
+        """Remove the unfinished bag."""
+        self._writer.discard()
+
+
+class ForkedDownstream:
+    """:class:`Downstream` in a process of its own; same argument, same errors."""
+
+    def __init__(self, job: Job) -> None:
+        context = multiprocessing.get_context("fork")
+        self._connection, theirs = context.Pipe()
+        # What a process that is killed at once leaves of a bag that was not there before.
+        self._path = None if job.out.exists() else job.out.absolute() / f"{job.out.absolute().name}_0.mcap"
+        self._process = context.Process(target=_serve, args=(self._connection, theirs, job), daemon=True)
+        self._batch: list[tuple[str, bytes, int]] = []
+        with warnings.catch_warnings():
+            # Python 3.12 warns of forking with threads; those of the numeric libraries are prepared for it.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            collects = gc.isenabled()
+            gc.disable()  # until the other process has set aside what it inherits
+            try:
+                self._process.start()
+            finally:
+                if collects:
+                    gc.enable()
+        theirs.close()
+        self._path = self._receive()
+
+    def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        """One message."""
+        self._batch.append((topic, cdr, at_ns))
+        if len(self._batch) >= _BATCH:
+            self._send()
+
+    def finish(self, at_ns: int) -> Written:
+        """Close the bag; one without angles is removed again."""
+        self._send()
+        self._connection.send(at_ns)
+        written = self._receive()
+        self._process.join()
+        assert isinstance(written, Written)
+        return written
+
+    def abandon(self) -> None:
+        """Remove the unfinished bag."""
+        self._connection.close()
+        self._process.join()
+        if self._path is not None:
+            remove_file(self._path)  # still there where the other process was killed
+
+    def _send(self) -> None:
+        try:
+            self._connection.send(self._batch)
+        except (BrokenPipeError, ConnectionResetError):
+            self._receive()  # raises why
+        self._batch = []
+
+    def _receive(self) -> Any:
+        try:
+            answer = self._connection.recv()
+        except (EOFError, ConnectionResetError):  # the latter where it left something unread
+            self.abandon()
+            raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
+        if isinstance(answer, BaseException):
+            self._process.join()
+            raise answer
+        return answer
+
+
+def _serve(theirs: Connection, connection: Connection, job: Job) -> None:
+    """The other process."""
+    # While a copy of the first process's end is open here, its closing would not be seen.
+    theirs.close()
+    # Garbage of the first process is not this one's to take down. ROS nodes among it have threads that are not here,
+    # and end in a crash.
+    gc.freeze()
+    gc.enable()
+    downstream: Downstream | None = None
+    try:
+        downstream = Downstream(job)
+        connection.send(downstream.path)
+        while isinstance(batch := connection.recv(), list):
+            for topic, cdr, at_ns in batch:
+                downstream.take(topic, cdr, at_ns)
+        connection.send(downstream.finish(batch))
+    except (EOFError, KeyboardInterrupt):
+        if downstream is not None:
+            downstream.abandon()
+    except BaseException as error:
+        if downstream is not None:
+            downstream.abandon()
+        connection.send(error)
+
+
+def start_downstream(job: Job) -> Downstream | ForkedDownstream:
+    """The second half, in another process where that is possible and there are processors for both.
+
+    Raises:
+        BodyTrackingError: as of :class:`Downstream`.
+    """
+    if hasattr(os, "fork") and len(os.sched_getaffinity(0)) > 1 and threading.active_count() == 1:
+        return ForkedDownstream(job)
+    return Downstream(job)
