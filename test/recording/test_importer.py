@@ -138,7 +138,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return code, output.out, output.err
 
 
-def test_import_and_info_as_json(tmp_path, capsys):
+def test_import_and_info_as_json_and_for_people(tmp_path, capsys):
     file = frames(tmp_path / "a.csv", *(index / 10 for index in range(11)))
     code, out, _ = run(capsys, "import", file, "-o", tmp_path / "bag", "--sensor", "left", "--json")
     report = json.loads(out)
@@ -148,21 +148,13 @@ def test_import_and_info_as_json(tmp_path, capsys):
     info = json.loads(out)
     assert code == 0 and info["messages"] == 11 and info["duration_s"] == 1.0 and info["warnings"] == []
     (topic,) = info["topics"]
-    assert (topic["name"], topic["type"], topic["count"], topic["rate"]) == (
-        "/left/skeleton",
-        POINT_CLOUD,
-        11,
-        pytest.approx(10.0),
-    )
+    assert (topic["name"], topic["type"], topic["count"]) == ("/left/skeleton", POINT_CLOUD, 11)
+    assert topic["rate"] == pytest.approx(10.0)
     assert topic["qos"][0]["reliability"] == "best_effort"
-
-
-def test_import_and_info_for_people(tmp_path, capsys):
-    file = frames(tmp_path / "a.csv", 0, 1, 1, 0.5)
-    code, out, err = run(capsys, "import", file, "-o", tmp_path / "bag")
+    code, out, err = run(capsys, "import", frames(tmp_path / "b.csv", 0, 1, 1, 0.5), "-o", tmp_path / "other")
     assert code == 0 and err == ""
     assert "/kinect1/skeleton: 4 frames" in out and "1 stamps that repeat" in out
-    code, out, err = run(capsys, "bag", "info", tmp_path / "bag")
+    code, out, err = run(capsys, "bag", "info", tmp_path / "other")
     assert code == 0 and err == ""
     assert "/kinect1/skeleton" in out and "best_effort" in out and "4" in out
 
