@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,9 +48,13 @@ class _Columns:
 class _Frame:
     """The rows of one frame, as far as they have come."""
 
+    sensor: str
     stamp_ns: int
     received_ns: int
     skeletons: dict[int, Skeleton] = field(default_factory=dict)
+
+    def finished(self) -> RecordedFrame:
+        return RecordedFrame(self.sensor, self.received_ns, tuple(self.skeletons.values()))
 
 
 class CsvRecording:
@@ -77,6 +80,7 @@ class CsvRecording:
         self.warnings: list[str] = []
         self._sensor = None if sensor is None else check_sensor_name(sensor)
         self._partial = partial
+        self._names: set[str] = set()
         self._file = CsvFile(self.path)
 
     @property
@@ -88,7 +92,8 @@ class CsvRecording:
         file = self._file = CsvFile(self.path)
         counts: Counter[str] = Counter()
         columns: _Columns | None = None
-        frames = _Frames(self._sensor, counts)
+        pending: dict[str, _Frame] = {}
+        self._names.clear()
         n_rows = n_lines = 0
         lines = file.lines()
         while block := list(islice(lines, _BLOCK_LINES)):
@@ -103,13 +108,21 @@ class CsvRecording:
             rows = {n_lines + index: row for index, row in enumerate(cells, 1) if row}
             n_lines += len(block)
             n_rows += len(rows)
-            if rows:
-                yield from frames.take(self._parse(list(rows), list(rows.values()), columns))
+            for sensor, received_ns, skeleton in self._parse(list(rows), list(rows.values()), columns, counts):
+                frame = pending.get(sensor)
+                if frame is None or skeleton.stamp_ns != frame.stamp_ns or skeleton.body in frame.skeletons:
+                    if frame is not None:
+                        counts[REPEATED] += skeleton.stamp_ns == frame.stamp_ns
+                        counts[BACKWARDS] += skeleton.stamp_ns < frame.stamp_ns
+                        yield frame.finished()
+                    frame = pending[sensor] = _Frame(sensor, skeleton.stamp_ns, received_ns)
+                frame.skeletons[skeleton.body] = skeleton
             self.problems = {name: count for name, count in counts.items() if count}
         if columns is None:
             raise CsvError(f"{self.path}: {file.cut or 'the file is empty'}")
         self.warnings = file.check_whole(n_rows, self._partial)
-        yield from frames.rest()
+        for frame in sorted(pending.values(), key=lambda each: each.received_ns):
+            yield frame.finished()
         self.problems = {name: count for name, count in counts.items() if count}
 
     # --- the header
@@ -141,8 +154,19 @@ class CsvRecording:
 
     # --- rows
 
-    def _parse(self, where: list[int], rows: list[list[str]], columns: _Columns) -> _Rows:
-        """Args: where: the line of each row; rows: their cells."""
+    def _parse(
+        self, where: list[int], rows: list[list[str]], columns: _Columns, counts: Counter[str]
+    ) -> list[tuple[str, int, Skeleton]]:
+        """Sensor, time of receipt and skeleton of each row.
+
+        Args:
+            where: the line of each row.
+            rows: their cells.
+            columns: of the file.
+            counts: of oddities, to be added to.
+        """
+        if not rows:
+            return []
         width = len(columns.names)
         for line, row in zip(where, rows, strict=True):
             if len(row) != width:
@@ -162,23 +186,18 @@ class CsvRecording:
         lost = ~np.isfinite(positions).all(axis=2)
         positions[lost] = np.nan
         states[lost] = TrackingState.NOT_TRACKED
-        stamps = [self._file.time_ns(line, row[columns.stamp], "stamp") for line, row in zip(where, rows, strict=True)]
-        return _Rows(
-            sensors=self._sensors(where, rows, columns),
-            stamps_ns=stamps,
-            received_ns=stamps
-            if columns.received is None
-            else [
-                self._file.time_ns(line, row[columns.received], "received")
-                for line, row in zip(where, rows, strict=True)
-            ],
-            persons=[0] * len(rows)
-            if columns.person is None
-            else [self._person(line, row[columns.person]) for line, row in zip(where, rows, strict=True)],
-            positions=camera_space_to_optical(positions),
-            states=states,
-            not_finite=int(lost.sum()),
-        )
+        counts[NOT_FINITE] += int(lost.sum())
+        positions = camera_space_to_optical(positions)
+        found = []
+        for line, row, sensor, points, own in zip(
+            where, rows, self._sensors(where, rows, columns), positions, states, strict=True
+        ):
+            stamp_ns = received_ns = self._file.time_ns(line, row[columns.stamp], "stamp")
+            if columns.received is not None:
+                received_ns = self._file.time_ns(line, row[columns.received], "received")
+            person = 0 if columns.person is None else self._person(line, row[columns.person])
+            found.append((sensor, received_ns, Skeleton(stamp_ns, optical_frame(sensor), points, own, person)))
+        return found
 
     def _numbers(self, where: list[int], cells: NDArray[np.str_], places: IntArray, columns: _Columns) -> FloatArray:
         """(rows, places) numbers; NaN for an empty cell."""
@@ -215,7 +234,12 @@ class CsvRecording:
                 check_sensor_name(name)
             except SensorNameError as error:
                 raise self._file.error(where[names.index(name)], str(error)) from error
-        return names
+        if self._sensor is None:
+            return names
+        self._names.update(names)
+        if len(self._names) > 1:
+            raise CsvError(f"--sensor {self._sensor}: the file has several sensors ({', '.join(sorted(self._names))})")
+        return [self._sensor] * len(rows)
 
 
 def sensor_column(path: Path | str) -> bool:
@@ -245,57 +269,3 @@ def _listing(what: str, names: Sequence[str]) -> str:
         return ""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f"{what}{'s' if len(names) > 1 else ''} {', '.join(names[:5])}{more}"
-
-
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """The rows of a block: positions (n, 25, 3) in the optical frame, states (n, 25)."""
-
-    sensors: list[str]
-    stamps_ns: list[int]
-    received_ns: list[int]
-    persons: list[int]
-    positions: FloatArray
-    states: NDArray[Any]
-    not_finite: int
-
-
-class _Frames:
-    """Puts rows together to frames; those of several sensors may alternate as they like."""
-
-    def __init__(self, rename: str | None, counts: Counter[str]) -> None:
-        self._rename = rename
-        self._counts = counts
-        self._pending: dict[str, _Frame] = {}
-        self._names: set[str] = set()
-
-    def take(self, rows: _Rows) -> Iterator[RecordedFrame]:
-        self._counts[NOT_FINITE] += rows.not_finite
-        for index, (name, stamp_ns, person) in enumerate(zip(rows.sensors, rows.stamps_ns, rows.persons, strict=True)):
-            sensor = self._named(name)
-            frame = self._pending.get(sensor)
-            if frame is None or stamp_ns != frame.stamp_ns or person in frame.skeletons:
-                if frame is not None:
-                    self._counts[REPEATED] += stamp_ns == frame.stamp_ns
-                    self._counts[BACKWARDS] += stamp_ns < frame.stamp_ns
-                    yield _finished(sensor, frame)
-                frame = self._pending[sensor] = _Frame(stamp_ns, rows.received_ns[index])
-            frame.skeletons[person] = Skeleton(
-                stamp_ns, optical_frame(sensor), rows.positions[index], rows.states[index], person
-            )
-
-    def rest(self) -> Iterator[RecordedFrame]:
-        for sensor, frame in sorted(self._pending.items(), key=lambda item: item[1].received_ns):
-            yield _finished(sensor, frame)
-
-    def _named(self, name: str) -> str:
-        if self._rename is None:
-            return name
-        self._names.add(name)
-        if len(self._names) > 1:
-            raise CsvError(f"--sensor {self._rename}: the file has several sensors ({', '.join(sorted(self._names))})")
-        return self._rename
-
-
-def _finished(sensor: str, frame: _Frame) -> RecordedFrame:
-    return RecordedFrame(sensor, frame.received_ns, tuple(frame.skeletons.values()))
