@@ -229,7 +229,7 @@ def test_a_damaged_gzip_is_refused(tmp_path, partial):
     data = bytearray(path.read_bytes())
     data[-6] ^= 1  # the checksum
     path.write_bytes(data)
-    fails(path, "damaged", partial=partial)
+    fails(path, "line 302: the gzip stream is damaged", partial=partial)
     path.write_bytes(b"stamp,no gzip at all\n")
     fails(path, "damaged", partial=partial)
 
