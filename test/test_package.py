@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import pytest
 
 import body_tracking
-from body_tracking import graph
+from body_tracking import graph, systems
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
@@ -181,7 +181,7 @@ def prefix(project: Path) -> Path:
 
 
 def test_table_of_nodes_lists_every_node_file(node_names: set[str]) -> None:
-    assert set(graph.EXECUTABLES) == node_names
+    assert set(systems.EXECUTABLES) == node_names
 
 
 def test_colcon_installs_an_executable_per_node(prefix: Path, node_names: set[str]) -> None:
@@ -274,8 +274,8 @@ def test_picture_shows_every_node_and_topic() -> None:
     picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
     texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}
     # The picture shows two sensors where the table has a pattern.
-    topics = {topic.name.replace("<sensor>", "kinect1") for topic in graph.TOPICS} - {graph.TF, graph.TF_STATIC}
-    assert set(graph.EXECUTABLES) | topics <= texts
+    topics = {topic.name.replace("<sensor>", "kinect1") for topic in systems.TOPICS} - {graph.TF, graph.TF_STATIC}
+    assert set(systems.EXECUTABLES) | topics <= texts
 
 
 def test_links_in_the_documentation_lead_somewhere() -> None:
