@@ -8,23 +8,20 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 from body_tracking.errors import BodyTrackingError
 
-SUBCOMMANDS = {
-    "import": ("recording.importer", "turn CSV recordings, NTU RGB+D .skeleton or Xsens .mvnx files into a bag"),
-    "bag": ("recording.info", "look into recordings, close one that was cut off"),
-    "replay": ("recording.replay", "run the whole graph offline over a bag"),
-    "calibrate": ("calibration.offline", "the poses and clocks of a bag's sensors"),
-    "up": ("up", "run the live graph: sensors or a bag in, joint angles out"),
-    "doctor": ("doctor.command", "why nothing comes: what is wrong with the shell, the graph or a bag, and what to do"),
-    "show": ("evaluation.show", "show the joint angles in a recording"),
-    "evaluate": ("evaluation.evaluate", "compare what was estimated with the truth"),
-    "simulate": ("simulation.bags", "people who move before simulated sensors, as a bag with the truth"),
-    "make-bags": ("simulation.bags", "make the simulated recordings that are shipped in bags/"),
-}
-"""Of each in the help's order: the module of the package with its ``add_parser(subparsers)``, which sets ``run`` on its
-parser, and what it does. The module is loaded only for its own command."""
+if TYPE_CHECKING:
+    from body_tracking.pipeline.system import Command
+
+
+def subcommands() -> dict[str, Command]:
+    """The subcommands, of which each is loaded for itself only."""
+    # loads numpy, which main() has to prepare
+    from body_tracking.systems import COMMANDS
+
+    return COMMANDS
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -37,12 +34,12 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    if command in SUBCOMMANDS:
-        module, _ = SUBCOMMANDS[command]
-        importlib.import_module(f"body_tracking.{module}").add_parser(subparsers)
+    commands = subcommands()
+    if command in commands:
+        importlib.import_module(commands[command].module).add_parser(subparsers)
     else:
-        for name, (_, text) in SUBCOMMANDS.items():
-            subparsers.add_parser(name, help=text)
+        for each in commands.values():
+            subparsers.add_parser(each.name, help=each.text)
     return top
 
 

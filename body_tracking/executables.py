@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import os
 import signal
 import threading
@@ -43,9 +44,12 @@ def start(name: str) -> None:
     hold_signals()
     imported = threading.Event()
     threading.Thread(target=_leave_unless, args=(imported,), daemon=True).start()
-    module = importlib.import_module(f"body_tracking.nodes.{name}")
+    if importlib.util.find_spec(f"body_tracking.nodes.{name}") is not None:
+        main = importlib.import_module(f"body_tracking.nodes.{name}").main
+    else:  # of a system that another package brings
+        main = importlib.import_module("body_tracking.nodes.host").host_of(name)
     imported.set()
-    module.main()
+    main()
 
 
 def _leave_unless(imported: threading.Event) -> None:

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from body_tracking import graph
-from body_tracking.graph import NodeSpec
 from body_tracking.parameters import (
     Parameter,
     ParameterError,
@@ -17,6 +15,8 @@ from body_tracking.parameters import (
     is_wildcard,
     read_file,
 )
+from body_tracking.pipeline.system import NodeSpec
+from body_tracking.systems import in_order, parameters_of
 
 
 def parameters_for(
@@ -42,9 +42,7 @@ def parameters_for(
             spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
         }
     possible = {spec.name: spec for spec in (*absent, *specs)}
-    tables = {
-        name: {item.name: item for item in graph.parameters_of(spec.executable)} for name, spec in possible.items()
-    }
+    tables = {name: {item.name: item for item in parameters_of(spec.executable)} for name, spec in possible.items()}
     sections = read_file(file)
     for pattern, values in sections.items():
         about = [spec for spec in possible.values() if spec.meant_by(pattern)]
@@ -58,7 +56,7 @@ def parameters_for(
     result: dict[str, dict[str, Value]] = {}
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
-        for pattern, values in graph.in_order(sections):
+        for pattern, values in in_order(sections):
             if spec.meant_by(pattern):
                 wildcard = is_wildcard(pattern)
                 given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}

@@ -13,16 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.times import MAX_STAMP_NS as MAX_STAMP_NS
+from body_tracking.times import NANOSECONDS as NANOSECONDS
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
-
-NANOSECONDS = 1_000_000_000
-
-MAX_STAMP_NS = 2**31 * NANOSECONDS - 1
-"""The last stamp that a ROS message can hold (``builtin_interfaces/Time``, January 2038); the first one is 0."""
 
 MAX_RANGE = 100.0
 """A coordinate beyond this many metres is no measurement of a person but a damaged number."""

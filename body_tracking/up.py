@@ -18,7 +18,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -29,13 +29,24 @@ import yaml
 from body_tracking import dds, graph, names
 from body_tracking.errors import BodyTrackingError
 from body_tracking.executables import signals_held
-from body_tracking.filters import FILTERS
-from body_tracking.graph import GraphOptions, NodeSpec
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.node_parameters import parameters_for
 from body_tracking.parameters import SECTION, Value, to_ros
+from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rig import RigReader
+from body_tracking.robot.system import convention_of
 from body_tracking.skeleton import NANOSECONDS
+from body_tracking.systems import (
+    FLOW,
+    add_options,
+    all_nodes_for,
+    bodies_of,
+    is_source,
+    nodes_for,
+    options_from,
+    options_of,
+    subscribers,
+    with_file,
+)
 
 if TYPE_CHECKING:
     from body_tracking.nodes.graph_monitor import GraphMonitor
@@ -78,17 +89,15 @@ class UpError(BodyTrackingError):
 # --- what to start
 
 
-def options_for(args: argparse.Namespace) -> GraphOptions:
+def options_for(args: argparse.Namespace) -> Options:
     """The graph that a command line, of ``up`` or of ``ros2 launch``, asks for.
 
     Raises:
         BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already, the robot's
             mapping is none or is about angles of another convention.
     """
-    sensors = tuple(name for name in args.sensors.split(",") if name) if args.sensors else ()
+    given = options_from(args)
     topics: frozenset[str] = frozenset()
-    if args.sensors is not None and not sensors:
-        raise UpError("sensors: no name")
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
     if args.external and args.bag is not None:
@@ -104,57 +113,43 @@ def options_for(args: argparse.Namespace) -> GraphOptions:
             there = graph.sensors_among(reader.topics)
         if not there:
             raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
-        missing = [sensor for sensor in sensors if sensor not in there]
+        asked = given.get("sensors", there)
+        missing = [sensor for sensor in asked if sensor not in there] if isinstance(asked, tuple) else []
         if missing:
             raise UpError(
                 f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
             )
-        sensors = sensors or there
-    convention = args.convention or ""
+        given["sensors"] = asked
     if args.robot is not None:
-        convention = graph.convention_of_robot(args.robot, convention)
-    options = GraphOptions(
-        sensors=sensors or graph.DEFAULT_SENSORS,
-        bag=str(args.bag) if args.bag else "",
-        record=str(args.record) if args.record else "",
-        record_covariance=args.model_covariance,
-        rate=args.rate,
-        filter_name=args.filter or "",
-        convention=convention,
-        calibration_file=str(args.calibration) if args.calibration else "",
-        reliable=args.reliable,
-        subject=args.subject or "",
-        people=args.people,
-        namespace=names.check_namespace(args.namespace),
-        robot=str(args.robot) if args.robot else "",
-        external=args.external,
-        adapted=tuple(args.adapt or ()),
-        viewer=args.viewer,
-        markers=args.markers,
-    )
-    options = graph.with_file(options, args.params_file)
-    return replace(options, imu_topics=graph.played_imu_topics(options.imus, topics)) if args.bag else options
+        given["convention"] = convention_of(args.robot, args.convention or "")
+    given["namespace"] = names.check_namespace(args.namespace or "/")
+    options = with_file(options_of(**given), args.params_file)
+    imus = options["imus"]
+    if args.bag is not None and isinstance(imus, tuple):
+        options = {**options, "imu_topics": graph.played_imu_topics(imus, topics)}
+    return options
 
 
 def all_parameters(
-    options: GraphOptions,
+    options: Options,
     specs: Sequence[NodeSpec],
     file: Path | None,
     defaults: Mapping[str, Mapping[str, Value]] | None = None,
 ) -> dict[str, dict[str, Value]]:
-    """The same, with a file that may be about every node that there can be.
+    """The parameters of every node; the file may be about every node that there can be.
 
     Args:
         options: the graph.
         specs: its nodes.
-        file: as above.
-        defaults: as above.
+        file: a ROS parameters file, or None.
+        defaults: more defaults by node name.
 
     Raises:
-        ParameterError: as above.
+        ParameterError: the file is none, is about a node that there cannot be, has unknown names or values that are not
+            allowed.
         UpError: a sensor node has nothing to read: there is no bag, and the file does not say.
     """
-    result = parameters_for(specs, file, defaults, graph.all_nodes_for(options))
+    result = parameters_for(specs, file, defaults, all_nodes_for(options))
     for spec in specs:
         given = result[spec.name]
         if (
@@ -165,6 +160,13 @@ def all_parameters(
             raise UpError(
                 f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
             )
+    for spec in specs:
+        if spec.executable == "bag_player":
+            count, played = subscribers(specs, result), result[spec.name]["topics"]
+            waited = (
+                [f"{topic}:{count[topic]}" for topic in played if topic in count] if isinstance(played, tuple) else []
+            )
+            result[spec.name]["wait_for_subscribers"] = tuple(waited)
     return result
 
 
@@ -252,20 +254,21 @@ class Supervisor:
 
     def __init__(
         self,
-        options: GraphOptions,
+        options: Options,
         specs: Sequence[NodeSpec],
         parameters: Mapping[str, dict[str, Value]],
         folder: Path,
     ) -> None:
         self.options = options
         self.folder = folder
+        self.subscribers = subscribers(specs, parameters)
         self.console = Console()
         self.children = [Child(spec, dict(parameters[spec.name])) for spec in specs]
         self.stopping = threading.Event()
         self.failure = ""
         self._bag_start_ns = 0
-        if options.bag:
-            with RigReader(options.bag) as reader:
+        if options["bag"]:
+            with RigReader(str(options["bag"])) as reader:
                 self._bag_start_ns = reader.start_ns
 
     def run(self, monitor: GraphMonitor) -> int:
@@ -322,10 +325,10 @@ class Supervisor:
     def _may_start(self, child: Child, now: float, monitor: GraphMonitor) -> bool:
         """Whether everybody listens whom the node is to wait for; one who does not come holds nobody up forever."""
         assert child.due is not None
-        if not child.spec.after:
+        if not is_source(child.spec):
             return True
-        others = [other.spec.name for other in self.children if not other.spec.after]
-        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(child.spec.after, others)
+        others = [other.spec.name for other in self.children if not is_source(other.spec)]
+        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(self.subscribers, others)
 
     def _start(self, child: Child) -> None:
         spec = child.spec
@@ -400,7 +403,7 @@ class Supervisor:
 
         However far one lags behind, what was played comes out.
         """
-        for executable in graph.FLOW:
+        for executable in FLOW:
             running = [child for child in self.children if child.spec.executable == executable and child.process]
             for child in running:
                 assert child.process is not None
@@ -461,46 +464,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "Ctrl-C, or when the bag ends.",
         epilog="Without --bag the parameters file says what each sensor node reads, under its name <sensor>_skeleton.",
     )
-    parser.add_argument("--params-file", type=Path, metavar="FILE", help="ROS parameters file; see config/")
-    parser.add_argument("--bag", type=Path, metavar="BAG", help="play this bag in place of the sensors")
-    parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="play the bag X times as fast (default 1)")
-    parser.add_argument("--record", type=Path, metavar="BAG", help="record everything into this new folder")
-    parser.add_argument(
-        "--model-covariance",
-        action="store_true",
-        help="record /filtered/model_covariance, too: with ekf most of a recording, which replay computes again",
-    )
-    parser.add_argument("--filter", choices=FILTERS, help="which filter; overrides the parameters file")
-    parser.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles; overrides the file, too")
-    parser.add_argument(
-        "--sensors", metavar="A,B", help="names, the reference first (default: those in the bag, else kinect1,kinect2)"
-    )
-    parser.add_argument(
-        "--external", action="store_true", help="start no sensor nodes: somebody else publishes /<sensor>/skeleton"
-    )
-    parser.add_argument(
-        "--adapt",
-        action="append",
-        metavar="SENSOR[:/TOPIC]",
-        help="this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
-    )
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="YAML file to load the calibration from, if there, and save to"
-    )
-    parser.add_argument(
-        "--robot", type=Path, metavar="FILE", help="mapping file of a robot that is to follow; see docs/robots.md"
-    )
-    parser.add_argument(
-        "--reliable", action="store_true", help="transport skeletons reliably: nothing is lost, whatever it takes"
-    )
-    parser.add_argument(
-        "--viewer", action="store_true", help="show it on a live page in a browser, and take its buttons"
-    )
-    parser.add_argument("--markers", action="store_true", help="publish markers for RViz and Foxglove")
-    graph.add_people(parser)
-    parser.add_argument(
-        "--namespace", default="/", metavar="NAME", help="of all nodes, and so of their topics; a second rig needs one"
-    )
+    add_options(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
     parser.set_defaults(run=run)
 
@@ -524,7 +488,7 @@ def arguments_from(words: Sequence[str]) -> argparse.Namespace:
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
     options = options_for(args)
-    specs = graph.nodes_for(options)
+    specs = nodes_for(options)
     try:
         from body_tracking.nodes.graph_monitor import GraphMonitor
     except ImportError as error:
@@ -542,8 +506,8 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    bodies = options.bodies or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),)
-    monitor = GraphMonitor(bodies, options.namespace)
+    bodies = bodies_of(options) or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),)
+    monitor = GraphMonitor(bodies, str(options["namespace"]))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

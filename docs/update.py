@@ -11,7 +11,8 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from body_tracking import cli, graph
+from body_tracking import cli, systems
+from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.parameters import Value
 from body_tracking.recording.qos import Qos
@@ -55,7 +56,7 @@ def topics() -> str:
             topic.publisher,
             topic.content,
         )
-        for topic in graph.TOPICS
+        for topic in systems.TOPICS
     ]
     return table(("topic", "type", "QoS", "from", "content"), rows)
 
@@ -63,7 +64,8 @@ def topics() -> str:
 def services() -> str:
     """Every service of the graph."""
     return table(
-        ("service", "node", "what it does"), [(f"`{name}`", node, text) for name, node, text in graph.SERVICES]
+        ("service", "node", "what it does"),
+        [(f"`{each.name}`", each.executable, each.text) for each in systems.SERVICES],
     )
 
 
@@ -77,7 +79,7 @@ def filters() -> str:
     """What each filter means for the nodes around it."""
     rows = [
         (f"`{name}`", f"`{role.input}`", f"`{role.angles_input}`", f"`{role.convention}`")
-        for name, role in graph.ROLES.items()
+        for name, role in ROLES.items()
     ]
     return table(("filter", "`input` of skeleton_filter", "`input` of joint_angles", "`convention`"), rows)
 
@@ -95,10 +97,10 @@ def _default(value: Value) -> str:
 def parameters() -> str:
     """The parameters of every node."""
     parts = []
-    for executable in graph.EXECUTABLES:
+    for executable in systems.EXECUTABLES:
         rows = [
             (f"`{item.name}`{' *' * item.live}", _default(item.default), item.unit, item.constraint, item.doc)
-            for item in graph.parameters_of(executable)
+            for item in systems.parameters_of(executable)
         ]
         parts.append(f"### {executable}\n\n" + table(("parameter", "default", "unit", "allowed", "meaning"), rows))
     return "\n".join(parts)
@@ -109,14 +111,14 @@ def _below(parser: argparse.ArgumentParser) -> Iterator[argparse._SubParsersActi
 
 
 def _commands() -> Iterator[tuple[str, str]]:
-    for name, (_, text) in cli.SUBCOMMANDS.items():
+    for name, command in cli.subcommands().items():
         (top,) = _below(cli.parser(name))
         verbs = [
             (f"`body_tracking {name} {verb.dest}`", verb.help or "")
             for action in _below(top.choices[name])
             for verb in action._choices_actions
         ]
-        yield from verbs or [(f"`body_tracking {name}`", text)]
+        yield from verbs or [(f"`body_tracking {name}`", command.text)]
 
 
 def commands() -> str:
@@ -146,7 +148,7 @@ def readme() -> str:
 def files() -> dict[Path, str]:
     """The text of each file as the code defines it now."""
     simulator = f"{SIMULATOR_HEADER}\n{kinect.errors_as_yaml()}"
-    return {README: readme(), CONFIG: graph.config_text(), SIMULATOR: simulator}
+    return {README: readme(), CONFIG: systems.config_text(), SIMULATOR: simulator}
 
 
 def main() -> int:

@@ -10,45 +10,35 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from body_tracking.graph import NodeSpec, nodes_for
+from body_tracking import systems
 from body_tracking.parameters import Value, to_ros
+from body_tracking.pipeline.system import NodeSpec, Option
 from body_tracking.up import CANNOT_START, UpError, all_parameters, arguments_from, options_for
 
-ARGUMENTS = {
-    "sensors": ("", "names of the sensors, the reference first; empty for those of the bag, else kinect1,kinect2"),
-    "adapt": ("", "sensors whose skeletons come from an Azure Kinect's ROS driver: A,B or A:/topic,B:/topic"),
-    "bag": ("", "play this bag in place of the sensors"),
-    "rate": ("1.0", "play it this many times as fast"),
-    "record": ("", "record everything into this new folder"),
-    "model_covariance": ("false", "record /filtered/model_covariance, too; with ekf it is most of a recording"),
-    "filter": ("", "which filter; overrides the parameters file"),
-    "convention": ("", "of the joint angles; overrides the parameters file"),
-    "subject": ("", "whom to track: nearest, first or all; overrides the parameters file"),
-    "people": ("0", "with subject all: how many at most; overrides the parameters file, but for 0"),
-    "calibration": ("", "YAML file to load the calibration from, if it is there, and save it to"),
-    "robot": ("", "mapping file of a robot that is to follow; see share/body_tracking/config/robots"),
-    "viewer": ("false", "show it on a live page in a browser"),
-    "markers": ("false", "publish markers for RViz and Foxglove"),
-    "namespace": ("/", "of all nodes, and so of their topics; a second rig needs one"),
-    "params_file": ("", "ROS parameters file; see share/body_tracking/config"),
-}
-SWITCHES = ("model_covariance", "viewer", "markers")
-LISTS = ("adapt",)
+OPTIONS = [option for option in systems.OPTIONS.values() if not option.hidden]
 TRUTH = {"true": True, "1": True, "false": False, "0": False}
 """As conditions of launch take it."""
+
+
+def default_of(option: Option) -> str:
+    """As launch has it; empty for what nobody asks for."""
+    if isinstance(option.default, bool):
+        return "false"
+    return "" if isinstance(option.default, tuple) else str(option.default)
 
 
 def words(context: LaunchContext) -> list[str]:
     """The same as options of ``body_tracking up``, which checks them."""
     found = []
-    for name in ARGUMENTS:
-        option, value = f"--{name.replace('_', '-')}", LaunchConfiguration(name).perform(context)
-        if name in SWITCHES:
+    for option in OPTIONS:
+        flag, value = f"--{option.name.replace('_', '-')}", LaunchConfiguration(option.name).perform(context)
+        if isinstance(option.default, bool):
             if value.lower() not in TRUTH:
-                raise UpError(f"{name}:={value}: expected true or false")
-            found += [option] * TRUTH[value.lower()]
+                raise UpError(f"{option.name}:={value}: expected true or false")
+            found += [flag] * TRUTH[value.lower()]
         elif value:
-            found += [f"{option}={each}" for each in (value.split(",") if name in LISTS else [value])]
+            several = isinstance(option.default, tuple) and option.name != "sensors"
+            found += [f"{flag}={each}" for each in (value.split(",") if several else [value])]
     return found
 
 
@@ -72,7 +62,7 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes for the arguments; everything ends with the bag, or with a node that cannot start."""
     args = arguments_from(words(context))
     options = options_for(args)
-    specs = nodes_for(options)
+    specs = systems.nodes_for(options)
     parameters = all_parameters(options, specs, args.params_file)
     nodes = {spec.name: action(spec, parameters[spec.name]) for spec in specs}
 
@@ -89,7 +79,7 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=text)
-        for name, (default, text) in ARGUMENTS.items()
+        DeclareLaunchArgument(option.name, default_value=default_of(option), description=option.text)
+        for option in OPTIONS
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=graph)])

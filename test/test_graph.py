@@ -5,37 +5,39 @@ from __future__ import annotations
 import ast
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from body_tracking import graph
+from body_tracking import graph, systems
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
-from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
+from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.node_parameters import parameters_for
 from body_tracking.parameters import ParameterError
+from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rosbag2 import is_known
+from body_tracking.robot.system import convention_of
+from body_tracking.systems import EXECUTABLES, TOPICS, all_nodes_for, bodies_of, nodes_for, options_of, subscribers
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH = ROOT / "launch" / "two_kinects.launch.py"
 
 VARIANTS = [
-    GraphOptions(),
-    GraphOptions(sensors=("a", "b", "c"), record="somewhere"),
-    GraphOptions(bag="bag", filter_name="lkf_zero_velocity", calibration_file="c.yaml", reliable=True),
-    GraphOptions(bag="bag", record="somewhere", rate=2.0),
-    GraphOptions(bag="bag", record="somewhere", filter_name="ekf", convention="isb"),
-    GraphOptions(filter_name="schlagenhauf_ekf"),
-    GraphOptions(filter_name="ekf", subject="all", people=3, imus=("forearm_left",)),
-    GraphOptions(bag="bag", filter_name="ekf", convention="isb", robot="robot.yaml"),
-    GraphOptions(sensors=("a", "b"), adapted=("b:/k4a/body_tracking_data",)),
-    GraphOptions(bag="bag", viewer=True, markers=True),
-    GraphOptions(viewer=True, record="somewhere"),
+    options_of(),
+    options_of(sensors=("a", "b", "c"), record="somewhere"),
+    options_of(bag="bag", filter="lkf_zero_velocity", calibration="c.yaml", reliable=True),
+    options_of(bag="bag", record="somewhere", rate=2.0),
+    options_of(bag="bag", record="somewhere", filter="ekf", convention="isb"),
+    options_of(filter="schlagenhauf_ekf"),
+    options_of(filter="ekf", subject="all", people=3, imus=("forearm_left",)),
+    options_of(bag="bag", filter="ekf", convention="isb", robot="robot.yaml"),
+    options_of(sensors=("a", "b"), adapt=("b:/k4a/body_tracking_data",)),
+    options_of(bag="bag", viewer=True, markers=True),
+    options_of(viewer=True, record="somewhere"),
 ]
 
 
@@ -44,81 +46,83 @@ def named(specs: Sequence[NodeSpec]) -> dict[str, NodeSpec]:
 
 
 @pytest.mark.parametrize("options", VARIANTS)
-def test_every_parameter_in_the_table_is_one_of_its_node(options: GraphOptions) -> None:
+def test_every_parameter_in_the_table_is_one_of_its_node(options: Options) -> None:
     pytest.importorskip("rclpy", reason="ROS is not installed")
     for spec in nodes_for(options):
-        known = {parameter.name: parameter for parameter in graph.parameters_of(spec.executable)}
+        known = {parameter.name: parameter for parameter in systems.parameters_of(spec.executable)}
         for name, value in {**spec.defaults, **spec.parameters}.items():
             if name != "use_sim_time":
                 assert known[name].check(value) == value
 
 
 def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
-    live, played = named(nodes_for(GraphOptions())), named(nodes_for(GraphOptions(bag="bag", record="r")))
+    live, played = named(nodes_for(options_of())), named(nodes_for(options_of(bag="bag", record="r")))
     assert {"kinect1_skeleton", "kinect2_skeleton"} <= set(live)
     assert "bag_player" not in live
     assert not any(name.endswith("t1_skeleton") for name in played)
     assert played["bag_player"].parameters["topics"] == ("/kinect1/skeleton", "/kinect2/skeleton")
     assert not any(spec.parameters.get("use_sim_time") for spec in live.values())
     assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
-    # Calibration, fusion and recorder listen to the sensors.
-    assert played["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:3", "/kinect2/skeleton:3")
 
 
 def test_sensors_of_somebody_else_need_no_nodes() -> None:
-    own, external = nodes_for(GraphOptions()), nodes_for(GraphOptions(external=True))
+    own, external = nodes_for(options_of()), nodes_for(options_of(external=True))
     assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
-    played = GraphOptions(bag="bag")
-    assert nodes_for(replace(played, external=True)) == nodes_for(played)
+    assert nodes_for(options_of(bag="bag", external=True)) == nodes_for(options_of(bag="bag"))
 
 
-def test_every_filter_has_a_role_and_the_nodes_around_it_follow_that() -> None:
-    assert set(graph.ROLES) == set(FILTERS)
-    for name, role in graph.ROLES.items():
-        specs = named(nodes_for(GraphOptions(bag="bag", record="r", filter_name=name)))
-        # The angles follow what the filter publishes.
-        angles = specs["joint_angles"].parameters
-        assert "input" not in angles
-        asked = str(angles.get("convention", graph.AUTO))
-        assert graph.angles_for(asked, role.angles_input) == (role.convention, role.angles_input)
-        # Calibration, fusion, recorder, and the filter where it listens to sensors.
-        listeners = 4 if role.input == graph.SENSORS_INPUT else 3
-        wanted = specs["bag_player"].parameters["wait_for_subscribers"]
-        assert wanted == (f"/kinect1/skeleton:{listeners}", f"/kinect2/skeleton:{listeners}")
-        after = specs["bag_player"].after
-        assert after[graph.FUSED] == (1 if role.input == graph.SENSORS_INPUT else 2)
-        listened = (
-            (graph.MODEL_STATE, graph.MODEL_COVARIANCE) if role.angles_input == "model_state" else (graph.FILTERED,)
-        )
-        # The recorder leaves the model's covariance out.
-        assert all(after[topic] == (1 if topic == graph.MODEL_COVARIANCE else 2) for topic in listened)
-        whole = named(nodes_for(GraphOptions(bag="bag", record="r", record_covariance=True, filter_name=name)))
-        assert whole["bag_recorder"].parameters["model_covariance"] is True
-        assert all(whole["bag_player"].after[topic] == 2 for topic in listened)
-        assert specs["skeleton_filter"].parameters["sensors"] == ("kinect1", "kinect2")
+def counted(**given: Any) -> dict[str, int]:
+    """How many nodes take each topic of a graph."""
+    specs = nodes_for(options_of(**given))
+    return subscribers(specs, parameters_for(specs, None))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_the_nodes_around_a_filter_follow_its_role_and_sources_wait_for_all_who_listen(name: str) -> None:
+    role = ROLES[name]
+    specs = named(nodes_for(options_of(bag="bag", record="r", filter=name)))
+    angles = specs["joint_angles"].parameters
+    assert "input" not in angles
+    asked = str(angles.get("convention", graph.AUTO))
+    assert graph.angles_for(asked, role.angles_input) == (role.convention, role.angles_input)
+    by_sensor, of_model = role.input == graph.SENSORS_INPUT, role.angles_input == graph.MODEL_INPUT
+    alone, recorded = counted(bag="bag", filter=name), counted(bag="bag", filter=name, record="r")
+    sensors = {graph.skeleton_topic(sensor): 2 + by_sensor for sensor in graph.DEFAULT_SENSORS}
+    wanted = {**sensors, graph.FUSED: int(not by_sensor), graph.FILTERED: int(not of_model)}
+    wanted |= {graph.MODEL_STATE: int(of_model), graph.MODEL_COVARIANCE: int(of_model)}
+    assert {topic: alone.get(topic, 0) for topic in wanted} == wanted
+    written = {topic for topic in wanted if topic in recorded} - {graph.MODEL_COVARIANCE}
+    assert all(recorded[topic] == wanted[topic] + 1 for topic in written) and graph.FILTERED in written
+    # the recorder leaves the model's covariance out, unless it is asked for
+    assert recorded.get(graph.MODEL_COVARIANCE, 0) == of_model
+    whole = counted(bag="bag", filter=name, record="r", model_covariance=True)
+    assert whole.get(graph.MODEL_COVARIANCE, 0) == 2 * of_model
 
 
 def test_those_who_track_know_of_each_other_whom() -> None:
-    options = GraphOptions(filter_name="ekf", subject="all", people=2, imus=("forearm_left",))
-    specs = named(nodes_for(options))
+    given: dict[str, Any] = {"filter": "ekf", "subject": "all", "people": 2, "imus": ("forearm_left",)}
+    specs = named(nodes_for(options_of(**given)))
     for name in ("fusion", "skeleton_filter", "joint_angles"):
         assert (specs[name].parameters["subject"], specs[name].parameters["people"]) == ("all", 2)
     assert specs["imu_skeleton"].parameters["subject"] == "all"
-    topics = [graph.model_topics(body, several=True) for body in ("body1", "body2")]
-    assert options.bodies == ("body1", "body2")
-    after = specs["kinect1_skeleton"].after
-    assert {topic.state for topic in topics} | {topic.covariance for topic in topics} <= set(after)
+    assert bodies_of(options_of(**given)) == ("body1", "body2") and bodies_of(options_of()) == ()
+    found = counted(**given)
+    for body in ("body1", "body2"):
+        topics = graph.model_topics(body, several=True)
+        assert found[topics.state] == found[topics.covariance] == 1
+    # inertial sensors take their world from the fusion, and the reference sensor's clock
+    assert found[graph.FUSED] == 1 and found["/kinect1/skeleton"] == found["/kinect2/skeleton"] + 1
+    assert found[graph.orientation_topic("forearm_left")] == 1
     alone = graph.model_topics("body1")
     assert (alone.state, alone.covariance) == (graph.MODEL_STATE, graph.MODEL_COVARIANCE)
-    assert GraphOptions().bodies == () and not named(nodes_for(GraphOptions()))["fusion"].parameters.get("subject")
 
 
 def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
     file = tmp_path / "people.yaml"
     file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
-    assert graph.with_file(GraphOptions(), file).bodies == graph.bodies(4)
-    assert graph.with_file(GraphOptions(subject="first", people=3), file).people == 3
-    assert graph.with_file(GraphOptions(subject="first"), file).bodies == ()
+    assert bodies_of(systems.with_file(options_of(), file)) == graph.bodies(4)
+    assert systems.with_file(options_of(subject="first", people=3), file)["people"] == 3
+    assert bodies_of(systems.with_file(options_of(subject="first"), file)) == ()
 
 
 def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
@@ -131,52 +135,50 @@ def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
         "/**: {ros__parameters: {silence: 0.1, gate: 4.0}}\n"
     )
     for namespace, prefix in (("/", "/"), ("/lab", "/lab/")):
-        options = graph.with_file(GraphOptions(namespace=namespace), file)
-        assert options.filter_name == "ekf"
+        options = systems.with_file(options_of(namespace=namespace), file)
+        assert options["filter"] == "ekf"
         assert {spec.full_name for spec in nodes_for(options)} == {
             f"{prefix}{spec.name}" for spec in nodes_for(options)
         }
     found = parameters_for(nodes_for(options), file)["fusion"]
     assert [found[name] for name in ("silence", "max_wait", "gate")] == [0.3, 0.01, 4.0]
     with pytest.raises(ParameterError, match="/lab/fusion: no such node"):
-        parameters_for(nodes_for(GraphOptions()), file)
+        parameters_for(nodes_for(options_of()), file)
 
 
-def test_a_robot_listens_to_every_sensor_and_is_there_before_anything_moves() -> None:
-    specs = nodes_for(GraphOptions(bag="bag", record="r", filter_name="ekf", robot="robot.yaml"))
-    assert specs[0].executable == "robot_commands"
-    assert specs[0].parameters["mapping"] == "robot.yaml"
-    assert specs[0].parameters["sensors"] == ("kinect1", "kinect2")
-    assert specs[-1].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:5", "/kinect2/skeleton:5")
-    assert "robot_commands" not in named(nodes_for(GraphOptions()))
+def test_a_robot_and_those_who_show_the_graph_listen_to_every_sensor() -> None:
+    specs = named(nodes_for(options_of(bag="bag", robot="robot.yaml")))
+    assert specs["robot_commands"].parameters["mapping"] == "robot.yaml"
+    assert specs["robot_commands"].parameters["sensors"] == ("kinect1", "kinect2")
+    assert "robot_commands" not in named(nodes_for(options_of()))
+    shown = named(nodes_for(options_of(bag="bag", viewer=True, markers=True)))
+    assert {"viewer", "body_markers", "bag_recorder"} <= set(shown)
+    assert shown["bag_recorder"].parameters["start_recording"] is False
+    recorded = named(nodes_for(options_of(viewer=True, record="r")))["bag_recorder"]
+    assert recorded.parameters == {"folder": "r", "use_sim_time": False}
+    plain = counted(bag="bag")
+    for given, listeners in (({"robot": "robot.yaml"}, 1), ({"viewer": True, "markers": True}, 2)):
+        found = counted(bag="bag", **given)
+        for sensor in graph.DEFAULT_SENSORS:
+            topic = graph.skeleton_topic(sensor)
+            assert found[topic] == plain[topic] + listeners
 
 
 def test_the_convention_is_the_robots() -> None:
     file = ROOT / "config" / "robots" / "iiwa7.yaml"
-    assert graph.convention_of_robot(file, "") == graph.convention_of_robot(file, "auto") == "isb"
+    assert convention_of(file, "") == convention_of(file, "auto") == "isb"
     with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
-        graph.convention_of_robot(file, "model")
+        convention_of(file, "model")
     with pytest.raises(BodyTrackingError, match="cannot be read"):
-        graph.convention_of_robot(ROOT / "nowhere.yaml", "")
-
-
-def test_a_bag_waits_for_those_who_show_it_and_a_page_has_a_recorder_for_its_button() -> None:
-    shown = named(nodes_for(GraphOptions(bag="bag", viewer=True, markers=True)))
-    assert {"viewer", "body_markers", "bag_recorder"} <= set(shown)
-    assert shown["bag_recorder"].parameters["start_recording"] is False
-    # Calibration, fusion and the two that show it; the recorder does not listen yet.
-    assert shown["bag_player"].parameters["wait_for_subscribers"] == ("/kinect1/skeleton:4", "/kinect2/skeleton:4")
-    assert shown["bag_player"].after == {graph.FUSED: 3, graph.FILTERED: 3}
-    recorded = named(nodes_for(GraphOptions(viewer=True, record="r")))["bag_recorder"]
-    assert recorded.parameters == {"folder": "r", "use_sim_time": False}
+        convention_of(ROOT / "nowhere.yaml", "")
 
 
 def test_whether_the_covariance_is_recorded_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text("/bag_recorder: {ros__parameters: {model_covariance: true}}\n")
-    assert graph.with_file(GraphOptions(), file).record_covariance
-    assert not graph.with_file(GraphOptions(), None).record_covariance
-    assert graph.with_file(GraphOptions(record_covariance=True), None).record_covariance
+    assert systems.with_file(options_of(), file)["model_covariance"]
+    assert not systems.with_file(options_of(), None)["model_covariance"]
+    assert systems.with_file(options_of(model_covariance=True), None)["model_covariance"]
 
 
 def test_covariances_of_models_are_known_among_topics_in_every_namespace() -> None:
@@ -193,9 +195,9 @@ def test_persons_are_found_among_topics() -> None:
 
 
 def test_angles_of_positions_need_no_model() -> None:
-    options = GraphOptions(filter_name="ekf", convention="positional")
+    options = options_of(filter="ekf", convention="positional")
     assert named(nodes_for(options))["joint_angles"].parameters["convention"] == "positional"
-    assert named(nodes_for(options))["kinect1_skeleton"].after[graph.FILTERED] == 1
+    assert counted(filter="ekf", convention="positional")[graph.FILTERED] == 1
     assert graph.angles_for("positional", "model_state") == ("positional", "skeleton")
     assert graph.angles_for(graph.AUTO, "model_state") == ("model", "model_state")
 
@@ -203,17 +205,17 @@ def test_angles_of_positions_need_no_model() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        GraphOptions(filter_name="lkf_zero_velocity", filter_input="sensors"),
-        GraphOptions(filter_name="schlagenhauf_ekf", angles_input="model_state"),
+        options_of(filter="lkf_zero_velocity", filter_input="sensors"),
+        options_of(filter="schlagenhauf_ekf", angles_input="model_state"),
     ],
 )
-def test_a_filter_is_not_asked_for_what_it_cannot_do(options: GraphOptions) -> None:
-    with pytest.raises(graph.GraphError, match=f"filter {options.filter_name}"):
+def test_a_filter_is_not_asked_for_what_it_cannot_do(options: Options) -> None:
+    with pytest.raises(graph.GraphError, match=f"filter {options['filter']}"):
         nodes_for(options)
 
 
 @pytest.mark.parametrize("options", VARIANTS)
-def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
+def test_names_are_unique_and_sources_come_last(options: Options) -> None:
     specs = nodes_for(options)
     assert len(named(specs)) == len(specs)
     assert {spec.executable for spec in specs} <= set(EXECUTABLES)
@@ -222,19 +224,19 @@ def test_names_are_unique_and_sources_come_last(options: GraphOptions) -> None:
 
 
 def test_another_cameras_driver_takes_the_place_of_a_sensors_node() -> None:
-    specs = named(nodes_for(GraphOptions(sensors=("a", "b", "c"), adapted=("b:/k4a/bodies", "c"))))
+    specs = named(nodes_for(options_of(sensors=("a", "b", "c"), adapt=("b:/k4a/bodies", "c"))))
     assert specs["a_skeleton"].executable == "kinect_skeleton"
     assert specs["b_skeleton"].executable == specs["c_skeleton"].executable == "skeleton_adapter"
     assert specs["b_skeleton"].parameters == {"sensor": "b", "topic": "/k4a/bodies", "use_sim_time": False}
     assert "topic" not in specs["c_skeleton"].parameters
     with pytest.raises(graph.GraphError, match="adapted sensor 'd' is none of a, b"):
-        nodes_for(GraphOptions(sensors=("a", "b"), adapted=("d",)))
+        nodes_for(options_of(sensors=("a", "b"), adapt=("d",)))
 
 
 @pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
 def test_sensors_that_cannot_be(sensors: tuple[str, ...]) -> None:
     with pytest.raises(BodyTrackingError):
-        nodes_for(GraphOptions(sensors=sensors))
+        nodes_for(options_of(sensors=sensors))
 
 
 def test_sensors_are_found_among_topics() -> None:
@@ -252,8 +254,8 @@ def test_topics_have_known_types_and_publishers() -> None:
 def test_the_parameters_file_is_as_the_code_has_it() -> None:
     pytest.importorskip("rclpy", reason="ROS is not installed")
     text = (ROOT / "config" / "body_tracking.yaml").read_text(encoding="utf-8")
-    assert text == graph.config_text(), "run `make docs`"
-    assert set(yaml.safe_load(text)) == set(named(all_nodes_for(GraphOptions())))
+    assert text == systems.config_text(), "run `make docs`"
+    assert set(yaml.safe_load(text)) == set(named(all_nodes_for(options_of())))
 
 
 # `launch` is not on PyPI: that the launch file runs is checked on a ROS install; here, that it compiles, that what it
@@ -269,7 +271,9 @@ def test_the_launch_file_takes_its_nodes_from_the_table() -> None:
     ours = {
         node.module: [alias.name for alias in node.names] for node in imported if "body_tracking" in str(node.module)
     }
-    assert "nodes_for" in ours["body_tracking.graph"]
+    assert {"systems.nodes_for", "systems.OPTIONS"} <= {
+        ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)
+    }
     for module, names in ours.items():
         found = __import__(str(module), fromlist=names)
         assert all(hasattr(found, name) for name in names)

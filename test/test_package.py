@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import pytest
 
 import body_tracking
-from body_tracking import graph
+from body_tracking import graph, systems
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
@@ -185,7 +185,7 @@ def prefix(project: Path) -> Path:
 def test_colcon_installs_an_executable_per_node_of_the_table_and_what_ros_finds_packages_by(
     prefix: Path, node_names: set[str]
 ) -> None:
-    assert set(graph.EXECUTABLES) == node_names
+    assert set(systems.EXECUTABLES) == node_names
     executables = {path.name for path in (prefix / "lib" / "body_tracking").iterdir() if os.access(path, os.X_OK)}
     assert executables == node_names | {"body_tracking", "kinect_sender"}
     assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "body_tracking").is_file()
@@ -259,8 +259,8 @@ def test_picture_shows_every_node_and_topic() -> None:
     picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
     texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}
     # The picture shows two sensors where the table has a pattern.
-    topics = {topic.name.replace("<sensor>", "kinect1") for topic in graph.TOPICS} - {graph.TF, graph.TF_STATIC}
-    assert set(graph.EXECUTABLES) | topics <= texts
+    topics = {topic.name.replace("<sensor>", "kinect1") for topic in systems.TOPICS} - {graph.TF, graph.TF_STATIC}
+    assert set(systems.EXECUTABLES) | topics <= texts
 
 
 def test_links_in_the_documentation_lead_somewhere() -> None:

@@ -25,13 +25,17 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from body_tracking import cli, graph  # noqa: E402
+from body_tracking import (  # noqa: E402
+    cli,
+    graph,
+    systems,
+)
 from body_tracking.calibration.result import CalibrationResult, SensorQuality  # noqa: E402
 from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.cdr import decode_skeletons  # noqa: E402
+from body_tracking.filters.roles import ROLES  # noqa: E402
 from body_tracking.fusion.people import PeopleParameters  # noqa: E402
 from body_tracking.fusion.subject import ALL  # noqa: E402
-from body_tracking.graph import GraphOptions  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.node_parameters import parameters_for  # noqa: E402
@@ -40,12 +44,14 @@ from body_tracking.parameters import (  # noqa: E402
     ParameterError,
     Value,
 )
+from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.simulation.bags import write_bag  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, lanes, simulate  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS  # noqa: E402
+from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
@@ -432,10 +438,10 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
 # --- parameters
 
 
-def angles_of(parameters: dict[str, dict[str, Any]], options: GraphOptions) -> tuple[str, str]:
+def angles_of(parameters: dict[str, dict[str, Any]], options: Options) -> tuple[str, str]:
     """What ``joint_angles`` makes angles of with these parameters, and in which convention."""
     given = parameters["joint_angles"]
-    published = graph.ROLES[options.filter_name].angles_input if options.filter_name else graph.SKELETON_INPUT
+    published = ROLES[options["filter"]].angles_input if options["filter"] else graph.SKELETON_INPUT
     source = given.get("input", graph.AUTO)
     convention, source = graph.angles_for(
         given.get("convention", graph.AUTO), published if source == graph.AUTO else source
@@ -457,14 +463,14 @@ def test_the_filter_in_the_file_decides_what_joint_angles_listens_to(tmp_path: P
         ("joint_angles: {ros__parameters: {convention: dh26}}", ("skeleton", "dh26")),
     ):
         file.write_text(content)
-        options = graph.with_file(GraphOptions(), file)
-        found = parameters_for(graph.nodes_for(options), file, absent=graph.all_nodes_for(options))
+        options = systems.with_file(options_of(), file)
+        found = parameters_for(systems.nodes_for(options), file, absent=systems.all_nodes_for(options))
         assert angles_of(found, options) == expected
         if "velocity_time" in content:
             assert found["skeleton_filter"]["ekf.velocity_time"] == 2.0
     # The command line wins.
-    options = graph.with_file(GraphOptions(filter_name="lkf_zero_velocity", convention="rep155"), file)
-    found = parameters_for(graph.nodes_for(options), file)
+    options = systems.with_file(options_of(filter="lkf_zero_velocity", convention="rep155"), file)
+    found = parameters_for(systems.nodes_for(options), file)
     assert angles_of(found, options) == ("skeleton", "rep155")
 
 
@@ -477,9 +483,9 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path
         "calibration: {ros__parameters: {calibration_file: mine.yaml}}\n"
         "bag_recorder: {ros__parameters: {chunk_seconds: 2.0}}\n"  # not started, but part of a graph
     )
-    options = GraphOptions(filter_name="lkf_zero_velocity")
+    options = options_of(filter="lkf_zero_velocity")
     defaults = {"calibration": {"calibration_file": "default.yaml"}}
-    found = parameters_for(graph.nodes_for(options), file, defaults, graph.all_nodes_for(options))
+    found = parameters_for(systems.nodes_for(options), file, defaults, systems.all_nodes_for(options))
     assert found["fusion"]["world_frame"] == found["calibration"]["world_frame"] == "map"
     assert "world_frame" not in found["joint_angles"]
     assert found["fusion"]["gate"] == 4.0
@@ -487,4 +493,4 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path
     assert found["skeleton_filter"]["predict_for"] == 1.0
     assert found["calibration"]["calibration_file"] == "mine.yaml"
     with pytest.raises(ParameterError, match="no such node"):
-        parameters_for(graph.nodes_for(options), file, defaults)
+        parameters_for(systems.nodes_for(options), file, defaults)

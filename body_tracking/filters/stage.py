@@ -22,6 +22,7 @@ from body_tracking.filters import (
     parameter_prefix,
 )
 from body_tracking.filters.prediction import Prediction
+from body_tracking.filters.roles import role_of
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
@@ -187,7 +188,7 @@ class PersonFilter:
         one_of_several: Callable[[Skeleton], None] | None = None,
     ) -> None:
         self._filter = make_filter(settings.filter_name, **settings.parameters)
-        role = graph.role_of(graph.GraphOptions(filter_name=settings.filter_name, filter_input=settings.input))
+        role = role_of({"filter": settings.filter_name, "filter_input": settings.input})
         self.by_sensor = role.input == graph.SENSORS_INPUT
         self.alignment: SensorAlignment | None = None
         self.people: People | None = None

@@ -11,23 +11,52 @@ from typing import Any, Protocol
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
+from body_tracking.messages.types import (
+    CLOCK as CLOCK,
+)
+from body_tracking.messages.types import (
+    DIAGNOSTICS as DIAGNOSTICS,
+)
+from body_tracking.messages.types import (
+    FLOAT_ARRAY as FLOAT_ARRAY,
+)
+from body_tracking.messages.types import (
+    IMAGE as IMAGE,
+)
+from body_tracking.messages.types import (
+    IMU as IMU,
+)
+from body_tracking.messages.types import (
+    JOINT_STATE as JOINT_STATE,
+)
+from body_tracking.messages.types import (
+    JOINT_TRAJECTORY as JOINT_TRAJECTORY,
+)
+from body_tracking.messages.types import (
+    MAGNETIC_FIELD as MAGNETIC_FIELD,
+)
+from body_tracking.messages.types import (
+    MARKERS as MARKERS,
+)
+from body_tracking.messages.types import (
+    POINT_CLOUD as POINT_CLOUD,
+)
+from body_tracking.messages.types import (
+    SEGMENTS as SEGMENTS,
+)
+from body_tracking.messages.types import (
+    STRING as STRING,
+)
+from body_tracking.messages.types import (
+    TF as TF,
+)
+from body_tracking.messages.types import (
+    TIME_REFERENCE as TIME_REFERENCE,
+)
+from body_tracking.messages.types import (
+    TRANSFORM as TRANSFORM,
+)
 from body_tracking.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
-
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-JOINT_STATE = "sensor_msgs/msg/JointState"
-TRANSFORM = "geometry_msgs/msg/TransformStamped"
-TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
-IMAGE = "sensor_msgs/msg/Image"
-SEGMENTS = "sensor_msgs/msg/MultiDOFJointState"
-IMU = "sensor_msgs/msg/Imu"
-MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
-STRING = "std_msgs/msg/String"
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-CLOCK = "rosgraph_msgs/msg/Clock"
-JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
-MARKERS = "visualization_msgs/msg/MarkerArray"
-TF = "tf2_msgs/msg/TFMessage"
 
 
 class MessageError(BodyTrackingError):

@@ -11,8 +11,8 @@ from body_tracking.executables import hold_signals, start
 
 if __name__ == "__main__":
     hold_signals()
-    from body_tracking.graph import EXECUTABLES, config_text
     from body_tracking.nodes.supervised import die_with_parent
+    from body_tracking.systems import EXECUTABLES, config_text
 
     die_with_parent()
     if sys.argv[1:] == ["parameters"]:

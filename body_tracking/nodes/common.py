@@ -45,7 +45,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
 
-from body_tracking import dds, graph, names
+from body_tracking import dds, graph, names, systems
 from body_tracking.backlog import Backlog, Sequences, Standstill
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
@@ -704,7 +704,7 @@ def _meant_for_others(node: Node, unknown: Set[str]) -> Set[str]:
                 shared |= unknown & values.keys()
     if not shared:
         return shared
-    return shared & {parameter.name for name in graph.EXECUTABLES for parameter in graph.parameters_of(name)}
+    return shared & {parameter.name for name in systems.EXECUTABLES for parameter in systems.parameters_of(name)}
 
 
 def _parameter_files() -> list[Path]:

@@ -20,12 +20,14 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from body_tracking import graph, names
-from body_tracking.graph import GraphOptions
+from body_tracking.filters.roles import ROLES, role_of
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.node_status import NodeStatus, note_statuses
 from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.pipeline.system import Options
 from body_tracking.recording.qos import RELIABLE
+from body_tracking.sensors.system import sensors_of
 
 _CHAIN = ("skeleton_filter", "joint_angles")
 _NAME = "body_tracking_up"
@@ -122,7 +124,7 @@ class GraphMonitor:
 
     # --- for people
 
-    def line(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:
+    def line(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
         """The status line: rates, delay, calibration, restarts."""
         now = time.monotonic()
         fresh = {name: status for name, status in self._statuses.items() if now - status.received < _FRESH}
@@ -141,19 +143,19 @@ class GraphMonitor:
             parts.append(f"malformed {malformed}")
         values = {f"{key}: {said}" for status in fresh.values() for key, said in status.values.items()}
         parts += sorted(each for each in values if each.startswith("publishers "))
-        if options.robot:
+        if options["robot"]:
             parts.append(f"robot {fresh['robot_commands'].text if 'robot_commands' in fresh else '-'}")
         if restarts:
             parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
         return " | ".join(parts)
 
-    def _rates(self, options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
+    def _rates(self, options: Options, fresh: Mapping[str, NodeStatus]) -> str:
         def rate(node: str, way: str, topic: str) -> str:
             key = f"rate {way} {names.resolved(topic, self._namespace)}"
             value = fresh[node].values.get(key) if node in fresh else None
             return f"{float(value):.0f}" if value is not None else "-"
 
-        sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in options.sensors)
+        sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in sensors_of(options))
         fused = rate("fusion", "out", graph.FUSED)
         rates = [rate("joint_angles", "out", topic) for topic in self._angles_topics]
         # those of whom something comes; of nobody at least how it is with the first
@@ -161,25 +163,24 @@ class GraphMonitor:
         return f"{sensors}, fused {fused}, angles {angles} Hz"
 
     @staticmethod
-    def _delay(options: GraphOptions, fresh: Mapping[str, NodeStatus]) -> str:
+    def _delay(options: Options, fresh: Mapping[str, NodeStatus]) -> str:
         """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
         running = fresh.get("skeleton_filter")
-        role = graph.ROLES.get(running.text if running is not None else "")  # it may have changed since the start
-        taken = (
-            (role or graph.role_of(options)).input if options.filter_input in ("", graph.AUTO) else options.filter_input
-        )
+        role = ROLES.get(running.text if running is not None else "")  # it may have changed since the start
+        asked = options["filter_input"]
+        taken = (role or role_of(options)).input if asked in ("", graph.AUTO) else asked
         by_sensor = taken == graph.SENSORS_INPUT
         chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)
         values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in chain]
         known = [float(value) for value in values if value is not None]
         return f"delay {sum(known):.1f} ms" if len(known) == len(chain) else ""
 
-    def summary(self, options: GraphOptions, elapsed: float, restarts: Mapping[str, int]) -> str:
+    def summary(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
         """What was done."""
-        what = f"played {options.bag}" if options.bag else "ran"
+        what = f"played {options['bag']}" if options["bag"] else "ran"
         text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
-        if options.record:
-            text += f", recorded in {options.record}"
+        if options["record"]:
+            text += f", recorded in {options['record']}"
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text

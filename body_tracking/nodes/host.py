@@ -10,35 +10,21 @@ from functools import partial
 from typing import Any, ClassVar
 
 from rclpy.publisher import Publisher
-from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.nodes.bag_topics import UnknownTypeError, message_class, to_profile
-from body_tracking.nodes.common import ROS, STEADY, GraphNode, deserialized
+from body_tracking.nodes.common import STEADY, GraphNode, run
+from body_tracking.nodes.wire import WIRE
 from body_tracking.parameters import Value
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.systems import stage_class
 
 _LOOK_S = 0.1
 """Seconds between two looks for what other nodes publish."""
 _SAVE_S = 2.0
 """Seconds between two writings to disk at least."""
-
-
-class RosWire:
-    """Serialisation by the client library."""
-
-    types = ROS
-
-    def serialize(self, type_name: str, message: Any) -> bytes:
-        return bytes(serialize_message(message))
-
-    def deserialize(self, type_name: str, cdr: bytes) -> Any:
-        return deserialized(cdr, message_class(type_name))
-
-
-_WIRE = RosWire()
 
 
 class StageNode(GraphNode):
@@ -129,7 +115,7 @@ class StageNode(GraphNode):
         if port.perishable and self.is_stale(self.full_name(topic), sent_ns):
             return
         try:
-            payload = port.codec.decode(cdr, _WIRE)
+            payload = port.codec.decode(cdr, WIRE)
         except BodyTrackingError:
             self.stage.refused(topic)
             raise
@@ -164,7 +150,7 @@ class StageNode(GraphNode):
             port, publisher = self.outputs[output.topic]
             if publisher is None:
                 continue
-            cdr = port.codec.encode(output.payload, _WIRE)
+            cdr = port.codec.encode(output.payload, WIRE)
             if port.measured:
                 self.send(publisher, cdr, output.stamp_ns, self.sent_ns)
             elif self.sent_ns is None or not self.is_stale(publisher.topic_name, self.sent_ns):
@@ -209,3 +195,13 @@ class StageNode(GraphNode):
             self.stage.save()
         except BodyTrackingError as error:
             self.get_logger().error(str(error))
+
+
+def host_of(executable: str) -> Callable[[], None]:
+    """What runs the node that hosts the stage of this name."""
+    hosted = stage_class(executable)
+
+    class Host(StageNode):
+        STAGE = hosted
+
+    return partial(run, Host)

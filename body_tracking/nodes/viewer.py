@@ -25,11 +25,12 @@ from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2
 from std_srvs.srv import Trigger
 
-from body_tracking import graph, names
+from body_tracking import graph, names, systems
 from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
+from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
@@ -38,9 +39,11 @@ from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_status import NodeStatus, note_statuses
-from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.nodes.bag_topics import message_class, to_profile
 from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run
+from body_tracking.nodes.wire import WIRE
 from body_tracking.parameters import Parameter
+from body_tracking.pipeline.system import load
 from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
 from body_tracking.sensors import check_sensor_name
 from body_tracking.skeleton import FloatArray, Skeleton
@@ -96,7 +99,7 @@ class ViewerNode(GraphNode):
         self.history = AngleHistory(given["window"])
         self.drawn, self.drawing_s = 0, 0.0
         self.ended = threading.Event()
-        self.triggers = {name: self.create_client(Trigger, name) for name, _, _ in graph.SERVICES}
+        self.triggers = {each.name: self.create_client(Trigger, each.name) for each in systems.SERVICES}
         self.setters = {
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
             for name in ("skeleton_filter", "joint_angles")
@@ -104,6 +107,10 @@ class ViewerNode(GraphNode):
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
             self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+        self.codecs = {layer.topic: load(layer.codec)() for layer in systems.LAYERS}
+        for topic, codec in self.codecs.items():
+            kind = message_class(codec.type_name)
+            self.listen(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
         self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
         self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
         self.of_body: list[Any] = []
@@ -124,7 +131,14 @@ class ViewerNode(GraphNode):
         except ImportError as error:
             raise PageError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
         page = Page(
-            given["host"], given["port"], self.sensors, self, tuple(FILTERS), tuple(ALL_CONVENTIONS), given["window"]
+            given["host"],
+            given["port"],
+            self.sensors,
+            self,
+            tuple(FILTERS),
+            tuple(ALL_CONVENTIONS),
+            given["window"],
+            systems.LAYERS,
         )
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
@@ -207,6 +221,7 @@ class ViewerNode(GraphNode):
             self.seen(graph.FILTERED),
             origins,
             quats,
+            {layer.name: self.payload(layer.topic) for layer in systems.LAYERS},
         )
 
     def seen(self, topic: str) -> Seen:
@@ -235,6 +250,17 @@ class ViewerNode(GraphNode):
         except MessageError as error:
             self.malformed(graph.segments_topic(self.body), str(error))
             return np.empty((0, 3)), np.empty((0, 4))
+
+    def payload(self, topic: str) -> Any:
+        """The latest message of a layer's topic; None for none, or none that is new."""
+        cdr, received = self.latest.get(topic, (b"", -np.inf))
+        if time.monotonic() - received > _STALE_S:
+            return None
+        try:
+            return self.codecs[topic].decode(cdr, WIRE)
+        except BodyTrackingError as error:
+            self.malformed(topic, str(error))
+            return None
 
     def collect_angles(self) -> None:
         """Take the joint angles that have come, each with its standard deviations."""
@@ -273,7 +299,7 @@ class ViewerNode(GraphNode):
 
     def choose_filter(self, name: str) -> str:
         """Another filter, and what the joint angles then are made of."""
-        convention = graph.ROLES[name].convention
+        convention = ROLES[name].convention
         self.set_parameters_of("skeleton_filter", filter=name)
         self.set_parameters_of("joint_angles", convention=convention, input=graph.AUTO)
         return f"{name}, with angles {convention}"

@@ -14,6 +14,14 @@ _LOOKS = 2
 """What a stage follows has to be the same at so many looks."""
 
 
+def connect(stages: Sequence[Stage], published: Iterable[str] = ()) -> None:
+    """Let each stage follow what the others publish, and who else publishes these topics."""
+    there = {port.topic for stage in stages for port in stage.outputs} | set(published)
+    for stage in stages:
+        for _ in range(_LOOKS):
+            stage.look(there.__contains__)
+
+
 class OfflineRunner:
     """Feeds stages with messages, and hands over what they publish.
 
@@ -41,10 +49,7 @@ class OfflineRunner:
         self._stages, self._wire, self._sink = stages, wire, sink
         self._queue: deque[tuple[str, bytes]] = deque()
         self._last_ns: dict[tuple[str, int], int] = {}
-        there = {port.topic for stage in stages for port in stage.outputs} | set(published)
-        for stage in stages:
-            for _ in range(_LOOKS):
-                stage.look(there.__contains__)
+        connect(stages, published)
         self._outputs = [{port.topic: port for port in stage.outputs} for stage in stages]
         self._inputs: dict[str, list[tuple[int, Stage, Port]]] = {}
         for number, stage in enumerate(stages):

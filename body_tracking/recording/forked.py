@@ -19,12 +19,10 @@ from typing import Any
 from body_tracking import graph
 from body_tracking.parameters import Value
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.pipeline.registry import stage_class
+from body_tracking.pipeline.system import Place
 from body_tracking.recording.qos import Qos
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remove_file
-
-STAGES = ("skeleton_filter", "joint_angles")
-"""Those of the second half."""
+from body_tracking.systems import NODES, stage_class
 
 _BATCH = 128
 """Messages that go through the pipe at once: each trip costs as much as several of them."""
@@ -62,6 +60,11 @@ class Job:
     model_covariance: bool
 
 
+def is_second(executable: str) -> bool:
+    """Whether a stage is one of the second half."""
+    return NODES[executable].place >= Place.FILTER
+
+
 class Downstream:
     """Writes every message, and runs the second half on it.
 
@@ -73,7 +76,7 @@ class Downstream:
     """
 
     def __init__(self, job: Job) -> None:
-        self._stages = [stage_class(name)(job.values[name]) for name in STAGES]
+        self._stages = [stage_class(name)(values) for name, values in job.values.items() if is_second(name)]
         self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
         self._covariance = job.model_covariance
         self._frames = 0
@@ -103,7 +106,8 @@ class Downstream:
             self._writer.close()
         else:
             self._writer.discard()
-        return Written(self._frames, {**self._stages[0].counters, **self._runner.counters})
+        counters = {f"filter {name}": count for name, count in self._stages[0].counters.items()}
+        return Written(self._frames, {**counters, **self._runner.counters})
 
     @property
     def path(self) -> Path:

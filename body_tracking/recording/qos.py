@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from body_tracking.files import FileError, load_yaml
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.times import NANOSECONDS
 
 INFINITE_NS = 2**63 - 1
 """``RMW_DURATION_INFINITE``: 9223372036 s and 854775807 ns."""

@@ -21,23 +21,32 @@ from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.storage import load
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
-from body_tracking.filters import DEFAULT_FILTER, FILTERS, parameter_prefix
+from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people import PeopleParameters
 from body_tracking.fusion.subject import SubjectSelector
 from body_tracking.inertial.parameters import TrackingParameters
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_parameters import parameters_for as parameters_of_nodes
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.pipeline.registry import STAGES, stage_class
 from body_tracking.pipeline.stage import JUMP_BACK_NS
+from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage, deserialize
 from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.systems import (
+    STAGES,
+    add_options,
+    all_nodes_for,
+    nodes_for,
+    options_from,
+    options_of,
+    stage_class,
+    with_file,
+)
 
 _P = TypeVar("_P")
 
@@ -81,16 +90,16 @@ class ReplaySettings:
     parameters: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     model_covariance: bool = False
 
-    def options(self) -> graph.GraphOptions:
+    def options(self) -> Options:
         """The graph that runs."""
-        return graph.GraphOptions(
+        return options_of(
             sensors=self.sensors or graph.DEFAULT_SENSORS,
-            filter_name=self.filter_name,
+            filter=self.filter_name,
             filter_input=self.filter_input,
             convention=self.convention,
             angles_input=self.angles_input,
             imus=self.imus,
-            calibration_file="" if self.calibration_file is None else str(self.calibration_file),
+            calibration="" if self.calibration_file is None else str(self.calibration_file),
             external=True,
         )
 
@@ -100,7 +109,10 @@ class ReplaySettings:
         Raises:
             BodyTrackingError: they do not go together.
         """
-        specs = graph.nodes_for(self.options())
+        specs = sorted(
+            (spec for spec in nodes_for(self.options()) if spec.name in STAGES),
+            key=lambda spec: STAGES.index(spec.name),
+        )
         prefix = parameter_prefix(self.filter_name)
         people = asdict(self.people)
         own: dict[str, dict[str, Any]] = {
@@ -112,12 +124,11 @@ class ReplaySettings:
         }
         found = {}
         for spec in specs:
-            if spec.name in STAGES:
-                given = {**spec.defaults, **own[spec.name], **spec.parameters, "reference": self.reference}
-                given |= self.parameters.get(spec.name, {})
-                table = stage_class(spec.name).PARAMETERS
-                known = {item.name for item in table}
-                found[spec.name] = check_all(table, {name: each for name, each in given.items() if name in known})
+            given = {**spec.defaults, **own.get(spec.name, {}), **spec.parameters, "reference": self.reference}
+            given |= self.parameters.get(spec.name, {})
+            table = stage_class(spec.name).PARAMETERS
+            known = {item.name for item in table}
+            found[spec.name] = check_all(table, {name: each for name, each in given.items() if name in known})
         return found
 
 
@@ -264,10 +275,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         if settings.calibration_file is not None:
             load(settings.calibration_file)  # it has to be there
         values = settings.values()
-        stages = [
-            stage_class(name)(values[name]) for name in values if name not in forked.STAGES
-        ]  # before `out` is touched
-        stages.sort(key=lambda stage: STAGES.index(stage.NAME))
+        # before `out` is touched
+        stages = [stage_class(name)(each) for name, each in values.items() if not forked.is_second(name)]
         written_by_us = {
             p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
         }
@@ -300,7 +309,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             )
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
-        counters.update({f"filter {name}": count for name, count in written.counters.items()})
+        counters.update(written.counters)
         return ReplayReport(
             written.frames,
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
@@ -352,16 +361,9 @@ def values_for(
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings that a command line asks for."""
-    asked = graph.GraphOptions(
-        filter_name=args.filter or "",
-        convention=args.convention or "",
-        subject=args.subject or "",
-        people=args.people,
-        external=True,
-    )
-    chosen = graph.with_file(asked, args.params_file)
-    specs = [spec for spec in graph.nodes_for(chosen) if spec.name in STAGES]
-    given = parameters_of_nodes(specs, args.params_file, absent=graph.all_nodes_for(chosen))
+    chosen = with_file(options_of(**{**options_from(args), "external": True}), args.params_file)
+    specs = [spec for spec in nodes_for(chosen) if spec.name in STAGES]
+    given = parameters_of_nodes(specs, args.params_file, absent=all_nodes_for(chosen))
     left = ("use_sim_time", "sensors", "calibration_file")
     parameters = {
         node: {name: value for name, value in values.items() if name not in left} for node, values in given.items()
@@ -373,15 +375,16 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     if args.reference:
         for values in parameters.values():
             values["reference"] = args.reference
+    words: dict[str, Any] = dict(chosen)
     return ReplaySettings(
-        tuple(args.sensors.split(",")) if args.sensors else (),
+        words["sensors"] if args.sensors else (),
         args.reference or "",
-        chosen.filter_name or DEFAULT_FILTER,
-        chosen.convention or graph.AUTO,
-        chosen.filter_input or graph.AUTO,
-        chosen.angles_input or graph.AUTO,
+        words["filter"] or DEFAULT_FILTER,
+        words["convention"] or graph.AUTO,
+        words["filter_input"] or graph.AUTO,
+        words["angles_input"] or graph.AUTO,
         args.calibration,
-        chosen.imus,
+        words["imus"],
         PeopleParameters(**people),  # type: ignore[arg-type]
         parameters=parameters,
         model_covariance=args.model_covariance,
@@ -399,18 +402,18 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics"
     )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
-    command.add_argument("--filter", choices=FILTERS, help=f"default: {DEFAULT_FILTER}")
-    command.add_argument("--convention", choices=ALL_CONVENTIONS, help="of the joint angles (default: by the filter)")
-    command.add_argument("--sensors", metavar="A,B", help="use these, the first as reference (default: all in the bag)")
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
-    command.add_argument("--calibration", type=Path, metavar="FILE", help="start from this calibration (YAML)")
-    command.add_argument("--params-file", type=Path, metavar="F", help="ROS parameters file, as for the nodes")
     command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
-    graph.add_people(command)
-    command.add_argument(
-        "--model-covariance",
-        action="store_true",
-        help="with ekf: write /filtered/model_covariance, too; it is most of such a bag",
+    names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "params_file")
+    add_options(
+        command,
+        *names,
+        "model_covariance",
+        filter=f"default: {DEFAULT_FILTER}",
+        convention="of the joint angles (default: by the filter)",
+        sensors="use these, the first as reference (default: all in the bag)",
+        calibration="start from this calibration (YAML)",
+        model_covariance="with ekf: write /filtered/model_covariance, too; it is most of such a bag",
     )
     command.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
     command.add_argument("--json", action="store_true", help="print the report as JSON")

@@ -10,10 +10,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from body_tracking.skeleton import Skeleton
 
 RESERVED_NAMES = ("fused", "filtered", "ground_truth", "imu")
 """First parts of topics that are not sensors."""

@@ -20,6 +20,7 @@ from viser import uplot
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.node_status import NodeStatus
+from body_tracking.pipeline.system import Layer, load
 from body_tracking.skeleton import FloatArray, Skeleton
 from body_tracking.viewing.colours import (
     BODY,
@@ -91,6 +92,7 @@ class Page:
         filters: that can be chosen.
         conventions: likewise.
         window: seconds that the plots show.
+        layers: what systems show beside the skeletons.
 
     Raises:
         PageError: the address is not one of this machine, or pages of other sites could not be kept out.
@@ -105,12 +107,15 @@ class Page:
         filters: Sequence[str],
         conventions: Sequence[str],
         window: float,
+        layers: Sequence[Layer] = (),
     ) -> None:
         _check_address(host)
         with same_origin(), redirect_stdout(StringIO()):  # it has much to say
             self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
         self._controls = controls
-        self._visible = {name: shown for name, (_, shown) in LAYERS.items()}
+        self._choices = {**LAYERS, **{each.name: (each.text, each.shown) for each in layers}}
+        self._layers = [(each.name, load(each.draw)) for each in layers]
+        self._visible = {name: shown for name, (_, shown) in self._choices.items()}
         self._floor: float | None = None
         self._looked_at = _HEAD_START
         self._scene(sensors)
@@ -185,6 +190,7 @@ class Page:
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show what is there now."""
+        scene = self._server.scene
         with self._server.atomic():
             standing: list[Skeleton] = []
             for sensor, seen in snapshot.sensors.items():
@@ -206,6 +212,8 @@ class Page:
             self._floor = floor_height([*standing, *snapshot.filtered.skeletons], self._floor)
             self._grid.position = (2.0, 0.0, -1.0 if self._floor is None else self._floor)
             _show(self._grid, self._visible["floor"])
+            for name, draw_layer in self._layers:
+                draw_layer(scene, f"/layers/{name}", snapshot.layers.get(name) if self._visible[name] else None)
         bodies = snapshot.filtered.skeletons or tuple(standing)
         if bodies:
             points = np.concatenate([each.positions[each.valid] for each in bodies])
@@ -258,7 +266,7 @@ class Page:
             self._convention = self._choice("angles", conventions, self._controls.choose_convention)
             self._body = self._choice("person", (_NONE,), self._controls.choose_body)
         with gui.add_folder("Show"):
-            for name, (label, shown) in LAYERS.items():
+            for name, (label, shown) in self._choices.items():
                 self._checkbox(name, label, shown)
         angles = gui.add_panel()
         with angles.add_tab("Joint angles", viser.Icon.CHART_LINE):

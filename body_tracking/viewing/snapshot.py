@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 from body_tracking.calibration.result import SensorPose
 from body_tracking.errors import BodyTrackingError
@@ -58,6 +58,7 @@ class Snapshot:
         filtered: in world.
         origins: (n, 3) metres, of the model's segments in world.
         quats_xyzw: (n, 4) their orientations.
+        layers: the payloads of further layers, by name.
     """
 
     sensors: Mapping[str, Seen]
@@ -66,3 +67,4 @@ class Snapshot:
     filtered: Seen
     origins: FloatArray
     quats_xyzw: FloatArray
+    layers: Mapping[str, Any] = field(default_factory=dict)

@@ -18,7 +18,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from body_tracking.graph import EXECUTABLES, PARENT_VARIABLE
+from body_tracking.graph import PARENT_VARIABLE
+from body_tracking.systems import EXECUTABLES
 
 _FORKING = multiprocessing.get_context("forkserver")
 _FORKING.set_forkserver_preload([f"body_tracking.nodes.{executable}" for executable in EXECUTABLES])

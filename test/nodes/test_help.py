@@ -11,11 +11,11 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 from node_process import NodeProcess
 from running import environment
 
-from body_tracking import graph
+from body_tracking import systems
 from body_tracking.parameters import check_all, read_file
 
 
-@pytest.mark.parametrize("executable", graph.EXECUTABLES)
+@pytest.mark.parametrize("executable", systems.EXECUTABLES)
 def test_help_ends_with_a_parameters_file_of_all_defaults(executable: str, tmp_path: Path) -> None:
     process = NodeProcess(executable, ["--help"], tmp_path / "log", environment())
     try:
@@ -26,5 +26,5 @@ def test_help_ends_with_a_parameters_file_of_all_defaults(executable: str, tmp_p
     assert text.startswith(f"usage: ros2 run body_tracking {executable} ")
     (tmp_path / "parameters.yaml").write_text(file)
     (values,) = read_file(tmp_path / "parameters.yaml").values()
-    table = graph.parameters_of(executable)
+    table = systems.parameters_of(executable)
     assert check_all(table, values) == {parameter.name: parameter.default for parameter in table}

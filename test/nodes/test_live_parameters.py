@@ -15,7 +15,7 @@ from running import BAG, Running
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from body_tracking import graph
+from body_tracking import graph, systems
 from body_tracking.kinematics.tracking import angle_names
 from body_tracking.parameters import ParameterError
 
@@ -94,9 +94,9 @@ def test_every_node_reports_what_comes_in_and_goes_out(running: Graph) -> None:
 # --- parameters
 
 
-@pytest.mark.parametrize("executable", graph.EXECUTABLES)
+@pytest.mark.parametrize("executable", systems.EXECUTABLES)
 def test_every_parameter_is_live_or_has_a_reason(executable: str) -> None:
-    for item in graph.parameters_of(executable):
+    for item in systems.parameters_of(executable):
         if item.live:
             assert item.check_change(item.default) == item.default
             assert not item.fixed, item.name
@@ -107,7 +107,7 @@ def test_every_parameter_is_live_or_has_a_reason(executable: str) -> None:
 
 @pytest.mark.parametrize("node", sorted(PARAMETERS))
 def test_what_is_live_is_taken_and_the_rest_says_why_not_and_what_to_do(running: Graph, node: str) -> None:
-    table = graph.parameters_of(node)
+    table = systems.parameters_of(node)
     names = [item.name for item in table]
     values = dict(zip(names, running.get(node, names), strict=True))
     answers = running.set(node, **values)

@@ -15,7 +15,11 @@ from running import BAG, ROOT, Running  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking import graph, names  # noqa: E402
+from body_tracking import (  # noqa: E402
+    graph,
+    names,
+    systems,
+)
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
 
@@ -32,7 +36,7 @@ NEEDED: dict[str, dict[str, object]] = {
 """Parameters without which an executable does not start, or has fewer topics."""
 
 
-@pytest.mark.parametrize("executable", graph.EXECUTABLES)
+@pytest.mark.parametrize("executable", systems.EXECUTABLES)
 def test_every_name_of_a_node_is_in_its_namespace(executable: str) -> None:
     given = {"use_sim_time": True, **NEEDED.get(executable, {})}
     parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]

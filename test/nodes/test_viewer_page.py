@@ -28,6 +28,7 @@ from running import Running, stop  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
+from body_tracking.filters.roles import ROLES  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.viewing.shapes import figure  # noqa: E402
@@ -106,7 +107,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
     with Running(tmp_path) as running:
         # The picture shows the filter that knows a body; it takes six times as long.
         name = "ekf" if PICTURES else "lkf_constant_velocity"
-        role = graph.ROLES[name]
+        role = ROLES[name]
         running.start("bag_recorder", folder=tmp_path / "recorded", start_recording=False, use_sim_time=True)
         running.start("joint_angles", input=role.angles_input, convention=role.convention, use_sim_time=True)
         running.start("skeleton_filter", filter=name, use_sim_time=True)

@@ -204,7 +204,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no angles": ({"silent": True}, "no new angles for"),
     "frames that repeat": ({"frames": 0}, "no frame of kinect1, kinect2 for"),
     "a missing sensor": ({"quality": quality("kinect2")}, "calibration is missing: kinect2"),
-    "a turned sensor": ({"quality": quality(rotation=0.2)}, "poor: standard deviation 0.2 rad of a sensor's orient"),
+    "a turned sensor": ({"quality": quality(rotation=0.07)}, "poor: standard deviation 0.07 rad of a sensor's orient"),
     "a misplaced sensor": (
         {"quality": quality(translation=math.inf)},
         "poor: standard deviation inf m of a sensor's p",

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from tools import Tool, Tools
 
-from body_tracking import graph
+from body_tracking import systems
 from draws import some
 
 LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
@@ -29,7 +29,7 @@ class Everybody:
             "viewer": {"port": 0},
         }
         self.tools_of: dict[str, Tool] = {
-            executable: tools.run(executable, **parameters.get(executable, {})) for executable in graph.EXECUTABLES
+            executable: tools.run(executable, **parameters.get(executable, {})) for executable in systems.EXECUTABLES
         }
 
     def text(self) -> str:
@@ -45,12 +45,14 @@ def everybody(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactor
 
 def test_every_node_tells_of_itself(everybody: Everybody) -> None:
     seen = everybody.tools.bench.diagnostics
-    wanted = set(graph.EXECUTABLES)
+    wanted = set(systems.EXECUTABLES)
     assert everybody.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), everybody.text())
 
 
 def test_every_service_answers(everybody: Everybody) -> None:
-    calls = [("service", "call", f"/{name}", "std_srvs/srv/Trigger") for name, _, _ in graph.SERVICES]
+    calls = [
+        ("service", "call", f"/{name}", "std_srvs/srv/Trigger") for name in [each.name for each in systems.SERVICES]
+    ]
     # The recorder is to start before it stops.
     first, later = [call for call in calls if "start" in call[2]], [call for call in calls if "start" not in call[2]]
     for text in (*everybody.tools.all(first), *everybody.tools.all(later)):
@@ -59,7 +61,7 @@ def test_every_service_answers(everybody: Everybody) -> None:
 
 
 def test_ctrl_c_ends_every_node_in_order(everybody: Everybody) -> None:
-    assert [tool.process.poll() for tool in everybody.tools_of.values()] == [None] * len(graph.EXECUTABLES)
+    assert [tool.process.poll() for tool in everybody.tools_of.values()] == [None] * len(systems.EXECUTABLES)
     for tool in everybody.tools_of.values():
         tool.interrupt()
     codes = {name: tool.ended() for name, tool in everybody.tools_of.items()}

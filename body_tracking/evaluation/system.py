@@ -1,0 +1,14 @@
+"""Pictures of results, and their comparison with the truth."""
+
+from __future__ import annotations
+
+from body_tracking.pipeline.system import Command, System
+
+SYSTEM = System(
+    "evaluation",
+    order=8,
+    commands=(
+        Command("show", "body_tracking.evaluation.show", "show the joint angles in a recording"),
+        Command("evaluate", "body_tracking.evaluation.evaluate", "compare what was estimated with the truth"),
+    ),
+)

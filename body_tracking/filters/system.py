@@ -1,0 +1,121 @@
+"""The filters, and what each means for the nodes around it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from body_tracking import graph
+from body_tracking.messages.types import IMAGE, JOINT_STATE, POINT_CLOUD, SEGMENTS, STRING
+from body_tracking.parameters import Value
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    System,
+    TopicSpec,
+    asked,
+    sensors_and_transport,
+)
+from body_tracking.recording.qos import RELIABLE
+
+
+def _filters() -> Sequence[str]:
+    from body_tracking.filters import FILTERS
+
+    return FILTERS
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    imus = options["imus"]
+    worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
+    orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
+    chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people")
+    yield NodeSpec(
+        "skeleton_filter",
+        "skeleton_filter",
+        defaults=orientations,
+        parameters={**sensors_and_transport(options), **chosen},
+    )
+
+
+SYSTEM = System(
+    "filters",
+    order=2,
+    nodes=(NodeType("skeleton_filter", Place.FILTER, "body_tracking.filters.stage:FilterStage"),),
+    specs=_specs,
+    options=(
+        Option(
+            "filter",
+            "",
+            "which filter; overrides the parameters file",
+            choices=_filters,
+            parameter=("skeleton_filter", "filter"),
+        ),
+        Option("filter_input", "", parameter=("skeleton_filter", "input"), hidden=True),
+    ),
+    topics=(
+        TopicSpec(
+            graph.FILTERED,
+            POINT_CLOUD,
+            graph.SKELETON,
+            "skeleton_filter",
+            "the same, filtered; in addition velocity `vx vy vz`; with `ekf` one per sensor's frame, and predicted "
+            "ones while nothing arrives",
+        ),
+        TopicSpec(
+            graph.MODEL_STATE,
+            JOINT_STATE,
+            graph.SKELETON,
+            "skeleton_filter",
+            "`ekf`: coordinates of the body model and their rates; base x y z in `world`, rotation vectors of the base "
+            "and of the upper arms, the other angles",
+        ),
+        TopicSpec(
+            graph.MODEL_STATE_STDDEV,
+            JOINT_STATE,
+            graph.SKELETON,
+            "skeleton_filter",
+            "`ekf`: the standard deviation of each; of a rotation, that of a small one more in the segment's own frame",
+        ),
+        TopicSpec(
+            graph.MODEL_COVARIANCE,
+            IMAGE,
+            graph.SKELETON,
+            "skeleton_filter",
+            "`ekf`: the whole covariance of these coordinates (rows 0 to 31) and of their rates (rows 32 to 63), "
+            "`32FC1`, with the stamp of the state",
+        ),
+        TopicSpec(
+            graph.model_topics("<id>", several=True).state,
+            JOINT_STATE,
+            graph.SKELETON,
+            "skeleton_filter",
+            "`ekf`, of each of several people (`subject: all`) what `/filtered/model_state` is of one; so are "
+            "`.../model_state_stddev` and `.../model_covariance`",
+        ),
+        TopicSpec(
+            graph.TRACKED,
+            "hri_msgs/msg/IdsList",
+            RELIABLE,
+            "skeleton_filter",
+            "the ids of the people who are tracked (REP-155), where hri_msgs is installed",
+        ),
+        TopicSpec(
+            graph.segments_topic("<id>"),
+            SEGMENTS,
+            RELIABLE,
+            "skeleton_filter",
+            "`ekf`: the pose of each segment of the body in `world`; quaternions have no singular pose",
+        ),
+        TopicSpec(
+            graph.urdf_topic("<id>"),
+            STRING,
+            graph.URDF_QOS,
+            "skeleton_filter",
+            "`ekf`: the person's model with the segment lengths known so far, for robot_state_publisher; its joints "
+            "are the angles of the convention `model`",
+        ),
+    ),
+)

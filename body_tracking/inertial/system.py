@@ -1,0 +1,64 @@
+"""The inertial system: sensors on segments of a body."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from body_tracking import graph
+from body_tracking.messages.types import IMU, POINT_CLOUD
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    Service,
+    System,
+    TopicSpec,
+    asked,
+    sensors_and_transport,
+)
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    if options["imus"]:
+        given = {"segments": options["imus"], **sensors_and_transport(options), **asked(options, subject="subject")}
+        yield NodeSpec("imu_skeleton", "imu_skeleton", parameters=given)
+
+
+SYSTEM = System(
+    "inertial",
+    order=1,
+    nodes=(NodeType("imu_skeleton", Place.SENSING, "body_tracking.inertial.stage:ImuStage"),),
+    specs=_specs,
+    options=(
+        Option(
+            "imus",
+            (),
+            "a segment with an inertial sensor, as the parameter segments of imu_skeleton lists them",
+            "SEGMENT[:NAME]",
+            parameter=("imu_skeleton", "segments"),
+        ),
+    ),
+    topics=(
+        TopicSpec(
+            graph.IMU_SKELETON,
+            POINT_CLOUD,
+            graph.SKELETON,
+            "imu_skeleton",
+            "the body that fits the orientations of inertial sensors, in `world`, with covariance as "
+            "`/fused/skeleton`; joints that these do not place are inferred",
+        ),
+        TopicSpec(
+            graph.orientation_topic("<segment>"),
+            IMU,
+            graph.SKELETON,
+            "imu_skeleton",
+            "the orientation of a segment in `world` with its covariance there, and its angular velocity about its own "
+            "axes, by an inertial sensor",
+        ),
+    ),
+    services=(
+        Service(graph.ALIGN_SERVICE, "imu_skeleton", "align the inertial sensors anew in the next pose that is held"),
+    ),
+)

@@ -1,0 +1,72 @@
+"""The joint angles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from body_tracking import graph
+from body_tracking.messages.types import JOINT_STATE
+from body_tracking.parameters import Value
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    System,
+    TopicSpec,
+    asked,
+    transport,
+)
+from body_tracking.recording.qos import RELIABLE
+
+
+def _conventions() -> Sequence[str]:
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS
+
+    return ALL_CONVENTIONS
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    from body_tracking.filters.roles import role_of
+
+    role = role_of(options)
+    # What nobody asked for is left to joint_angles, which follows the filter while that changes.
+    angles: dict[str, Value] = asked(options, input="angles_input", subject="subject", people="people")
+    if options["convention"] not in ("", graph.AUTO) or graph.convention_of(role.angles_input) != role.convention:
+        angles["convention"] = role.convention
+    yield NodeSpec("joint_angles", "joint_angles", parameters={**transport(options), **angles})
+
+
+SYSTEM = System(
+    "kinematics",
+    order=3,
+    nodes=(NodeType("joint_angles", Place.ANGLES, "body_tracking.kinematics.stage:AnglesStage"),),
+    specs=_specs,
+    options=(
+        Option(
+            "convention",
+            "",
+            "of the joint angles; overrides the file, too",
+            choices=_conventions,
+            parameter=("joint_angles", "convention"),
+        ),
+        Option("angles_input", "", parameter=("joint_angles", "input"), hidden=True),
+    ),
+    topics=(
+        TopicSpec(
+            graph.joint_states_topic("<id>"),
+            JOINT_STATE,
+            RELIABLE,
+            "joint_angles",
+            "angle and angular velocity per name, capture stamp; names end in `_<id>`; `frame_id` names the convention",
+        ),
+        TopicSpec(
+            graph.joint_states_stddev_topic("<id>"),
+            JOINT_STATE,
+            RELIABLE,
+            "joint_angles",
+            "the standard deviation of each, same header, names and order; infinity where there is no estimate",
+        ),
+    ),
+)

@@ -1,0 +1,90 @@
+"""Recordings: played in place of sensors, and made of whatever runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from body_tracking import graph
+from body_tracking.messages.types import CLOCK
+from body_tracking.parameters import Value
+from body_tracking.pipeline.system import (
+    Command,
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    Service,
+    System,
+    TopicSpec,
+)
+from body_tracking.recording.qos import RELIABLE
+
+
+def _recorded(parameters: Mapping[str, Value], topics: Iterable[str]) -> Iterable[str]:
+    if parameters.get("start_recording", True) is False:
+        return []
+    whole = parameters.get("model_covariance", False)
+    return [topic for topic in topics if whole or not graph.is_model_covariance(topic)]
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    covariance: dict[str, Value] = {"model_covariance": True} if options["model_covariance"] else {}
+    if options["record"]:
+        yield NodeSpec("bag_recorder", "bag_recorder", parameters={"folder": options["record"], **covariance})
+    elif options["viewer"]:  # waits for the button on the page
+        yield NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **covariance})
+    if not options["bag"]:
+        return
+    sensors, inertial = options["sensors"], options["imu_topics"]
+    assert isinstance(sensors, tuple)
+    assert isinstance(inertial, tuple)
+    yield NodeSpec(
+        "bag_player",
+        "bag_player",
+        # Every message comes with the clock anyway; each node pays for every tick.
+        defaults={"clock_rate": 20.0},
+        parameters={
+            "bag": options["bag"],
+            "rate": options["rate"],
+            "topics": (*map(graph.skeleton_topic, sensors), *inertial),
+            "reliable": options["reliable"],
+        },
+    )
+
+
+SYSTEM = System(
+    "recording",
+    order=5,
+    nodes=(NodeType("bag_player", Place.SOURCE), NodeType("bag_recorder", Place.RECORDER, takes=_recorded)),
+    specs=_specs,
+    options=(
+        Option("bag", "", "play this bag in place of the sensors", "BAG", path=True),
+        Option("rate", 1.0, "play the bag X times as fast (default 1)", "X"),
+        Option("imu_topics", (), hidden=True),
+        Option("record", "", "record everything into this new folder", "BAG", path=True),
+        Option(
+            "model_covariance",
+            False,
+            "record /filtered/model_covariance, too: with ekf most of a recording, which replay computes again",
+            parameter=("bag_recorder", "model_covariance"),
+        ),
+    ),
+    topics=(TopicSpec(graph.CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),),
+    services=(
+        Service("recorder/start", "bag_recorder", "record, into a new file of the same bag"),
+        Service("recorder/stop", "bag_recorder", "stop recording and close the bag"),
+        Service("bag_player/pause", "bag_player", "stand still"),
+        Service("bag_player/resume", "bag_player", "go on"),
+        Service("bag_player/toggle_paused", "bag_player", "the one or the other"),
+    ),
+    commands=(
+        Command(
+            "import",
+            "body_tracking.recording.importer",
+            "turn CSV recordings, NTU RGB+D .skeleton or Xsens .mvnx files into a bag",
+        ),
+        Command("bag", "body_tracking.recording.info", "look into recordings, close one that was cut off"),
+        Command("replay", "body_tracking.recording.replay", "run the whole graph offline over a bag"),
+    ),
+)

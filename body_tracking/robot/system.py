@@ -1,0 +1,81 @@
+"""Commands to robots that follow a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from body_tracking import graph
+from body_tracking.messages.types import JOINT_TRAJECTORY
+from body_tracking.parameters import Value
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    Service,
+    System,
+    TopicSpec,
+    sensors_and_transport,
+)
+from body_tracking.recording.qos import RELIABLE
+
+
+def _takes(parameters: Mapping[str, Value], topics: Iterable[str]) -> Iterable[str]:
+    sensors = parameters.get("sensors", ())
+    return [graph.skeleton_topic(sensor) for sensor in sensors] if isinstance(sensors, tuple) else []
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    if options["robot"]:
+        given = {"mapping": options["robot"], **sensors_and_transport(options)}
+        yield NodeSpec("robot_commands", "robot_commands", parameters=given)
+
+
+def convention_of(mapping: Path, asked: str) -> str:
+    """The convention whose angles a robot's mapping file is about.
+
+    Args:
+        mapping: the file.
+        asked: the convention that somebody asks for; empty or ``graph.AUTO`` for any.
+
+    Raises:
+        MappingError: the file is none.
+        GraphError: another convention is asked for.
+    """
+    # only who drives a robot pays for these
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+    from body_tracking.robot.mapping import load
+
+    found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention
+    if asked not in ("", graph.AUTO, found):
+        raise graph.GraphError(f"convention {asked}: {mapping} is about angles of the convention {found}")
+    return found
+
+
+SYSTEM = System(
+    "robot",
+    order=4,
+    nodes=(NodeType("robot_commands", Place.CONSUMER, takes=_takes),),
+    specs=_specs,
+    options=(Option("robot", "", "mapping file of a robot that is to follow; see docs/robots.md", "FILE", path=True),),
+    topics=(
+        TopicSpec(
+            "<topic of the mapping>",
+            JOINT_TRAJECTORY,
+            RELIABLE,
+            "robot_commands",
+            "one point for the robot's joints; or `std_msgs/Float64MultiArray`, as the mapping file says; silent while "
+            "stopped",
+        ),
+    ),
+    services=(
+        Service(
+            "robot_commands/enable",
+            "robot_commands",
+            "a person says that the robot stands at `home` or where it was left, and may move; below the node's own "
+            "name",
+        ),
+    ),
+)

@@ -1,0 +1,20 @@
+"""Simulated people before simulated sensors."""
+
+from __future__ import annotations
+
+from body_tracking.pipeline.system import Command, System
+
+SYSTEM = System(
+    "simulation",
+    order=9,
+    commands=(
+        Command(
+            "simulate",
+            "body_tracking.simulation.bags",
+            "people who move before simulated sensors, as a bag with the truth",
+        ),
+        Command(
+            "make-bags", "body_tracking.simulation.bags", "make the simulated recordings that are shipped in bags/"
+        ),
+    ),
+)

@@ -1,0 +1,284 @@
+"""The graph: what all systems together bring, and which nodes run for given options.
+
+``body_tracking up``, the launch file, ``body_tracking replay``, the nodes, the command line and the documentation read
+it here; none repeats it. Knows no ROS library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from body_tracking import graph
+from body_tracking.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    Options,
+    Place,
+    System,
+    load,
+)
+
+if TYPE_CHECKING:
+    from body_tracking.pipeline.stage import Stage
+
+ENTRY_POINTS: Final = "body_tracking.systems"
+"""The group of entry points by which another package brings a system."""
+
+
+def _found() -> tuple[System, ...]:
+    folders = sorted(
+        path.parent.name for path in Path(__file__).parent.glob("*/system.py") if path.parent.name != "pipeline"
+    )
+    ours = [load(f"body_tracking.{folder}.system:SYSTEM") for folder in folders]
+    others = [entry.load() for entry in entry_points(group=ENTRY_POINTS)]
+    return tuple(sorted([*ours, *others], key=lambda system: (system.order, system.name)))
+
+
+SYSTEMS: Final = _found()
+OPTIONS: Final = {option.name: option for system in SYSTEMS for option in system.options}
+NODES: Final = {node.name: node for system in SYSTEMS for node in system.nodes}
+EXECUTABLES: Final = tuple(NODES)
+TOPICS: Final = tuple(topic for system in SYSTEMS for topic in system.topics)
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, and ``TRACKED`` only where
+``hri_msgs`` is."""
+SERVICES: Final = tuple(service for system in SYSTEMS for service in system.services)
+COMMANDS: Final = {command.name: command for system in SYSTEMS for command in system.commands}
+LAYERS: Final = tuple(layer for system in SYSTEMS for layer in system.layers)
+_PLACED: Final = sorted(NODES.values(), key=lambda node: node.place)
+STAGES: Final = tuple(node.name for node in _PLACED if node.stage)
+"""The nodes that host a stage, in the order in which messages go through them."""
+FLOW: Final = tuple(
+    node.name for node in sorted(NODES.values(), key=lambda node: node.place) if node.place <= Place.ANGLES
+)
+"""Executables from source to angles."""
+
+
+# --- what is known of a node
+
+
+@cache
+def stage_class(executable: str) -> type[Stage]:
+    """The class of the stage that a node hosts.
+
+    Raises:
+        KeyError: there is no such node, or it hosts none.
+    """
+    node = NODES[executable]
+    if not node.stage:
+        raise KeyError(executable)
+    found: type[Stage] = load(node.stage)
+    return found
+
+
+def parameters_of(executable: str) -> tuple[Parameter, ...]:
+    """The parameters of a node: from its stage, or from its own module, which needs ROS to import."""
+    node = NODES[executable]
+    if node.stage:
+        return stage_class(executable).PARAMETERS
+    table: tuple[Parameter, ...] = importlib.import_module(node.module).PARAMETERS
+    return table
+
+
+# --- options
+
+
+def options_of(**given: Value) -> Options:
+    """All options, with their defaults where nothing is given.
+
+    Raises:
+        KeyError: there is no option of such a name.
+    """
+    unknown = given.keys() - OPTIONS.keys()
+    if unknown:
+        raise KeyError(f"no option {', '.join(sorted(unknown))}")
+    return {name: given.get(name, option.default) for name, option in OPTIONS.items()}
+
+
+def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> None:
+    """Options to a command.
+
+    Args:
+        parser: of the command.
+        names: of the options; all that people may give when empty.
+        texts: what the command says of an option in place of its own text.
+    """
+    for option in OPTIONS.values():
+        if option.hidden or (names and option.name not in names):
+            continue
+        flag, text = f"--{option.name.replace('_', '-')}", texts.get(option.name, option.text)
+        if isinstance(option.default, bool):
+            parser.add_argument(flag, action="store_true", help=text)
+        elif isinstance(option.default, tuple) and option.name != "sensors":
+            parser.add_argument(flag, action="append", metavar=option.metavar, help=text)
+        else:
+            kind = Path if option.path else str if isinstance(option.default, tuple) else type(option.default)
+            choices = None if option.choices is None else tuple(option.choices())
+            metavar = option.metavar or None
+            default = option.default if isinstance(option.default, int | float) else None
+            parser.add_argument(flag, type=kind, choices=choices, metavar=metavar, default=default, help=text)
+
+
+def options_from(args: argparse.Namespace) -> dict[str, Value]:
+    """What a command line says of the options that it has; others are left out.
+
+    Raises:
+        GraphError: a list of sensors without a name.
+    """
+    found: dict[str, Value] = {}
+    for name, option in OPTIONS.items():
+        value = getattr(args, name, None)
+        if value is None:
+            continue
+        if name == "sensors":
+            value = tuple(each for each in value.split(",") if each)
+            if not value:
+                raise graph.GraphError("sensors: no name")
+        found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value
+    return found
+
+
+def in_order(sections: Mapping[str, dict[str, object]]) -> list[tuple[str, dict[str, object]]]:
+    """The sections of a parameters file, those later that hold against the ones before: the more exact ones."""
+    return sorted(sections.items(), key=lambda item: (not is_wildcard(item[0]), item[0].count("/")))
+
+
+def with_file(options: Options, file: Path | None) -> Options:
+    """The options with what a parameters file says where they say nothing.
+
+    Raises:
+        ParameterError: the file is none.
+    """
+    found = dict(options)
+    for pattern, values in in_order(read_file(file) if file is not None else {}):
+        for option in OPTIONS.values():
+            if option.parameter is None or options[option.name] != option.default:
+                continue
+            node, parameter = option.parameter
+            value = values.get(parameter)
+            if isinstance(value, list):
+                value = tuple(entry for entry in value if isinstance(entry, str) and entry)
+            # What has another type is refused by whoever checks the parameters.
+            if type(value) is type(option.default) and NodeSpec(node, node, str(options["namespace"])).meant_by(
+                pattern
+            ):
+                found[option.name] = value
+    return found
+
+
+def bodies_of(options: Options) -> tuple[str, ...]:
+    """The ids of those who may be tracked, of several people; empty with one subject."""
+    from body_tracking.fusion.subject import ALL, MAX_PEOPLE
+
+    return graph.bodies(int(str(options["people"])) or MAX_PEOPLE) if options["subject"] == ALL else ()
+
+
+# --- the graph
+
+
+def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
+    """The nodes of a graph; sources last, so that those who listen are there first.
+
+    With two sensors and a filter it is the process of Schlagenhauf (2017), figure 5.1.
+
+    Raises:
+        GraphError: no sensor, or one twice; a filter was asked for what it cannot do.
+        SensorNameError: a name that cannot be a sensor's.
+    """
+    specs = [spec for system in SYSTEMS for spec in system.specs(options)]
+    specs.sort(key=lambda spec: -NODES[spec.executable].place)
+    return tuple(
+        replace(
+            spec,
+            namespace=str(options["namespace"]),
+            parameters=spec.parameters
+            if spec.executable == "bag_player"
+            else {**spec.parameters, "use_sim_time": bool(options["bag"])},
+        )
+        for spec in specs
+    )
+
+
+def is_source(spec: NodeSpec) -> bool:
+    """Whether the node is the first on the way, and is to wait for all others."""
+    return NODES[spec.executable].place == Place.SOURCE
+
+
+def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
+    """The nodes of a graph, and those that it would have live, with a bag and with everything that may be added."""
+    more = {
+        **options,
+        "record": "recording",
+        "imus": options["imus"] or graph.SOME_IMUS,
+        "robot": options["robot"] or "robot.yaml",
+        "viewer": True,
+        "markers": True,
+    }
+    variants = [options] + [{**more, "bag": bag} for bag in ("", options["bag"] or "bag")]
+    return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
+
+
+def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, Stage]:
+    """The stages of a graph, connected with each other, by the names of their nodes in the order of their places.
+
+    Args:
+        specs: the nodes.
+        parameters: of each.
+
+    Raises:
+        BodyTrackingError: parameters that a node cannot have.
+    """
+    hosts = sorted(
+        (spec for spec in specs if spec.executable in STAGES), key=lambda spec: STAGES.index(spec.executable)
+    )
+    stages = {}
+    for spec in hosts:
+        own = {name: value for name, value in parameters[spec.name].items() if not is_ros_own(name)}
+        stages[spec.name] = stage_class(spec.executable)(check_all(parameters_of(spec.executable), own))
+    from body_tracking.pipeline.offline import connect  # numpy takes its time
+
+    connect(tuple(stages.values()))
+    return stages
+
+
+def subscribers(specs: Sequence[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, int]:
+    """How many nodes of a graph take each topic; arguments and errors as of :func:`stages_for`."""
+    stages = stages_for(specs, parameters)
+    count = Counter(port.topic for stage in stages.values() for port in stage.inputs)
+    published = {port.topic for stage in stages.values() for port in stage.outputs if not port.optional}
+    for spec in specs:
+        given = parameters[spec.name]
+        if spec.executable == "bag_player" and isinstance(played := given["topics"], tuple):
+            published.update(played)
+        elif is_source(spec):
+            published.add(graph.skeleton_topic(str(given["sensor"])))
+    for spec in specs:
+        if (takes := NODES[spec.executable].takes) is not None:
+            count.update(takes(parameters[spec.name], published))
+    return dict(count)
+
+
+CONFIG_HEADER = """\
+# Every parameter of every node at its default. Written by `make docs` from the code; copy it, keep what you change:
+#   body_tracking up --params-file my_parameters.yaml
+#   ros2 launch body_tracking two_kinects.launch.py params_file:=my_parameters.yaml
+# What the graph hangs together by (names of sensors, the bag, simulated time) is the command line's to say, not the
+# file's. A section /** is about all nodes that have the parameter.
+"""
+
+
+def config_text() -> str:
+    """``config/body_tracking.yaml``; needs ROS to import the nodes."""
+    said = [option.parameter for option in OPTIONS.values() if option.parameter is not None]
+    sections = {}
+    for spec in sorted(all_nodes_for(options_of()), key=lambda spec: EXECUTABLES.index(spec.executable)):
+        hidden = spec.parameters.keys() - {parameter for node, parameter in said if node == spec.name}
+        sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
+    return f"{CONFIG_HEADER}\n{as_yaml(sections)}"

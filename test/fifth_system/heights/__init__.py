@@ -1,0 +1,1 @@
+"""A system that another package brings: how tall each filtered skeleton stands."""

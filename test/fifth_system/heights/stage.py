@@ -1,0 +1,58 @@
+"""Its only stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from body_tracking import graph
+from body_tracking.messages.base import to_header, to_nanoseconds
+from body_tracking.messages.types import IMAGE
+from body_tracking.parameters import Parameter, Value
+from body_tracking.pipeline.codecs import Codec, Wire
+from body_tracking.pipeline.shared import RELIABLE, skeleton_input
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from heights.system import HEIGHT
+
+
+class Height(Codec):
+    """Stamp, and metres."""
+
+    type_name = IMAGE
+
+    def encode(self, payload: tuple[int, float], wire: Wire) -> bytes:
+        message = wire.types.make(
+            IMAGE,
+            header=to_header(payload[0], "world", wire.types),
+            height=1,
+            width=1,
+            encoding="32FC1",
+            is_bigendian=0,
+            step=4,
+            data=wire.types.octets(np.float32(payload[1]).tobytes()),
+        )
+        return wire.serialize(IMAGE, message)
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, float]:
+        message = wire.deserialize(IMAGE, cdr)
+        return to_nanoseconds(message.header.stamp), float(np.frombuffer(bytes(message.data), np.float32)[0])
+
+
+class HeightStage(Stage):
+    """Measures filtered skeletons."""
+
+    NAME = "heights"
+    PARAMETERS = (Parameter("margin", 0.1, "what there is above the head joint", unit="m", live=True), RELIABLE)
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self.inputs = (skeleton_input(graph.FILTERED, values),)
+        self.outputs = (Port(HEIGHT, Height(), RELIABLE_QOS, measured=True),)
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        up = payload[0].positions[:, 2]
+        height = float(np.nanmax(up) - np.nanmin(up)) + float(str(self.values["margin"]))
+        yield Output(HEIGHT, (payload[0].stamp_ns, height), payload[0].stamp_ns)

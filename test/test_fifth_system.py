@@ -1,0 +1,100 @@
+"""Another package adds a system: one folder, no other file; it runs live and offline, and is shown and documented."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from body_tracking import graph
+from body_tracking.cdr import decode_skeletons
+from body_tracking.messages.base import to_nanoseconds
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+from domains import domain
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+ROOT = Path(__file__).resolve().parent.parent
+HEIGHT = "/humans/height"
+
+
+class _Nobody:
+    """Takes what people press."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *given: ""
+
+
+def command(*words: str | Path) -> str:
+    """What a command of ours prints, with the system installed."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "test" / "fifth_system")])
+    environment = {**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(domain())}
+    done = subprocess.run(
+        [sys.executable, "-m", *map(str, words)], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def heights(bag: Path, margin: float) -> dict[int, float]:
+    """By stamp; each is what the filtered skeleton of the same recording says."""
+    with BagReader(bag) as reader:
+        type_name = reader.topics[HEIGHT].type_name
+        messages = [deserialize(type_name, raw.cdr) for raw in reader.messages([HEIGHT])]
+        filtered = {
+            s[0].stamp_ns: s[0] for raw in reader.messages([graph.FILTERED]) if (s := decode_skeletons(raw.cdr))
+        }
+    found = {to_nanoseconds(m.header.stamp): float(np.frombuffer(bytes(m.data), np.float32)[0]) for m in messages}
+    for stamp_ns, height in found.items():
+        up = filtered[stamp_ns].positions[:, 2]
+        assert height == pytest.approx(np.nanmax(up) - np.nanmin(up) + margin, abs=1e-5)
+    return found
+
+
+def test_a_folder_is_a_system_live_and_offline(tmp_path: Path, wave: Path) -> None:
+    command("body_tracking.cli", "replay", wave, "-o", tmp_path / "offline")
+    offline = heights(tmp_path / "offline", 0.1)
+    words = ("--bag", wave, "--record", tmp_path / "live", "--height-margin", "0.2", "--log-dir", tmp_path)
+    assert "heights" in command("body_tracking.cli", "up", *words).splitlines()[0]
+    live = heights(tmp_path / "live", 0.2)
+    assert len(offline) > 100 and len(live) > 0.7 * len(offline)
+
+
+def test_its_topic_parameter_option_and_layer_are_among_the_graphs() -> None:
+    said = command("body_tracking.cli", "up", "--help")
+    assert "--height-margin METRES" in said
+    assert "heights:" in command("body_tracking.nodes", "parameters")
+    line = "from body_tracking import systems as s; print([t.name for t in s.TOPICS], [x.name for x in s.LAYERS])"
+    path = os.pathsep.join([str(ROOT), str(ROOT / "test" / "fifth_system")])
+    done = subprocess.run(
+        [sys.executable, "-c", line], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
+    )
+    assert HEIGHT in done.stdout and done.stdout.rstrip().endswith("['heights']")
+
+
+def test_its_layer_is_drawn_and_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    viser = pytest.importorskip("viser")
+    monkeypatch.syspath_prepend(str(ROOT / "test" / "fifth_system"))
+    from heights.system import SYSTEM
+
+    from body_tracking.viewing.page import Page
+    from body_tracking.viewing.snapshot import Seen, Snapshot
+
+    shown: list[tuple[str, bool]] = []
+    monkeypatch.setattr(
+        viser.SceneApi, "add_label", lambda self, name, text, visible=True, **rest: shown.append((text, visible))
+    )
+    page = Page("127.0.0.1", 0, (), cast(Any, _Nobody()), ("ekf",), ("model",), 5.0, SYSTEM.layers)
+    try:
+        nobody = Seen((), stale=True)
+        empty = np.empty((0, 3)), np.empty((0, 4))
+        page.draw(Snapshot({}, {}, nobody, nobody, *empty, {"heights": (0, 1.75)}))
+        page.draw(Snapshot({}, {}, nobody, nobody, *empty))
+    finally:
+        page.close()
+    assert shown == [("1.75 m", True), ("", False)]
