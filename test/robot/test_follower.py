@@ -206,8 +206,8 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a missing sensor": ({"quality": quality("kinect2")}, "calibration is missing: kinect2"),
     "a turned sensor": ({"quality": quality(rotation=0.07)}, "poor: standard deviation 0.07 rad of a sensor's orient"),
     "a misplaced sensor": (
-        {"quality": quality(translation=math.inf)},
-        "poor: standard deviation inf m of a sensor's p",
+        {"quality": quality(translation=math.nan)},
+        "poor: standard deviation nan m of a sensor's p",
     ),
     "no word of the calibration": ({"quality": None}, "calibration has not been heard of"),
     "a robot that says nothing": ({"mute": True}, "does not say how it stands"),
