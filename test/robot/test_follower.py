@@ -327,7 +327,7 @@ def test_a_sensor_that_counts_anew_is_followed_once_a_person_says_so() -> None:
     assert bench.run(3.0).state == State.FOLLOWING
 
 
-@pytest.mark.parametrize(("seconds", "state"), [(1.0, State.HOLDING), (2.1, State.STOPPED)])
+@pytest.mark.parametrize(("seconds", "state"), [(0.05, State.FOLLOWING), (1.0, State.HOLDING), (2.1, State.STOPPED)])
 def test_a_standstill_of_the_commands_holds_or_stops_at_once_and_is_not_made_up_for(
     seconds: float, state: State
 ) -> None:
@@ -337,11 +337,12 @@ def test_a_standstill_of_the_commands_holds_or_stops_at_once_and_is_not_made_up_
     bench.elapsed_ns += round(seconds * NANOSECONDS)
     after = bench.run()
     assert after.state == state
-    assert f"the commands themselves stood still for {seconds + PERIOD:.2f} s" in after.reason
+    late = f"the commands themselves stood still for {seconds + PERIOD:.2f} s"
+    assert (late in after.reason) == (state != State.FOLLOWING)
     if state == State.STOPPED:
         assert after.position is None  # not even the last command is repeated
     else:
-        assert (np.abs(place(after) - place(before)) <= np.array([2.0, 3.0]) * 2 * PERIOD).all()
+        assert (np.abs(place(after) - place(before)) <= np.array([2.0, 3.0]) * 2 * PERIOD + 1e-9).all()
 
 
 def test_a_backward_jump_of_time_is_told_and_holds() -> None:
