@@ -24,12 +24,10 @@ TOPIC = st.sampled_from(
 
 
 @given(NAMESPACE, TOPIC)
-def test_what_is_resolved_in_a_namespace_is_found_within_it(namespace: str, topic: str) -> None:
+def test_what_is_resolved_in_a_namespace_is_found_within_it_and_the_root_changes_nothing(
+    namespace: str, topic: str
+) -> None:
     assert within(resolved(topic, namespace), namespace) == topic
-
-
-@given(TOPIC)
-def test_the_root_namespace_changes_nothing(topic: str) -> None:
     assert resolved(topic, "/") == topic == within(topic, "/")
     assert relative(topic) in (topic, topic[1:])
 
@@ -51,13 +49,8 @@ def test_another_namespace_is_outside() -> None:
 
 
 def test_a_namespace_is_written_as_ros_does_or_refused() -> None:
-    assert [check_namespace(text) for text in ("", "/", "lab", "/lab/", "lab/left")] == [
-        "/",
-        "/",
-        "/lab",
-        "/lab",
-        "/lab/left",
-    ]
+    for text, written in {"": "/", "/": "/", "lab": "/lab", "/lab/": "/lab", "lab/left": "/lab/left"}.items():
+        assert check_namespace(text) == written
     for text in ("la b", "9", "lab//left", "lab-1", "lab/9"):
         with pytest.raises(NamespaceError, match="namespace"):
             check_namespace(text)

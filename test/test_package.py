@@ -154,16 +154,18 @@ def wheel(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_wheel_installs_all_modules_and_share_files(wheel: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        # pip's own commands are the only ones in it
+        assert not [name for name in archive.namelist() if ".data/data/bin/" in name]
     target = tmp_path / "target"
-    run(
-        sys.executable,
-        *("-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target", target, wheel),
-        cwd=tmp_path,
-    )
+    pip = ("-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target", target, wheel)
+    run(sys.executable, *pip, cwd=tmp_path)
     modules = {path for path in files_under(ROOT / "body_tracking") if path.endswith((".py", "py.typed"))}
-    assert modules <= files_under(target / "body_tracking")
-    assert "py.typed" in modules
-    share = target / "share" / "body_tracking"
+    assert {"py.typed"} < modules <= files_under(target / "body_tracking")
+    check_shared(target / "share" / "body_tracking")
+
+
+def check_shared(share: Path) -> None:
     for folder in SHARED_FOLDERS:
         assert files_under(share / folder) == files_under(ROOT / folder), folder
 
@@ -180,21 +182,16 @@ def prefix(project: Path) -> Path:
     return workspace / "install" / "body_tracking"
 
 
-def test_table_of_nodes_lists_every_node_file(node_names: set[str]) -> None:
+def test_colcon_installs_an_executable_per_node_of_the_table_and_what_ros_finds_packages_by(
+    prefix: Path, node_names: set[str]
+) -> None:
     assert set(systems.EXECUTABLES) == node_names
-
-
-def test_colcon_installs_an_executable_per_node(prefix: Path, node_names: set[str]) -> None:
     executables = {path.name for path in (prefix / "lib" / "body_tracking").iterdir() if os.access(path, os.X_OK)}
     assert executables == node_names | {"body_tracking", "kinect_sender"}
-
-
-def test_colcon_installs_what_ros_finds_packages_by(prefix: Path) -> None:
     assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "body_tracking").is_file()
     share = prefix / "share" / "body_tracking"
     assert (share / "package.xml").read_text() == (ROOT / "package.xml").read_text()
-    for folder in SHARED_FOLDERS:
-        assert files_under(share / folder) == files_under(ROOT / folder), folder
+    check_shared(share)
 
 
 def in_workspace(prefix: Path, command: str) -> str:
@@ -221,11 +218,6 @@ def test_commands_are_on_the_path_of_a_sourced_workspace(prefix: Path) -> None:
     assert {"import", "replay", "up", "calibrate", "HOST"} <= set(re.findall(r"\w+", out))
 
 
-def test_pips_own_commands_are_the_only_ones_in_a_wheel(wheel: Path) -> None:
-    with zipfile.ZipFile(wheel) as archive:
-        assert not [name for name in archive.namelist() if ".data/data/bin/" in name]
-
-
 # --- make and CI
 
 
@@ -240,17 +232,10 @@ def test_make_leaves_other_environments_behind(tmp_path: Path) -> None:
         "PYTHONPATH": "/opt/ros/jazzy/lib/python3.12/site-packages",
         "ROS_DOMAIN_ID": "0",
     }
-    runs = [
-        dict(
-            line.split("=", 1)
-            for line in run("make", "-f", makefile, "probe", cwd=ROOT, env=env).stdout.split("\n")
-            if "=" in line
-        )
-        for _ in range(3)
-    ]
-    for seen in runs:
-        assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in seen
-        assert "PYTHONPATH" not in seen
+    for _ in range(3):
+        printed = run("make", "-f", makefile, "probe", cwd=ROOT, env=env).stdout.split("\n")
+        seen = dict(line.split("=", 1) for line in printed if "=" in line)
+        assert not {"_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH"} & seen.keys()
         assert seen["LD_LIBRARY_PATH"] == "/usr/local/lib"
         assert seen["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
         assert 1 <= int(seen["ROS_DOMAIN_ID"]) <= 100

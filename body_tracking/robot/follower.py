@@ -28,7 +28,7 @@ jump), and ``steady_ns``, which never does. This is no safety-rated function.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -119,18 +119,6 @@ class Command:
     nearest: str
 
 
-@dataclass(slots=True, eq=False)
-class _Angles:
-    """The last angles: (m,) each, in the mapping's order."""
-
-    stamp_ns: int = 0
-    steady_ns: int = 0
-    position: FloatArray = field(default_factory=lambda: np.empty(0))
-    velocity: FloatArray = field(default_factory=lambda: np.empty(0))
-    stddev: FloatArray = field(default_factory=lambda: np.empty(0))
-    velocity_stddev: FloatArray = field(default_factory=lambda: np.empty(0))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Expected:
     """What is expected of the person now.
@@ -184,7 +172,8 @@ class Follower:
         self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
         self._clock = StampClock(clock, delay)
         self._ros_ns = self._settled_ns = 0
-        self._angles: _Angles | None = None
+        self._angles: JointAngles | None = None
+        self._heard_ns = 0
         self._wrong = "no angles yet"
         self._refused = ""
         self._places: IntArray = np.array([mapping.names.index(name) for name in mapping.angles], dtype=np.intp)
@@ -226,14 +215,9 @@ class Follower:
             return jumped  # late, or the same again: no news
         self._wrong = ""
         self._clock.note(angles.stamp_ns, now_ns, steady_ns)
-        self._angles = _Angles(
-            angles.stamp_ns,
-            steady_ns,
-            angles.position[self._places],
-            angles.velocity[self._places],
-            angles.position_stddev[self._places],
-            angles.velocity_stddev[self._places],
-        )
+        columns = (angles.position, angles.velocity, angles.position_stddev, angles.velocity_stddev)
+        self._angles = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._places] for each in columns))
+        self._heard_ns = steady_ns
         return jumped
 
     def refuse_angles(self, reason: str) -> None:
@@ -292,19 +276,18 @@ class Follower:
         Raises:
             FollowerError: a joint is missing, or stands nowhere.
         """
-        self._robot_ns = steady_ns
+        self._robot, self._robot_ns, self._robot_wrong = None, steady_ns, ""
         missing = [name for name in self.mapping.joints if name not in joints]
-        if missing or len(position) != len(joints):
-            what = (
-                f"{missing[0]} is not among them" if missing else f"{len(position)} positions of {len(joints)} joints"
-            )
-            self._robot, self._robot_wrong = None, f"the robot's joint states: {what}"
-            raise FollowerError(self._robot_wrong)
-        found = position[[joints.index(name) for name in self.mapping.joints]]
-        if not np.isfinite(found).all():
-            self._robot, self._robot_wrong = None, "the robot's joint states are not finite"
-            raise FollowerError(self._robot_wrong)
-        self._robot, self._robot_wrong = found, ""
+        if missing:
+            self._robot_wrong = f"the robot's joint states: {missing[0]} is not among them"
+        elif len(position) != len(joints):
+            self._robot_wrong = f"the robot's joint states: {len(position)} positions of {len(joints)} joints"
+        elif not np.isfinite(found := position[[joints.index(name) for name in self.mapping.joints]]).all():
+            self._robot_wrong = "the robot's joint states are not finite"
+        else:
+            self._robot = found
+            return
+        raise FollowerError(self._robot_wrong)
 
     def time_jumped_back(self) -> None:
         """The stamps jumped back: what was heard before is of another time."""
@@ -379,8 +362,8 @@ class Follower:
             predicted = np.where(possible, angles.position + ahead * angles.velocity, np.nan)
             # How errors of angle and velocity go together is not told; this is the most that any correlation makes of
             # them. Beyond the horizon the velocity itself is the error.
-            stddev = angles.stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
-            stddev[~((angles.stddev >= 0.0) & (angles.velocity_stddev >= 0.0))] = np.nan
+            stddev = angles.position_stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
+            stddev[~((angles.position_stddev >= 0.0) & (angles.velocity_stddev >= 0.0))] = np.nan
             sound = possible & np.isfinite(stddev)
         most = np.where(self._used, mapping.max_stddev[:, None], np.inf)
         known = (~self._used | (sound & (stddev <= most))).all(axis=1)
@@ -406,8 +389,8 @@ class Follower:
             return "waits for a person: call its service enable once the robot stands at home"
         if self._refused or self._wrong or angles is None:
             return self._refused or self._wrong or "no angles yet"
-        if steady_ns - angles.steady_ns >= allowed_ns:
-            return f"no new angles for {(steady_ns - angles.steady_ns) / NANOSECONDS:.2f} s"
+        if steady_ns - self._heard_ns >= allowed_ns:
+            return f"no new angles for {(steady_ns - self._heard_ns) / NANOSECONDS:.2f} s"
         if self._watched:
             heard = [self._sensors[sensor][1] for sensor in self._watched if sensor in self._sensors]
             listed = ", ".join(self._watched)
@@ -428,7 +411,7 @@ class Follower:
             return self._unknown(int(needed.argmax()), angles, expected)
         return self.calibration.fault(limits, angles.stamp_ns, steady_ns) or self._robot_fault(steady_ns)
 
-    def _unknown(self, joint: int, angles: _Angles, expected: _Expected) -> str:
+    def _unknown(self, joint: int, angles: JointAngles, expected: _Expected) -> str:
         """What is wrong with the angles of a joint."""
         for place in np.flatnonzero(self._used[joint]):
             name, most = self.mapping.angles[place], self.mapping.max_stddev[joint]

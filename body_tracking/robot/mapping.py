@@ -247,9 +247,7 @@ def parse(content: object, angle_names: Mapping[str, Sequence[str]]) -> RobotMap
     Raises:
         MappingError, ParameterError: as there, without the file's name.
     """
-    top = _section(content, "the file")
-    _known(top, _TOP, "the file")
-    _required(top, ("robot", "convention", "output", "joints"), "the file")
+    top = _section(content, "the file", "robot", "convention", "output", "joints", known=_TOP)
     robot, convention = (_text(top[key], key) for key in ("robot", "convention"))
     if convention not in angle_names:
         raise MappingError(f"unknown convention {convention!r}; known: {', '.join(angle_names)}")
@@ -271,24 +269,19 @@ def parse(content: object, angle_names: Mapping[str, Sequence[str]]) -> RobotMap
     def column(key: str) -> FloatArray:
         return np.array([joint[key] for joint in joints], dtype=np.float64)
 
+    columns = ("offset", "lower", "upper", "home", "rate", "acceleration", "max_stddev")
     return RobotMapping(
-        robot,
-        convention,
-        output,
-        safety,
-        names,
-        tuple(angle_names[convention]),
-        angles,
-        matrix,
-        column("offset"),
-        np.array([_period(row) for row in matrix]),
-        column("lower"),
-        column("upper"),
-        column("home"),
-        column("rate"),
-        column("acceleration"),
-        column("max_stddev"),
-        np.array([joint["when_uncertain"] == HOLD_JOINT for joint in joints]),
+        robot=robot,
+        convention=convention,
+        output=output,
+        safety=safety,
+        joints=names,
+        names=tuple(angle_names[convention]),
+        angles=angles,
+        matrix=matrix,
+        period=np.array([_period(row) for row in matrix]),
+        alone=np.array([joint["when_uncertain"] == HOLD_JOINT for joint in joints]),
+        **{key: column(key) for key in columns},
     )
 
 
@@ -298,17 +291,13 @@ def _period(row: FloatArray) -> float:
 
 
 def _output(content: object) -> tuple[Output, tuple[str, ...]]:
-    given = _section(content, "output")
-    _required(given, ("kind", "topic", "order"), "output")
-    values = _checked(_OUTPUT, given, "output")
+    values: dict[str, Any] = _checked(_OUTPUT, _section(content, "output", "kind", "topic", "order"), "output")
     for key in ("topic", "state_topic"):
         topic = str(values[key])
         if not (topic.startswith("/") and topic.strip("/")) and (topic or key == "topic"):
             raise MappingError(f"output: {key} {topic!r}, expected a topic that begins with /")
     order = values.pop("order")
-    assert isinstance(order, tuple)
-    fields: dict[str, Any] = values
-    return Output(**fields), order
+    return Output(**values), order
 
 
 def _safety(content: object) -> SafetyLimits:
@@ -329,14 +318,11 @@ def _joint(content: object, number: int, known_angles: Sequence[str]) -> dict[st
     if len(sources) != 1:
         raise MappingError(f"{what}: expected one of angle, angles, constant; it has {', '.join(sources) or 'none'}")
     terms = given.pop("angles", None)
-    _required(given, ("name", "lower", "upper", "rate", "home"), what)
-    joint: dict[str, Any] = dict(_checked(_JOINT, given, what))
+    _section(given, what, "name", "lower", "upper", "rate", "home")
+    joint: dict[str, Any] = _checked(_JOINT, given, what)
     if not joint["name"]:
         raise MappingError(f"{what}: no name")
-    if "acceleration" not in given:
-        joint["acceleration"] = np.inf
-    if "max_stddev" not in given:
-        joint["max_stddev"] = None
+    joint |= {key: value for key, value in {"acceleration": np.inf, "max_stddev": None}.items() if key not in given}
     if sources == ["constant"]:
         if "scale" in given or "offset" in given:
             raise MappingError(f"{what}: a constant has neither scale nor offset")
@@ -356,23 +342,24 @@ def _terms(content: object, what: str) -> list[tuple[str, float]]:
         raise MappingError(f"{what}: angles: expected a list of {{angle: NAME, weight: NUMBER}}")
     terms: list[tuple[str, float]] = []
     for entry in content:
-        given = _section(entry, f"{what}: angles")
-        _required(given, ("angle", "weight"), f"{what}: angles")
+        given = _section(entry, f"{what}: angles", "angle", "weight")
         values: dict[str, Any] = _checked(_TERM, given, f"{what}: angles")
         if values["weight"] == 0.0:
             raise MappingError(f"{what}: weight 0 of angle {values['angle']!r} follows nothing")
         terms.append((values["angle"], values["weight"]))
-    for angle, count in Counter(angle for angle, _ in terms).items():
-        if count > 1:
-            raise MappingError(f"{what}: angle {angle!r} comes twice")
+    _once([angle for angle, _ in terms], f"{what}: angle")
     return terms
 
 
+def _once(names: Sequence[str], what: str) -> None:
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise MappingError(f"{what} {name!r} comes twice")
+
+
 def _check_order(names: tuple[str, ...], order: tuple[str, ...]) -> None:
-    for what, listed in (("joints", names), ("output: order", order)):
-        for name, count in Counter(listed).items():
-            if count > 1:
-                raise MappingError(f"{what}: joint {name!r} comes twice")
+    _once(names, "joints: joint")
+    _once(order, "output: order: joint")
     for name in names:
         if name not in order:
             raise MappingError(f"unknown joint {name!r}: the controller's order has none{_hint(name, order)}")
@@ -401,26 +388,21 @@ def _check_motion(joint: dict[str, Any], safety: SafetyLimits) -> None:
         joint["max_stddev"] = safety.max_stddev
 
 
-def _section(content: object, what: str) -> Mapping[str, object]:
+def _section(content: object, what: str, *required: str, known: Sequence[str] = ()) -> Mapping[str, object]:
+    """Names and values, with those that are required and, where any are given, no others than the known ones."""
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise MappingError(f"{what}: expected names and values")
+    for key in content:
+        if known and key not in known:
+            raise MappingError(f"{what}: unknown key {key!r}{_hint(key, known)}")
+    for key in required:
+        if key not in content:
+            raise MappingError(f"{what}: {key} is missing")
     return content
 
 
-def _known(given: Mapping[str, object], known: Sequence[str], what: str) -> None:
-    for key in given:
-        if key not in known:
-            raise MappingError(f"{what}: unknown key {key!r}{_hint(key, known)}")
-
-
-def _required(given: Mapping[str, object], keys: Sequence[str], what: str) -> None:
-    for key in keys:
-        if key not in given:
-            raise MappingError(f"{what}: {key} is missing")
-
-
 def _checked(table: Sequence[Parameter], given: Mapping[str, object], what: str) -> dict[str, Value]:
-    _known(given, [item.name for item in table], what)
+    _section(given, what, known=[item.name for item in table])
     try:
         return check_all(table, given)
     except ParameterError as error:

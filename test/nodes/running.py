@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -18,15 +19,21 @@ from node_process import NodeProcess
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from body_tracking.graph import PARENT_VARIABLE
+from body_tracking.graph import PARENT_VARIABLE, skeleton_topic
 from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.skeleton import Skeleton
 from domains import domain
 from spinning import spin_until
 
+ROOT = Path(__file__).resolve().parents[2]
+BAG = ROOT / "bags" / "tpose_wave"
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def environment() -> dict[str, str]:
@@ -51,17 +58,42 @@ def stop(process: subprocess.Popen[Any] | NodeProcess) -> int:
         raise
 
 
+def words_of(parameters: Mapping[str, object], name: str = "") -> list[str]:
+    """The arguments of a node with parameters, under another name where one is given."""
+    words = ["-r", f"__node:={name}"] if name else []
+    return words + [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+
+
 def refusal(folder: Path, executable: str, *arguments: str) -> str:
-    """The one line in which a node says why it does not start."""
-    process = NodeProcess(executable, ["--ros-args", *arguments], folder / "refusal.log", environment())
+    """The one line in which a node says why it does not start in a folder."""
+    process = NodeProcess(executable, ["--ros-args", *arguments], folder / "refusal.log", environment(), folder)
     assert process.wait(60.0) == 2, process.output()
     (line,) = process.output().splitlines()
     assert line.startswith(f"{executable}: ")
     return line
 
 
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def recorded(sensor: str) -> list[Skeleton]:
+    """The frames of one sensor of ``BAG``."""
+    topic = skeleton_topic(sensor)
+    with BagReader(BAG) as reader:
+        type_name = reader.topics[topic].type_name
+        return [cloud_to_skeletons(deserialize(type_name, raw.cdr))[0] for raw in reader.messages([topic])]
+
+
 class Running:
-    """Processes and a node."""
+    """Processes and a node.
+
+    Attributes:
+        diagnostics: by node the values of its last diagnostics, its text as the value of ""; see :meth:`said`.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -94,27 +126,44 @@ class Running:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in statuses(message):
-            self.diagnostics[status.node] = {**status.values, "": status.text}
+            self.diagnostics[status.node] = {**status.values, "": status.text, "level": str(status.level)}
 
-    def start(self, executable: str, name: str = "", **parameters: object) -> NodeProcess:
+    def said(self, node: str) -> dict[str, str]:
+        """A node's last diagnostics; nothing before the first."""
+        return self.diagnostics.get(node, {})
+
+    def number(self, node: str, key: str) -> float:
+        """A value of a node's last diagnostics; 0 where there is none."""
+        return float(self.said(node).get(key, 0))
+
+    def start(
+        self, executable: str, name: str = "", file_size_limit: int | None = None, **parameters: object
+    ) -> NodeProcess:
         """Start a node, under another name where one is given; its output goes to a file."""
-        words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
-        if name:
-            words = ["-r", f"__node:={name}", *words]
+        words = words_of(parameters, name)
         log = self.folder / f"{name or executable}.log"
-        process = NodeProcess(executable, ["--ros-args", *words], log, self.environment)
+        process = NodeProcess(executable, ["--ros-args", *words], log, self.environment, None, file_size_limit)
         self.processes[name or executable] = process
         return process
 
-    def start_interpreter(self, executable: str, **parameters: object) -> subprocess.Popen[bytes]:
+    def start_interpreter(self, executable: str, name: str = "", **parameters: object) -> subprocess.Popen[bytes]:
         """Start a node that imports for itself, where what is installed is another."""
-        words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
-        command = [sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *words]
+        words = words_of(parameters, name)
+        return self.start_module(name or executable, "body_tracking.nodes", executable, "--ros-args", *words)
+
+    def start_module(self, name: str, module: str, *words: str | Path) -> subprocess.Popen[bytes]:
+        """Start what ``python -m`` does; its output goes to a file."""
         variables = {**self.environment, PARENT_VARIABLE: str(os.getpid())}  # no node outlives the tests
-        with (self.folder / f"{executable}.log").open("wb") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=variables)
-        self.processes[executable] = process
+        with (self.folder / f"{name}.log").open("wb") as log:
+            self.processes[name] = process = subprocess.Popen(
+                [sys.executable, "-m", module, *words], stdout=log, stderr=subprocess.STDOUT, env=variables
+            )
         return process
+
+    def replay(self, name: str, port: int) -> subprocess.Popen[bytes]:
+        """Send ``BAG`` to a port of this machine, again and again."""
+        words = ("--loop", "--replay", BAG, "--to", f"127.0.0.1:{port}")
+        return self.start_module(name, "body_tracking.sensors.kinect_sender", *words)
 
     def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
         """Until nodes have found who is to hear them.
@@ -129,7 +178,7 @@ class Running:
                 f"{node}: {topic}"
                 for node, topics in links.items()
                 for topic, number in topics.items()
-                if int(self.diagnostics.get(node, {}).get(f"subscribers {topic}", 0)) < number
+                if self.number(node, f"subscribers {topic}") < number
             ]
 
         assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)

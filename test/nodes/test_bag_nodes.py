@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import time
@@ -14,16 +15,14 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from nav_msgs.msg import Goals  # noqa: E402
 from node_process import NodeProcess  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.rosbag2 import Reader  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
+from running import RELIABLE as RELIABLE_QOS  # noqa: E402
+from running import Running  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -38,7 +37,6 @@ from body_tracking.recording.rosbag2 import (  # noqa: E402
     deserialize,
     serialize,
 )
-from domains import domain  # noqa: E402
 
 Stored = tuple[str, bytes, int]
 
@@ -49,7 +47,6 @@ TOPICS = {
 }
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
-RELIABLE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def stored_messages(count: int) -> list[Stored]:
@@ -101,104 +98,36 @@ def on_the_wire(cdr: bytes) -> bytes:
     return cdr + bytes(-len(cdr) % 4)
 
 
-class Bench:
-    """The processes of one test and a node to look at what they do, in a ROS domain of their own."""
+class Bench(Running):
+    """The processes of one test and a node to look at what they do."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain()))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        self.folder = folder
-        self.processes: list[NodeProcess] = []
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = Node("bench", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-
-    def run(
-        self,
-        executable: str,
-        environment: dict[str, str] | None = None,
-        file_size_limit: int | None = None,
-        **parameters: Any,
-    ) -> NodeProcess:
-        """Start a node."""
-        arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={_text(value)}")]
-        log = self.folder / f"{executable}{len(self.processes)}.log"
-        process = NodeProcess(
-            executable,
-            ["--ros-args", *arguments],
-            log,
-            {**os.environ, **(environment or {})},
-            self.folder,
-            file_size_limit,
-        )
-        self.processes.append(process)
-        return process
-
-    def listen(self, kind: type, topic: str, qos: QoSProfile = RELIABLE_QOS) -> list[Any]:
-        """The messages of a topic, as they come."""
-        messages: list[Any] = []
-        self.node.create_subscription(kind, topic, messages.append, qos)
-        return messages
-
-    def until(self, condition: Callable[[], Any], what: str, seconds: float = 30.0) -> None:
+    def wait_until(self, condition: Callable[[], Any], what: str, seconds: float = 30.0) -> None:
         """Spin until something is so; it failing is the test failing."""
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, f"waited {seconds} s for: {what}"
-            self.executor.spin_once(timeout_sec=0.02)
+        assert self.until(condition, seconds), f"waited {seconds} s for: {what}"
 
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def call(self, kind: type, name: str, request: Any) -> Any:
-        client = self.node.create_client(kind, name)
-        self.until(client.service_is_ready, f"service {name}")
-        future = client.call_async(request)
-        self.until(future.done, f"answer of {name}")
-        self.node.destroy_client(client)
-        return future.result()
+    def publish(self, hertz: float, make: Callable[[], str], *topics: str) -> None:
+        """Texts, again and again."""
+        publishers = [self.node.create_publisher(String, topic, RELIABLE_QOS) for topic in topics]
+        self.node.create_timer(1.0 / hertz, lambda: [each.publish(String(data=make())) for each in publishers])
 
     def trigger(self, name: str) -> Any:
         return self.call(Trigger, name, Trigger.Request())
 
-    def wait_for(self, process: NodeProcess, seconds: float = 30.0) -> str:
-        """The output of a process that ends by itself, properly."""
-        assert process.wait(seconds) == 0, process.output()
+    def finished(self, process: NodeProcess, how: signal.Signals | None = None) -> str:
+        """The output of a process that ends properly, by itself or as a user ends it."""
+        if how is not None:
+            process.send_signal(how)
+        assert process.wait(30.0) == 0, process.output()
         return process.output()
-
-    def stop(self, process: NodeProcess, how: signal.Signals = signal.SIGINT) -> str:
-        """End a process as a user does."""
-        process.send_signal(how)
-        return self.wait_for(process)
-
-    def close(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.wait(30.0)
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(monkeypatch, tmp_path)
-    yield bench
-    bench.close()
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with Bench(tmp_path) as bench:
+        yield bench
 
 
-def everybody(number: int = 1) -> tuple[str, ...]:
-    return tuple(f"{topic}:{number}" for topic in TOPICS)
+EVERYBODY = [f"{topic}:1" for topic in TOPICS]
 
 
 # --- bytes
@@ -206,14 +135,14 @@ def everybody(number: int = 1) -> tuple[str, ...]:
 
 def test_what_is_played_is_recorded_byte_by_byte(bench, tmp_path):
     stored = write_bag(tmp_path / "original", 240)
-    recorder = bench.run("bag_recorder", folder=tmp_path / "copy", topics=tuple(TOPICS))
+    recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS))
     began = time.monotonic()
-    player = bench.run(
-        "bag_player", bag=tmp_path / "original", rate=2.0, reliable=True, wait_for_subscribers=everybody()
+    player = bench.start(
+        "bag_player", bag=tmp_path / "original", rate=2.0, reliable=True, wait_for_subscribers=EVERYBODY
     )
-    bench.wait_for(player)
+    bench.finished(player)
     assert time.monotonic() - began >= 239 * STEP_NS / 1e9 / 2, "never faster than told"
-    bench.stop(recorder)
+    bench.finished(recorder, signal.SIGINT)
     with BagReader(tmp_path / "copy") as reader:
         found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()]
         assert reader.warnings == [] and reader.whole
@@ -235,22 +164,24 @@ def test_what_is_played_is_recorded_byte_by_byte(bench, tmp_path):
 
 def test_recorded_qos_is_offered_again(bench, tmp_path):
     write_bag(tmp_path / "bag", 9)
-    player = bench.run("bag_player", bag=tmp_path / "bag", start_paused=True)
-    bench.until(lambda: all(bench.node.get_publishers_info_by_topic(topic) for topic in TOPICS), "the player's topics")
+    player = bench.start("bag_player", bag=tmp_path / "bag", start_paused=True)
+    bench.wait_until(
+        lambda: all(bench.node.get_publishers_info_by_topic(topic) for topic in TOPICS), "the player's topics"
+    )
     offered = {topic: bench.node.get_publishers_info_by_topic(topic)[0].qos_profile for topic in TOPICS}
     assert offered["/left/text"].reliability == ReliabilityPolicy.BEST_EFFORT
     assert offered["/right/text"].reliability == ReliabilityPolicy.RELIABLE
     assert offered["/right/text"].durability == DurabilityPolicy.VOLATILE
     assert offered["/latched"].durability == DurabilityPolicy.TRANSIENT_LOCAL
-    bench.stop(player)
+    bench.finished(player, signal.SIGINT)
 
 
 def test_a_recorder_with_simulated_time_follows_the_clock(bench, tmp_path):
     stored = write_bag(tmp_path / "original", 90)
-    recorder = bench.run("bag_recorder", folder=tmp_path / "copy", topics=tuple(TOPICS), use_sim_time=True)
-    player = bench.run("bag_player", bag=tmp_path / "original", reliable=True, wait_for_subscribers=everybody())
-    bench.wait_for(player)
-    bench.stop(recorder, signal.SIGTERM)
+    recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS), use_sim_time=True)
+    player = bench.start("bag_player", bag=tmp_path / "original", reliable=True, wait_for_subscribers=EVERYBODY)
+    bench.finished(player)
+    bench.finished(recorder, signal.SIGTERM)
     found = read_bag(tmp_path / "copy")
     assert sorted(cdr for _, cdr, _ in found) == sorted(on_the_wire(cdr) for _, cdr, _ in stored)
     assert all(stored[0][2] <= at <= stored[-1][2] for _, _, at in found)
@@ -261,54 +192,47 @@ def test_a_recorder_with_simulated_time_follows_the_clock(bench, tmp_path):
 
 def test_pause_rate_and_clock(bench, tmp_path):
     write_bag(tmp_path / "bag", 600)
-    clock = bench.listen(Clock, "/clock")
-    texts = bench.listen(String, "/right/text")
-    player = bench.run(
+    clock = bench.collect(Clock, "/clock")
+    texts = bench.collect(String, "/right/text")
+    player = bench.start(
         "bag_player",
         bag=tmp_path / "bag",
         start_paused=True,
-        topics=("/right/text",),
-        wait_for_subscribers=("/right/text",),
+        topics=["/right/text"],
+        wait_for_subscribers=["/right/text"],
     )
-    bench.until(lambda: len(clock) > 20, "the clock, standing still")
+    bench.wait_until(lambda: len(clock) > 20, "the clock, standing still")
     assert texts == [] and {to_nanoseconds(tick.clock) for tick in clock} == {START_NS}
 
     assert bench.trigger("/bag_player/resume").success
-    bench.until(lambda: len(texts) >= 20, "messages")
+    bench.wait_until(lambda: len(texts) >= 20, "messages")
     assert bench.trigger("/bag_player/pause").success
-    bench.spin(0.3)
+    bench.until(lambda: False, 0.3)
     n_texts, n_clock = len(texts), len(clock)
-    bench.spin(0.5)
+    bench.until(lambda: False, 0.5)
     assert len(texts) == n_texts, "paused"
     standing = {to_nanoseconds(tick.clock) for tick in clock[n_clock:]}
     assert len(standing) == 1, "the clock goes on telling where it stands"
 
-    answer = bench.call(SetParameters, "/bag_player/set_parameters", _rate(0.0))
-    assert not answer.results[0].successful
-    answer = bench.call(SetParameters, "/bag_player/set_parameters", _rate(20.0))
-    assert answer.results[0].successful, answer
+    assert not bench.set_parameter("bag_player", "rate", ParameterValue(type=3, double_value=0.0))[0]
+    assert bench.set_parameter("bag_player", "rate", ParameterValue(type=3, double_value=20.0))[0]
     assert bench.trigger("/bag_player/toggle_paused").success
-    bench.until(lambda: len(texts) == 200, "all messages")
-    bench.wait_for(player)
+    bench.wait_until(lambda: len(texts) == 200, "all messages")
+    bench.finished(player)
     numbers = [int(text.data.split()[0]) for text in texts]
     assert numbers == list(range(1, 600, 3)), "in order, and none left out"
-    bench.until(lambda: to_nanoseconds(clock[-1].clock) >= START_NS + 597 * STEP_NS, "the clock's last tick")
+    bench.wait_until(lambda: to_nanoseconds(clock[-1].clock) >= START_NS + 597 * STEP_NS, "the clock's last tick")
     times = [to_nanoseconds(tick.clock) for tick in clock]
     assert times == sorted(times)
 
 
-def _rate(value: float) -> SetParameters.Request:
-    parameter = Parameter(name="rate", value=ParameterValue(type=3, double_value=value))
-    return SetParameters.Request(parameters=[parameter])
-
-
 def test_loop(bench, tmp_path):
     write_bag(tmp_path / "bag", 30)
-    clock = bench.listen(Clock, "/clock")
-    texts = bench.listen(String, "/right/text")
-    player = bench.run("bag_player", bag=tmp_path / "bag", loop=True, wait_for_subscribers=("/right/text",))
-    bench.until(lambda: len(texts) >= 35, "the fourth round")
-    bench.stop(player)
+    clock = bench.collect(Clock, "/clock")
+    texts = bench.collect(String, "/right/text")
+    player = bench.start("bag_player", bag=tmp_path / "bag", loop=True, wait_for_subscribers=["/right/text"])
+    bench.wait_until(lambda: len(texts) >= 35, "the fourth round")
+    bench.finished(player, signal.SIGINT)
     numbers = [int(text.data.split()[0]) for text in texts]
     assert numbers == [1 + 3 * (index % 10) for index in range(len(numbers))]
     times = [to_nanoseconds(tick.clock) for tick in clock]
@@ -318,42 +242,20 @@ def test_loop(bench, tmp_path):
 
 def test_start_offset_and_topics(bench, tmp_path):
     write_bag(tmp_path / "bag", 120)
-    texts = bench.listen(String, "/right/text")
-    left = bench.listen(String, "/left/text", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
-    player = bench.run(
+    texts = bench.collect(String, "/right/text")
+    left = bench.collect(String, "/left/text", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
+    player = bench.start(
         "bag_player",
         bag=tmp_path / "bag",
         start_offset=0.6,
-        topics=("/right/text",),
-        wait_for_subscribers=("/right/text",),
+        topics=["/right/text"],
+        wait_for_subscribers=["/right/text"],
         on_end="idle",
     )
-    bench.until(lambda: texts and texts[-1].data.startswith("118 "), "the last message")
+    bench.wait_until(lambda: texts and texts[-1].data.startswith("118 "), "the last message")
     assert [int(text.data.split()[0]) for text in texts] == list(range(61, 120, 3))
     assert left == [] and player.poll() is None, "it idles at the end"
-    bench.stop(player)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "text"),
-    [
-        ({"bag": "absent"}, "no such recording"),
-        ({}, "no bag to play"),
-        ({"bag": "bag", "topics": ("/nothing",)}, "no topic /nothing"),
-        ({"bag": "bag", "wait_for_subscribers": ("/nothing",)}, "/nothing"),
-        ({"bag": "bag", "start_offset": 99.0}, "no message to play after 99 s"),
-        ({"bag": "bag", "rate": 0.0}, "rate"),
-        ({"bag": "bag", "on_end": "explode"}, "on_end"),
-        ({"bag": "empty.mcap"}, "empty"),
-    ],
-)
-def test_what_cannot_be_played_is_one_line(bench, tmp_path, parameters, text):
-    write_bag(tmp_path / "bag", 9)
-    (tmp_path / "empty.mcap").touch()
-    process = bench.run("bag_player", **parameters)
-    process.wait(30.0)
-    output = process.output()
-    assert process.returncode == 2 and text in output and len(output.strip().splitlines()) == 1, output
+    bench.finished(player, signal.SIGINT)
 
 
 def test_a_damaged_bag_is_played_as_far_as_it_goes(bench, tmp_path):
@@ -361,12 +263,12 @@ def test_a_damaged_bag_is_played_as_far_as_it_goes(bench, tmp_path):
     path = tmp_path / "bag" / "bag_0.mcap"
     path.write_bytes(path.read_bytes()[:-1500])
     expected = [cdr for topic, cdr, _ in read_bag(tmp_path / "bag") if topic == "/right/text"]
-    texts = bench.listen(String, "/right/text")
-    player = bench.run(
-        "bag_player", bag=tmp_path / "bag", rate=5.0, wait_for_subscribers=("/right/text",), reliable=True
+    texts = bench.collect(String, "/right/text")
+    player = bench.start(
+        "bag_player", bag=tmp_path / "bag", rate=5.0, wait_for_subscribers=["/right/text"], reliable=True
     )
-    assert "cut off" in bench.wait_for(player)
-    bench.until(lambda: len(texts) == len(expected), "the messages that are whole")
+    assert "cut off" in bench.finished(player)
+    bench.wait_until(lambda: len(texts) == len(expected), "the messages that are whole")
     assert len(stored) // 3 >= len(expected) > 0
 
 
@@ -374,25 +276,24 @@ def test_a_damaged_bag_is_played_as_far_as_it_goes(bench, tmp_path):
 
 
 def test_kill_9_and_a_restart_lose_little(bench, tmp_path):
-    publisher = bench.node.create_publisher(String, "/talk", RELIABLE_QOS)
     sent = []
 
-    def talk() -> None:
+    def text() -> str:
         sent.append(f"message {len(sent)}")
-        publisher.publish(String(data=sent[-1]))
+        return sent[-1]
 
-    bench.node.create_timer(0.01, talk)
+    bench.publish(100.0, text, "/talk")
     folder = tmp_path / "bag"
-    recorder = bench.run("bag_recorder", folder=folder, topics=("/talk",), chunk_seconds=0.1)
-    bench.until(lambda: len(read_so_far(folder)) > 50, "a recording")
+    recorder = bench.start("bag_recorder", folder=folder, topics=["/talk"], chunk_seconds=0.1)
+    bench.wait_until(lambda: len(read_so_far(folder)) > 50, "a recording")
     recorder.kill()
     recorder.wait(10)
     first = read_bag(folder)
     assert len(first) > 50
 
-    again = bench.run("bag_recorder", folder=folder, topics=("/talk",), chunk_seconds=0.1)
-    bench.until(lambda: len(read_so_far(folder)) > len(first) + 50, "more of it")
-    bench.stop(again, signal.SIGTERM)
+    again = bench.start("bag_recorder", folder=folder, topics=["/talk"], chunk_seconds=0.1)
+    bench.wait_until(lambda: len(read_so_far(folder)) > len(first) + 50, "more of it")
+    bench.finished(again, signal.SIGTERM)
     with BagReader(folder) as reader:
         assert reader.whole and reader.warnings == []
         found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()]
@@ -408,92 +309,64 @@ def text_of(cdr: bytes) -> str:
 
 
 def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
-    publisher = bench.node.create_publisher(String, "/talk", RELIABLE_QOS)
-    count = 0
-
-    def talk() -> None:
-        nonlocal count
-        publisher.publish(String(data=f"message {count}"))
-        count += 1
-
-    bench.node.create_timer(0.01, talk)
+    numbers = itertools.count()
+    bench.publish(100.0, lambda: f"message {next(numbers)}", "/talk")
     folder = tmp_path / "bag"
-    recorder = bench.run("bag_recorder", folder=folder, start_recording=False, chunk_seconds=0.1)
+    recorder = bench.start("bag_recorder", folder=folder, start_recording=False, chunk_seconds=0.1)
     for part in range(2):
         assert not (folder / f"bag_{part}.mcap").exists()
         assert bench.trigger("/recorder/start").success
-        bench.until(lambda part=part: len(read_so_far(folder / f"bag_{part}.mcap")) > 30, f"part {part}")
+        bench.wait_until(lambda part=part: len(read_so_far(folder / f"bag_{part}.mcap")) > 30, f"part {part}")
         assert bench.trigger("/recorder/stop").success
         with BagReader(folder) as reader:
             assert reader.whole, "closed by recorder/stop"
     n_messages = len(read_bag(folder))
-    bench.spin(0.5)
+    bench.until(lambda: False, 0.5)
     assert len(read_bag(folder)) == n_messages
-    bench.stop(recorder)
+    bench.finished(recorder, signal.SIGINT)
     with BagReader(folder) as reader:
         # What is there by itself (all but /clock, /rosout, /parameter_events) was recorded too.
         assert "/talk" in reader.topics and "/diagnostics" in reader.topics and "/rosout" not in reader.topics
 
 
 @pytest.mark.parametrize(
-    "parameters", [{}, {"model_covariance": True}, {"topics": (MODEL_COVARIANCE, "/talk")}], ids=str
+    "parameters", [{}, {"model_covariance": True}, {"topics": [MODEL_COVARIANCE, "/talk"]}], ids=str
 )
 def test_the_covariance_of_a_model_is_recorded_only_where_asked_for(bench, tmp_path, parameters):
-    publishers = [bench.node.create_publisher(String, topic, RELIABLE_QOS) for topic in (MODEL_COVARIANCE, "/talk")]
-    bench.node.create_timer(0.01, lambda: [publisher.publish(String(data="x")) for publisher in publishers])
-    recorder = bench.run("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.05, **parameters)
-    bench.until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 30, "the other topic")
-    bench.stop(recorder)
+    bench.publish(100.0, lambda: "x", MODEL_COVARIANCE, "/talk")
+    recorder = bench.start("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.05, **parameters)
+    bench.wait_until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 30, "the other topic")
+    bench.finished(recorder, signal.SIGINT)
     with BagReader(tmp_path / "bag") as reader:
         assert (MODEL_COVARIANCE in reader.topics) == bool(parameters)
 
 
 def test_a_type_that_is_not_known_is_counted_and_the_rest_recorded(bench, tmp_path):
-    statuses = bench.listen(DiagnosticArray, "/diagnostics")
     bench.node.create_publisher(Goals, "/goals", RELIABLE_QOS)
-    publisher = bench.node.create_publisher(String, "/talk", RELIABLE_QOS)
-    bench.node.create_timer(0.02, lambda: publisher.publish(String(data="still here")))
-    recorder = bench.run("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.1)
-    bench.until(
-        lambda: any(
-            status.message == "recording" and {"/goals (nav_msgs/msg/Goals)"} & {value.value for value in status.values}
-            for array in statuses
-            for status in array.status
-        ),
-        "a diagnostic that names /goals",
-    )
-    bench.until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 10, "the other topic")
-    bench.stop(recorder)
+    bench.publish(50.0, lambda: "still here", "/talk")
+    recorder = bench.start("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.1)
+
+    def named() -> bool:
+        said = bench.said("bag_recorder")
+        return said.get("") == "recording" and "/goals (nav_msgs/msg/Goals)" in said.values()
+
+    bench.wait_until(named, "a diagnostic that names /goals")
+    bench.wait_until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 10, "the other topic")
+    bench.finished(recorder, signal.SIGINT)
 
 
 def test_a_full_disk_is_said_and_not_a_crash(bench, tmp_path):
-    statuses = bench.listen(DiagnosticArray, "/diagnostics")
-    publisher = bench.node.create_publisher(String, "/talk", RELIABLE_QOS)
-    bench.node.create_timer(0.005, lambda: publisher.publish(String(data=os.urandom(400).hex())))
-    recorder = bench.run(
-        "bag_recorder",
-        # Shared memory is made of files too, and would meet the limit first.
-        {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
-        folder=tmp_path / "bag",
-        topics=("/talk",),
-        chunk_seconds=0.05,
-        file_size_limit=60_000,
-    )
+    bench.publish(200.0, lambda: os.urandom(400).hex(), "/talk")
+    # shared memory is made of files too, and would meet the limit first
+    bench.environment["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+    folder = tmp_path / "bag"
+    recorder = bench.start("bag_recorder", file_size_limit=60_000, folder=folder, topics=["/talk"], chunk_seconds=0.05)
 
-    def lost() -> int:
-        return max(
-            (
-                int(value.value)
-                for array in statuses
-                for status in array.status
-                for value in status.values
-                if status.level == b"\x02" and value.key == "lost"
-            ),
-            default=0,
-        )
+    def lost() -> bool:
+        return bench.said("bag_recorder").get("level") == "2" and bench.number("bag_recorder", "lost") > 20
 
-    bench.until(lambda: lost() > 20, "an error in the diagnostics, with a count of what is lost")
+    bench.wait_until(lost, "an error in the diagnostics, with a count of what is lost")
     assert recorder.poll() is None
-    bench.stop(recorder)
-    with BagReader(tmp_path / "bag") as reader:
+    bench.finished(recorder, signal.SIGINT)
+    with BagReader(folder) as reader:
         assert len(list(reader.messages())) > 20

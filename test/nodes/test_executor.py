@@ -6,6 +6,7 @@ import random
 import threading
 import time
 from collections.abc import Iterator
+from typing import Self
 
 import pytest
 
@@ -29,18 +30,26 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
 
 
 class Spinning:
-    """The executor in a thread."""
+    """The executor in a thread, until the test is done."""
 
     def __init__(self, node: rclpy.node.Node) -> None:
         self.thread = threading.Thread(target=self.spin, args=(LeanExecutor(node),), daemon=True)
         self.ended: type[BaseException] | None = None
-        self.thread.start()
 
     def spin(self, executor: LeanExecutor) -> None:
         try:
             executor.spin()
         except BaseException as error:
             self.ended = type(error)
+
+    def __enter__(self) -> Self:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        rclpy.shutdown()
+        self.thread.join(10.0)
+        assert not self.thread.is_alive()
 
 
 def until(condition: object, timeout: float = 10.0) -> bool:
@@ -84,19 +93,15 @@ def test_messages_timers_and_services_are_served_while_others_come_and_go(node: 
 
     timer = node.create_timer(0.02, tick, clock=STEADY)
     node.create_service(Trigger, "ask", lambda _, response: Trigger.Response(success=True, message="here"))
-    spinning = Spinning(node)
-    assert until(lambda: len(texts) >= 10 and len(later) >= 3)
-    assert texts == [str(number + 1) for number in range(len(texts))]
-
-    assert answers(node, 1) == ["here"]
-
-    node.destroy_timer(timer)
-    time.sleep(0.1)
-    count = len(ticks)
-    time.sleep(0.2)
-    assert len(ticks) == count
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
+    with Spinning(node) as spinning:
+        assert until(lambda: len(texts) >= 10 and len(later) >= 3)
+        assert texts == [str(number + 1) for number in range(len(texts))]
+        assert answers(node, 1) == ["here"]
+        node.destroy_timer(timer)
+        time.sleep(0.1)
+        count = len(ticks)
+        time.sleep(0.2)
+        assert len(ticks) == count
     assert spinning.ended is ExternalShutdownException
 
 
@@ -111,11 +116,9 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
     order = random.Random(3).choices(range(3), weights=(1, 3, 6), k=120)
     for number, topic in enumerate(order):
         publishers[topic].publish(String(data=str(number)))
-    spinning = Spinning(node)
-    assert until(lambda: len(handled) == len(order))
+    with Spinning(node):
+        assert until(lambda: len(handled) == len(order))
     assert handled == list(range(len(order)))
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
 
 
 class Noting(rclpy.node.Node):  # type: ignore[misc]
@@ -139,14 +142,12 @@ def test_a_node_is_told_when_it_has_all_messages_that_were_there(node: rclpy.nod
     for number in range(6):
         publishers[number % 2].publish(String(data=str(number)))
     time.sleep(0.1)  # the timer is ready, too
-    spinning = Spinning(noting)
-    assert until(lambda: "timer" in noting.said)
-    assert noting.said[:8] == [*"012345", "all", "timer"]
-    publishers[0].publish(String(data="more"))
-    assert until(lambda: noting.said.count("all") == 2)
+    with Spinning(noting):
+        assert until(lambda: "timer" in noting.said)
+        assert noting.said[:8] == [*"012345", "all", "timer"]
+        publishers[0].publish(String(data="more"))
+        assert until(lambda: noting.said.count("all") == 2)
     assert noting.said[noting.said.index("more") + 1] == "all"
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
 
 
 @pytest.mark.parametrize("work", [0.0, 0.03])
@@ -155,22 +156,17 @@ def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> 
     node.create_subscription(String, "text", lambda message: time.sleep(work), 10)
     node.create_timer(0.02, lambda: publisher.publish(String(data="more")), clock=STEADY)
     node.create_service(Trigger, "ask", lambda _, response: Trigger.Response(success=True, message="here"))
-    spinning = Spinning(node)
-    assert answers(node, 5) == ["here"] * 5
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
+    with Spinning(node):
+        assert answers(node, 5) == ["here"] * 5
 
 
 @pytest.mark.alone
 def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
-    spinning = Spinning(node)
-    time.sleep(0.3)
-    before = time.process_time()
-    time.sleep(1.0)
-    assert time.process_time() - before < 0.5
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
-    assert not spinning.thread.is_alive()
+    with Spinning(node):
+        time.sleep(0.3)
+        before = time.process_time()
+        time.sleep(1.0)
+        assert time.process_time() - before < 0.5
 
 
 def test_a_timer_that_is_set_anew_fires_once_each_time(node: rclpy.node.Node) -> None:
@@ -184,12 +180,10 @@ def test_a_timer_that_is_set_anew_fires_once_each_time(node: rclpy.node.Node) ->
             timer.reset()
 
     timer = node.create_timer(0.02, fire, clock=STEADY)
-    spinning = Spinning(node)
-    assert until(lambda: len(fired) == 5)
-    time.sleep(0.1)
+    with Spinning(node):
+        assert until(lambda: len(fired) == 5)
+        time.sleep(0.1)
     assert len(fired) == 5
-    rclpy.shutdown()
-    spinning.thread.join(10.0)
 
 
 def test_what_was_sent_before_the_end_is_handled_and_what_comes_after_is_not(node: rclpy.node.Node) -> None:

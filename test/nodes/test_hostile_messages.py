@@ -21,7 +21,7 @@ from hostile import class_of, hostile, message  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
-from running import RELIABLE, Running, refusal, stop  # noqa: E402
+from running import LATCHED, RELIABLE, ROOT, Running, recorded, refusal, stop  # noqa: E402
 from sensor_msgs.msg import Image, Imu, JointState, PointCloud2, TimeReference  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -33,30 +33,20 @@ from body_tracking.kinematics.tracking import angle_names  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds  # noqa: E402
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform  # noqa: E402
-from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
+from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
 from body_tracking.nodes.common import STEADY, GraphNode, RCLError  # noqa: E402
 from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
-from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
+from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 from draws import draws  # noqa: E402
 
 ROS = RosMessages()
-BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
-ROBOT = Path(__file__).resolve().parents[2] / "config" / "robots" / "two_joint_arm.yaml"
-LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ROBOT = ROOT / "config" / "robots" / "two_joint_arm.yaml"
 FRAME_NS = 33_333_333
 START_NS = 10**12
 
 
-def recorded() -> list[Skeleton]:
-    """The frames of one sensor of a shipped recording."""
-    topic = graph.skeleton_topic("kinect1")
-    with BagReader(BAG) as reader:
-        type_name = reader.topics[topic].type_name
-        return [cloud_to_skeletons(deserialize(type_name, raw.cdr))[0] for raw in reader.messages([topic])]
-
-
-FRAMES = recorded()
+FRAMES = recorded("kinect1")
 
 
 # --- clocks
@@ -84,9 +74,7 @@ def test_clocks_and_poses_that_cannot_be_end_no_node_and_none_that_is_started_la
         nodes = ("fusion", "skeleton_filter")
         running.start("fusion")
         running.start("skeleton_filter", filter="ekf")  # both are started after what is latched
-        assert running.until(
-            lambda: all(int(running.diagnostics.get(node, {}).get("malformed", 0)) == 5 for node in nodes)
-        ), running.diagnostics
+        assert running.until(lambda: all(running.number(node, "malformed") == 5 for node in nodes)), running.diagnostics
         for node in nodes:
             assert running.processes[node].poll() is None
             assert "expected 0 to 2147483647 s" in running.log(node)
@@ -142,7 +130,7 @@ def test_a_simulated_time_that_cannot_be_is_left_out(tmp_path: Path) -> None:
                 tick = Clock()
                 tick.clock.sec, tick.clock.nanosec = sec, nanosec
                 ticks.publish(tick)
-            return int(running.diagnostics.get("fusion", {}).get("malformed", 0))
+            return int(running.number("fusion", "malformed"))
 
         assert running.until(lambda: told() >= 3)
         assert running.processes["fusion"].poll() is None
@@ -157,28 +145,25 @@ def test_a_recorder_without_its_clock_keeps_nothing_and_says_why(tmp_path: Path)
         latched.publish(String(data="latched"))
         assert running.until(lambda: texts.get_subscription_count() and latched.get_subscription_count())
 
-        def told() -> dict[str, str]:
-            return running.diagnostics.get("bag_recorder", {})
-
         def left_out() -> int:
             texts.publish(String(data=10_000 * "x"))
-            return int(told().get("before the clock, not recorded", 0))
+            return int(running.number("bag_recorder", "before the clock, not recorded"))
 
-        assert running.until(lambda: left_out() > 100), told()
-        assert told()[""] == "waiting for /clock (use_sim_time): nothing is recorded"
-        assert told()["messages"] == "0"
+        assert running.until(lambda: left_out() > 100), running.diagnostics
+        assert running.said("bag_recorder")[""] == "waiting for /clock (use_sim_time): nothing is recorded"
+        assert running.said("bag_recorder")["messages"] == "0"
         # the clock comes: of what was before, only what is latched counts
         running.until(lambda: False, 1.5)
         ticks = running.node.create_publisher(Clock, graph.CLOCK_TOPIC, RELIABLE)
 
-        def recorded() -> int:
+        def kept() -> int:
             tick = Clock()
             tick.clock.sec = 100
             ticks.publish(tick)
             texts.publish(String(data="now"))
-            return int(told().get("messages", 0))
+            return int(running.number("bag_recorder", "messages"))
 
-        assert running.until(lambda: recorded() > 3), told()
+        assert running.until(lambda: kept() > 3), running.diagnostics
         stop(running.processes["bag_recorder"])
     with BagReader(tmp_path / "bag") as reader:
         found = list(reader.messages())

@@ -227,14 +227,14 @@ def test_bad_messages_are_counted_and_survived(wrists: Wrists) -> None:
     topic = "/forearm_left/imu/data_raw"
     publisher = wrists.node.create_publisher(Imu, topic, RELIABLE)
     assert wrists.until(lambda: publisher.get_subscription_count() == 1)
-    before = int(wrists.diagnostics["imu_skeleton"].get("refused of forearm_left", 0))
+    before = wrists.number("imu_skeleton", "refused of forearm_left")
     messages = bad_ones()
     for message in messages:
         publisher.publish(message)
-    assert wrists.until(
-        lambda: int(wrists.diagnostics["imu_skeleton"].get("refused of forearm_left", 0)) == before + len(messages),
-        30.0,
-    ), wrists.diagnostics["imu_skeleton"]
+    wanted = before + len(messages)
+    assert wrists.until(lambda: wrists.number("imu_skeleton", "refused of forearm_left") == wanted, 30.0), (
+        wrists.diagnostics["imu_skeleton"]
+    )
     assert wrists.processes["imu_skeleton"].poll() is None
     assert topic in wrists.diagnostics["imu_skeleton"]["last malformed"]
     assert topic in wrists.log("imu_skeleton")
@@ -242,31 +242,17 @@ def test_bad_messages_are_counted_and_survived(wrists: Wrists) -> None:
     others = wrists.node.create_publisher(Imu, graph.orientation_topic("forearm_left"), RELIABLE)
     assert wrists.until(lambda: others.get_subscription_count() >= 1)
     refused = [Imu(), bad_ones()[1]]
-    filter_before = sum(int(wrists.diagnostics["skeleton_filter"].get(key, 0)) for key in ("malformed", "refused"))
+
+    def counted() -> float:
+        return wrists.number("skeleton_filter", "malformed") + wrists.number("skeleton_filter", "refused")
+
+    wanted = counted() + len(refused)
     for message in refused:
         others.publish(message)
-    assert wrists.until(
-        lambda: (
-            sum(int(wrists.diagnostics["skeleton_filter"].get(key, 0)) for key in ("malformed", "refused"))
-            == filter_before + len(refused)
-        ),
-        30.0,
-    )
+    assert wrists.until(lambda: counted() == wanted, 30.0)
 
 
 def test_an_alignment_can_be_asked_for(wrists: Wrists) -> None:
-    client = wrists.node.create_client(Trigger, graph.ALIGN_SERVICE)
-    assert client.wait_for_service(20.0)
-    future = client.call_async(Trigger.Request())
-    assert wrists.until(future.done, 30.0)
-    assert future.result().success
-    assert "hold" in future.result().message
-
-
-def test_who_lists_no_segment_or_an_unknown_one_is_told_in_a_line(tmp_path: Path) -> None:
-    with Running(tmp_path) as running:
-        for given in ({}, {"segments": "[nose]"}, {"segments": "[head]", "mountings": "['head:up']"}):
-            process = running.start("imu_skeleton", **given)
-            assert process.wait(60.0) == 2
-            assert running.log("imu_skeleton").count("\n") == 1
-            assert running.log("imu_skeleton").startswith("imu_skeleton: ")
+    answer = wrists.call(Trigger, graph.ALIGN_SERVICE, Trigger.Request())
+    assert answer.success
+    assert "hold" in answer.message

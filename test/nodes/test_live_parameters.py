@@ -11,7 +11,7 @@ pytest.importorskip("rclpy")
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
-from running import Running
+from running import BAG, Running
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -19,7 +19,6 @@ from body_tracking import graph, systems
 from body_tracking.kinematics.tracking import angle_names
 from body_tracking.parameters import ParameterError
 
-BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_wave"
 PARAMETERS: dict[str, dict[str, object]] = {
     "joint_angles": {},
     "skeleton_filter": {},
@@ -51,9 +50,6 @@ class Graph(Running):
     def get(self, node: str, names: Sequence[str]) -> list[ParameterValue]:
         answer = self.call(GetParameters, f"/{node}/get_parameters", GetParameters.Request(names=names))
         return list(answer.values)
-
-    def number(self, node: str, key: str) -> float:
-        return float(self.diagnostics.get(node, {}).get(key, 0))
 
 
 def _value(value: object) -> ParameterValue:
@@ -194,14 +190,6 @@ def test_an_input_that_the_filter_does_not_publish_is_reported(running: Graph) -
     assert running.set("joint_angles", input="auto") == [(True, "")]
     running.angles.clear()
     assert running.until(lambda: running.angles, 60.0)
-
-
-def test_filter_and_angles_become_others(running: Graph) -> None:
-    assert running.set("skeleton_filter", filter="lkf_zero_velocity") == [(True, "")]
-    assert running.until(lambda: running.diagnostics["skeleton_filter"][""] == "lkf_zero_velocity")
-    assert running.set("joint_angles", convention="isb") == [(True, "")]
-    running.angles.clear()
-    assert running.until(lambda: running.angles and "thorax_extension_body1" in running.angles[-1].name)
 
 
 def test_the_player_plays_faster(running: Graph) -> None:

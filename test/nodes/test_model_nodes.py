@@ -14,14 +14,12 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rcl_interfaces.msg import ParameterValue  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rclpy.serialization import deserialize_message  # noqa: E402
-from running import RELIABLE, Running  # noqa: E402
+from running import BAG, LATCHED, RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, TimeReference  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
-from body_tracking.kinematics.tracking import AngleStream, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.model import image_to_covariance, joint_state_to_model  # noqa: E402
@@ -29,8 +27,6 @@ from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS, Joint, Skeleton, TrackingState  # noqa: E402
 
-BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
-LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MODEL = UpperBody()
 SENSORS = ("kinect1", "kinect2")
 STATE, COVARIANCE = graph.MODEL_STATE, graph.MODEL_COVARIANCE
@@ -48,10 +44,7 @@ class Tracking(Running):
                 (each.topic, each.cdr, each.log_time_ns)
                 for each in reader.messages([graph.skeleton_topic(sensor) for sensor in SENSORS])
             ]
-            calibration = {
-                graph.TRUE_CALIBRATION: TransformStamped,
-                graph.TRUE_CLOCK: TimeReference,
-            }
+            calibration = {graph.TRUE_CALIBRATION: TransformStamped, graph.TRUE_CLOCK: TimeReference}
             self.calibration = [
                 (each.topic, deserialize_message(each.cdr, calibration[each.topic]))
                 for each in reader.messages(calibration)
@@ -176,28 +169,6 @@ def test_the_messages_tell_of_one_and_the_same_state(tracking: Tracking) -> None
         np.testing.assert_allclose([forearm.x, forearm.y, forearm.z], skeleton.positions[Joint.ELBOW_LEFT], atol=1e-5)
 
 
-def test_the_angles_are_those_of_the_states_one_after_the_other(tracking: Tracking) -> None:
-    # states and covariances are best effort: one that was lost on the way leaves no pair
-    images = dict(zip(stamps(tracking.covariances), tracking.covariances, strict=True))
-    said = dict(zip(stamps(tracking.angles), zip(tracking.angles, tracking.deviations, strict=False), strict=False))
-    stream, compared = AngleStream("isb"), 0
-    for state in tracking.states:
-        stamp_ns, frame_id, q, velocity = joint_state_to_model(state, MODEL)
-        if stamp_ns not in images or stamp_ns not in said:
-            continue
-        _, covariance = image_to_covariance(images[stamp_ns], MODEL)
-        expected = stream.of_estimate(state_estimate(MODEL, stamp_ns, frame_id, q, velocity, covariance))
-        values, deviations = said[stamp_ns]
-        assert values.name == deviations.name == [f"{name}_body1" for name in expected.names]
-        np.testing.assert_array_equal(values.position, expected.position)
-        np.testing.assert_array_equal(values.velocity, expected.velocity)
-        np.testing.assert_array_equal(deviations.position, expected.position_stddev)
-        np.testing.assert_array_equal(deviations.velocity, expected.velocity_stddev)
-        assert np.isfinite(expected.position).all()
-        compared += 1
-    assert compared >= 30
-
-
 def test_who_comes_late_gets_the_persons_model(tracking: Tracking) -> None:
     models = tracking.collect(String, graph.urdf_topic("body1"), LATCHED)
     assert tracking.until(lambda: models)
@@ -284,13 +255,11 @@ def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tr
         with_data(np.full(2048, np.nan, "<f4").tobytes()),
         b"\x00\x01\x00\x00garbage",
     ]
-    before = int(tracking.diagnostics["joint_angles"].get("malformed", 0))
-    for message in bad_states:
-        states.publish(message)
-    for message in bad_images:
-        images.publish(message)
-    count = len(bad_states) + len(bad_images)
-    assert tracking.until(lambda: int(tracking.diagnostics["joint_angles"].get("malformed", 0)) == before + count)
+    wanted = tracking.number("joint_angles", "malformed") + len(bad_states) + len(bad_images)
+    for publisher, messages in ((states, bad_states), (images, bad_images)):
+        for message in messages:
+            publisher.publish(message)
+    assert tracking.until(lambda: tracking.number("joint_angles", "malformed") == wanted)
     assert f"{STATE}: malformed message ignored" in tracking.log("joint_angles")
     assert f"{COVARIANCE}: malformed message ignored" in tracking.log("joint_angles")
     tracking.cut_short()
@@ -298,24 +267,11 @@ def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tr
     assert tracking.until(lambda: tracking.angles)
 
 
-def test_filter_and_convention_may_change_while_they_run(tracking: Tracking) -> None:
-    done, reason = tracking.set_parameter(
-        "skeleton_filter", "ekf.predict_for", ParameterValue(type=3, double_value=-1.0)
-    )
-    assert not done
-    assert "ekf.predict_for" in reason
-    assert tracking.set_parameter("skeleton_filter", "ekf.predict_for", ParameterValue(type=3, double_value=2.0))[0]
-    assert tracking.set_parameter("joint_angles", "convention", ParameterValue(type=4, string_value="rep155"))[0]
-    tracking.cut_short()
-    # With the poses that the filter had before: they do not come again.
-    assert tracking.play_until(lambda: tracking.angles and "waist_body1" in tracking.angles[-1].name)
-    assert tracking.angles[-1].header.frame_id == "rep155"  # so that a subscriber can tell
-    # A linear filter takes what the fusion makes; nobody makes anything here.
-    linear = ParameterValue(type=4, string_value="lkf_constant_velocity")
-    assert tracking.set_parameter("skeleton_filter", "filter", linear)[0]
-    assert tracking.until(lambda: all(p.get_subscription_count() == 0 for p in tracking.publishers.values()))
-    extended = ParameterValue(type=4, string_value="ekf")
-    assert tracking.set_parameter("skeleton_filter", "filter", extended)[0]
-    assert tracking.until(tracking.heard)
+def test_after_another_filter_it_goes_on_with_the_poses_of_before(tracking: Tracking) -> None:
+    for name, sensors in (("lkf_constant_velocity", 0), ("ekf", 1)):  # a linear filter takes what the fusion makes
+        assert tracking.set_parameter("skeleton_filter", "filter", ParameterValue(type=4, string_value=name))[0]
+        assert tracking.until(
+            lambda count=sensors: all(p.get_subscription_count() == count for p in tracking.publishers.values())
+        )
     tracking.cut_short()
     assert tracking.play_until(lambda: tracking.angles), (tracking.at, len(tracking.frames), tracking.diagnostics)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from running import Running  # noqa: E402
+from running import BAG, ROOT, Running  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -25,8 +23,6 @@ from body_tracking import (  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
-BAG = ROOT / "bags" / "tpose_wave"
 NEEDED: dict[str, dict[str, object]] = {
     "kinect_skeleton": {"file": BAG},
     "imu_skeleton": {"segments": "[forearm_left]"},
@@ -82,14 +78,8 @@ class Rigs(Running):
             parameters.write_text(f"kinect1_skeleton: {{ros__parameters: {{file: {ROOT / 'bags' / bag}, loop: true}}}}")
             self.angles[name] = self.collect(JointState, names.resolved(graph.joint_states_topic("body1"), f"/{name}"))
             arguments = ["--namespace", name, "--sensors", "kinect1", "--params-file", parameters]
-            with (folder / f"{name}.log").open("wb") as log:
-                self.processes[name] = subprocess.Popen(
-                    [sys.executable, "-m", "body_tracking.cli", "up", *arguments]
-                    + ["--record", folder / f"{name}_bag", "--log-dir", folder],
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env=self.environment,
-                )
+            words = ["--record", folder / f"{name}_bag", "--log-dir", folder]
+            self.start_module(name, "body_tracking.cli", "up", *arguments, *words)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from rclpy.qos import QoSProfile  # noqa: E402
-from running import RELIABLE, Running, environment, refusal, stop  # noqa: E402
+from running import RELIABLE, ROOT, Running, environment, free_port, stop  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
@@ -25,31 +25,7 @@ from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.sensors.azure import AzureJoint  # noqa: E402
 from body_tracking.skeleton import Joint, TrackingState  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
-BAG = ROOT / "bags" / "tpose_wave"
 NO_NAMESPACES = 77
-
-
-@pytest.mark.parametrize(
-    ("parameters", "said"),
-    [
-        (("port:=0",), "parameter 'port': 0, expected 1 to 65535"),
-        (("backend:=network", "address:=0.0.0.0"), "needs the parameter 'key_file'"),
-        (("backend:=network", "key_file:=/nowhere"), "parameter 'key_file': /nowhere: cannot be read"),
-    ],
-)
-def test_a_receiver_that_would_not_be_safe_does_not_start(
-    tmp_path: Path, parameters: tuple[str, ...], said: str
-) -> None:
-    words = [word for parameter in parameters for word in ("-p", parameter)]
-    assert said in refusal(tmp_path, "kinect_skeleton", *words)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_path: Path) -> None:
@@ -61,15 +37,12 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
         )
 
         def told() -> dict[str, str]:
-            return running.diagnostics.get("kinect_skeleton", {})
+            return running.said("kinect_skeleton")
 
         assert running.until(lambda: "no frame yet" in told().get("", ""), 60.0)
-        command = [sys.executable, "-m", "body_tracking.sensors.kinect_sender", "--loop", "--replay", str(BAG)]
         for session in ("1", "2"):
             clouds_wanted = len(clouds) + 60
-            with (tmp_path / f"sender{session}.log").open("wb") as log:
-                sender = subprocess.Popen([*command, "--to", f"127.0.0.1:{port}"], stderr=log, env=running.environment)
-            running.processes[f"sender{session}"] = sender
+            sender = running.replay(f"sender{session}", port)
             assert running.until(lambda wanted=clouds_wanted: len(clouds) > wanted, 60.0), told()
             assert running.until(lambda: told()[""] == "streaming", 30.0), told()
             assert told()["sessions"] == session
@@ -109,7 +82,7 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
         publisher = running.node.create_publisher(MarkerArray, "/k4a/body_tracking_data", RELIABLE)
 
         def told() -> dict[str, str]:
-            return running.diagnostics.get("skeleton_adapter", {})
+            return running.said("skeleton_adapter")
 
         assert running.until(lambda: told().get("") == "no message on /k4a/body_tracking_data yet", 60.0)
         assert running.until(lambda: publisher.get_subscription_count() == 1, 30.0)

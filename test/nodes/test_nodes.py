@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import TransformStamped  # noqa: E402
-from rcl_interfaces.msg import ParameterValue  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from running import RELIABLE, Running, environment, refusal, stop  # noqa: E402
+from running import BAG, LATCHED, RELIABLE, Running, environment, recorded, refusal, stop  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -30,28 +27,17 @@ from body_tracking.calibration.storage import load  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds, to_time  # noqa: E402
 from body_tracking.messages.calibration import pose_to_transform  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
-from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 
 ROS = RosMessages()
-BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
-LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FRAME_NS = 33_333_333
-
-
-def recorded(sensor: str) -> list[Skeleton]:
-    """The frames of one sensor of a shipped recording."""
-    topic = graph.skeleton_topic(sensor)
-    with BagReader(BAG) as reader:
-        type_name = reader.topics[topic].type_name
-        return [cloud_to_skeletons(deserialize(type_name, message.cdr))[0] for message in reader.messages([topic])]
 
 
 # --- parameters
 
 
 @pytest.mark.parametrize(
-    ("executable", "parameter", "said"),
+    ("executable", "parameters", "said"),
     [
         ("kinect_skeleton", "sensr:=kinect1", "unknown parameter 'sensr'; did you mean 'sensor'?"),
         ("kinect_skeleton", "rate:=-1.0", "parameter 'rate': -1.0, expected 0.01 to 100"),
@@ -68,10 +54,28 @@ def recorded(sensor: str) -> list[Skeleton]:
         ("joint_angles", "body:=a/b", "parameter 'body': 'a/b'"),
         ("bag_player", "bags:=x", "unknown parameter 'bags'; did you mean 'bag'?"),
         ("bag_recorder", "chunk_seconds:=-1.0", "parameter 'chunk_seconds'"),
+        ("kinect_skeleton", "port:=0", "parameter 'port': 0, expected 1 to 65535"),
+        ("kinect_skeleton", "backend:=network address:=0.0.0.0", "needs the parameter 'key_file'"),
+        ("kinect_skeleton", "backend:=network key_file:=/nowhere", "'key_file': /nowhere: cannot be read"),
+        ("imu_skeleton", "", "segments"),
+        ("imu_skeleton", "segments:=[nose]", "nose"),
+        ("imu_skeleton", "segments:=[head] mountings:=['head:up']", "mounting 'up' on head"),
+        ("robot_commands", "", "parameter 'mapping': no mapping file of a robot; see docs/robots.md"),
+        ("robot_commands", f"mapping:={BAG}/metadata.yaml", f"{BAG}/metadata.yaml: the file: unknown key"),
+        ("bag_player", "", "no bag to play"),
+        ("bag_player", "bag:=absent", "absent: no such recording"),
+        ("bag_player", f"bag:={BAG} topics:=[/nothing]", "no topic /nothing"),
+        ("bag_player", f"bag:={BAG} wait_for_subscribers:=[/nothing]", "/nothing"),
+        ("bag_player", f"bag:={BAG} start_offset:=99.0", "no message to play after 99 s"),
+        ("bag_player", f"bag:={BAG} rate:=0.0", "rate"),
+        ("bag_player", f"bag:={BAG} on_end:=explode", "on_end"),
+        ("bag_player", "bag:=empty.mcap", "empty"),
     ],
 )
-def test_a_node_refuses_a_bad_parameter_in_one_line(tmp_path: Path, executable: str, parameter: str, said: str) -> None:
-    assert said in refusal(tmp_path, executable, "-p", parameter)
+def test_a_node_refuses_bad_parameters_in_one_line(tmp_path: Path, executable: str, parameters: str, said: str) -> None:
+    (tmp_path / "empty.mcap").touch()
+    words = [word for parameter in parameters.split() for word in ("-p", parameter)]
+    assert said in refusal(tmp_path, executable, *words)
 
 
 def test_a_section_for_all_nodes_may_hold_what_only_some_know(tmp_path: Path) -> None:
@@ -138,23 +142,21 @@ MALFORMED: dict[str, Callable[[], Any]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with Running(tmp_path_factory.mktemp("nodes")) as running:
-        for executable in ("calibration", "fusion"):
-            running.start(executable, reliable=True)
-        for executable in ("skeleton_filter", "joint_angles"):
-            running.start(executable, reliable=True)
-        assert running.until(lambda: len(running.diagnostics) >= 4)
-        yield running
-
-
 INPUTS = {
     "calibration": "/kinect2/skeleton",
     "fusion": "/kinect2/skeleton",
     "skeleton_filter": graph.FUSED,
     "joint_angles": graph.FILTERED,
 }
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with Running(tmp_path_factory.mktemp("nodes")) as running:
+        for executable in INPUTS:
+            running.start(executable, reliable=True)
+        assert running.until(lambda: len(running.diagnostics) >= 4)
+        yield running
 
 
 @pytest.mark.parametrize("topic", sorted(set(INPUTS.values())))
@@ -164,26 +166,19 @@ def test_every_malformed_message_is_counted_and_survived(nodes: Running, topic: 
     assert nodes.until(lambda: publisher.get_subscription_count() == len(readers))
     for make in MALFORMED.values():
         publisher.publish(make())
-    counted = dict.fromkeys(readers, 0)
-
-    def all_counted() -> bool:
-        for name in readers:
-            counted[name] = int(nodes.diagnostics[name].get("malformed", 0))
-        return min(counted.values()) >= len(MALFORMED)
-
-    nodes.until(all_counted)
-    assert counted == dict.fromkeys(readers, len(MALFORMED))
+    nodes.until(lambda: all(nodes.number(name, "malformed") >= len(MALFORMED) for name in readers))
+    assert [nodes.number(name, "malformed") for name in readers] == [len(MALFORMED)] * len(readers)
     for name in readers:
         assert nodes.processes[name].poll() is None
         assert topic in nodes.diagnostics[name]["last malformed"]
         assert "malformed message ignored" in nodes.log(name)
     publisher.publish(valid())
-    assert nodes.until(lambda: all(int(nodes.diagnostics[name].get("received", 0)) >= 1 for name in readers))
+    assert nodes.until(lambda: all(nodes.number(name, "received") >= 1 for name in readers))
     nodes.node.destroy_publisher(publisher)
 
 
 def test_a_pose_that_is_none_is_counted(nodes: Running) -> None:
-    before = int(nodes.diagnostics["fusion"].get("malformed", 0))
+    before = nodes.number("fusion", "malformed")
     publisher = nodes.node.create_publisher(TransformStamped, graph.CALIBRATION, LATCHED)
     assert nodes.until(lambda: publisher.get_subscription_count() == 1)
     no_rotation = pose_to_transform(level_pose("kinect1"), "world", ROS)
@@ -192,7 +187,7 @@ def test_a_pose_that_is_none_is_counted(nodes: Running) -> None:
     no_sensor.child_frame_id = "kinect1"
     for message in (no_rotation, no_sensor):
         publisher.publish(message)
-    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("malformed", 0)) == before + 2)
+    assert nodes.until(lambda: nodes.number("fusion", "malformed") == before + 2)
     nodes.node.destroy_publisher(publisher)
 
 
@@ -239,8 +234,8 @@ def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Runni
         cloud = skeletons_to_cloud([frames[0]], ROS)
         cloud.header.stamp = to_time(start + 19 * FRAME_NS - back_ns, ROS)
         publisher.publish(cloud)
-    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("repeated stamps", 0)) == 1)
-    assert nodes.until(lambda: int(nodes.diagnostics["fusion"].get("stamps backwards", 0)) >= 2)
+    assert nodes.until(lambda: nodes.number("fusion", "repeated stamps") == 1)
+    assert nodes.until(lambda: nodes.number("fusion", "stamps backwards") >= 2)
     assert all(process.poll() is None for process in nodes.processes.values())
 
 
@@ -257,30 +252,14 @@ def test_a_t_pose_that_is_held_is_logged(nodes: Running) -> None:
     nodes.node.destroy_publisher(publisher)
 
 
-def test_the_filter_may_change_while_it_runs_but_not_to_nonsense(nodes: Running) -> None:
-    set_parameter = partial(nodes.set_parameter, "skeleton_filter")
-    assert set_parameter("filter", ParameterValue(type=4, string_value="lkf_zero_velocity"))[0]
-    assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"][""].startswith("lkf_zero_velocity"))
-    refused, reason = set_parameter("filter", ParameterValue(type=4, string_value="wishful"))
-    assert not refused
-    assert "expected one of" in reason
-    assert not set_parameter("measurement_noise_scale", ParameterValue(type=3, double_value=-7.0))[0]
-    assert set_parameter("measurement_noise_scale", ParameterValue(type=3, double_value=1.1))[0]
-    assert not set_parameter("reliable", ParameterValue(type=1, bool_value=False))[0]
-
-
 def test_who_comes_late_gets_the_calibration_and_services_answer(nodes: Running) -> None:
     poses = nodes.collect(TransformStamped, graph.CALIBRATION, LATCHED)
     assert nodes.until(lambda: poses)
     assert poses[0].child_frame_id == "kinect1_optical_frame"
     assert poses[0].header.frame_id == "world"
     for service in (graph.START_SERVICE, graph.RESET_SERVICE):
-        client = nodes.node.create_client(Trigger, service)
-        assert client.wait_for_service(10.0)
-        future = client.call_async(Trigger.Request())
-        assert nodes.until(future.done)
-        assert future.result().success
-        assert future.result().message
+        answer = nodes.call(Trigger, service, Trigger.Request())
+        assert answer.success and answer.message
 
 
 # --- nodes on their own
@@ -297,7 +276,7 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
         assert [to_nanoseconds(cloud.header.stamp) for cloud in received] == stamps
         last = cloud_to_skeletons(received[-1])[0]
         assert np.array_equal(last.positions, frames[-1].positions, equal_nan=True)
-        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == "ended")
+        assert running.until(lambda: running.said("kinect_skeleton").get("") == "ended")
         assert stop(running.processes["kinect_skeleton"]) == 0
 
 
@@ -353,7 +332,7 @@ def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Pa
         running.environment |= installed(tmp_path, "mycamera:Camera")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
         told = "OSError: the cable was pulled"
-        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("") == told, 60.0)
+        assert running.until(lambda: running.said("kinect_skeleton").get("") == told, 60.0)
         assert running.diagnostics["kinect_skeleton"]["published"] == "3"
         assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
         assert process.poll() is None
@@ -364,7 +343,7 @@ def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Mute")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
-        assert running.until(lambda: running.diagnostics.get("kinect_skeleton", {}).get("published") == "3", 60.0)
+        assert running.until(lambda: running.said("kinect_skeleton").get("published") == "3", 60.0)
         assert running.diagnostics["kinect_skeleton"][""] == "streaming; counters: KeyError: 'temperature'"
         assert "in counters" in running.log("kinect_skeleton")
         assert stop(process) == 0

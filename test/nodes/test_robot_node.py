@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-import yaml
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from running import RELIABLE, Running, environment, stop  # noqa: E402
+from running import BAG, RELIABLE, ROOT, Running, environment, stop  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from simulated_arm import SimulatedArm  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
@@ -39,8 +38,6 @@ from body_tracking.robot.follower import State  # noqa: E402
 from body_tracking.robot.mapping import RobotMapping, load  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS, FloatArray  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
-BAG = ROOT / "bags" / "tpose_wave"
 SENSOR = graph.skeleton_topic("kinect1")
 LATENCY_NS = 20_000_000
 BODIES = {"two_joint_arm": "body1", "iiwa7": "body2"}
@@ -49,41 +46,6 @@ PERIOD = 0.01
 
 def mapping_file(robot: str) -> Path:
     return ROOT / "config" / "robots" / f"{robot}.yaml"
-
-
-# --- what is refused
-
-
-def test_a_robot_without_a_mapping_is_refused_in_one_line() -> None:
-    command = [sys.executable, "-m", "body_tracking.nodes", "robot_commands"]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
-    assert done.stderr == "robot_commands: parameter 'mapping': no mapping file of a robot; see docs/robots.md\n"
-
-
-def _inverted(content: dict[str, Any]) -> None:
-    content["joints"][1]["lower"], content["joints"][1]["upper"] = 1.0, 1.0
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda content: content["joints"][0].update(name="sholder"), "unknown joint 'sholder'"),
-        (_inverted, "joint 'elbow': empty limits"),
-        (lambda content: content["joints"].reverse(), "wrong order: joint 1 is 'elbow'"),
-    ],
-)
-def test_a_wrong_mapping_is_refused_at_the_start_by_name(change: Any, said: str, tmp_path: Path) -> None:
-    content = yaml.safe_load(mapping_file("two_joint_arm").read_text())
-    change(content)
-    file = tmp_path / "robot.yaml"
-    file.write_text(yaml.safe_dump(content))
-    command = [sys.executable, "-m", "body_tracking.nodes", "robot_commands", "--ros-args", "-p", f"mapping:={file}"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment())
-    assert result.returncode == 2
-    (line,) = result.stderr.strip().splitlines()
-    assert line.startswith(f"robot_commands: {file}: ")
-    assert said in line
 
 
 # --- a recording of the angles that the graph would find, if it saw everything
@@ -181,15 +143,7 @@ class Robots(Running):
     def command(self, robot: str, **parameters: object) -> None:
         """Start a robot's ``robot_commands`` under the robot's name."""
         given = {"mapping": mapping_file(robot), "sensors": "[kinect1]", **parameters}
-        words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
-        with (self.folder / f"{robot}.log").open("wb") as log:
-            self.processes[robot] = subprocess.Popen(
-                [sys.executable, "-m", "body_tracking.nodes", "robot_commands", "--ros-args"]
-                + ["-r", f"__node:={robot}_commands", *words],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=self.environment,
-            )
+        self.start_interpreter("robot_commands", name=f"{robot}_commands", **given)
 
 
 class PlayedRobots(Robots):
@@ -208,18 +162,19 @@ class PlayedRobots(Robots):
         """Start the sensor."""
         self.start("bag_player", bag=self.bag, loop=True, wait_for_subscribers=f"['{SENSOR}:3']", wait_timeout=60.0)
 
-    def said(self, robot: str) -> dict[str, str]:
-        return self.diagnostics.get(f"{robot}_commands", {})
+    def robot(self, robot: str) -> dict[str, str]:
+        """The last diagnostics of what commands a robot."""
+        return self.said(f"{robot}_commands")
 
     def in_state(self, *states: State) -> bool:
         """Whether the last diagnostics of every robot say one of these."""
-        return all(self.said(robot).get("state") in states for robot in self.arms)
+        return all(self.robot(robot).get("state") in states for robot in self.arms)
 
     def kill_while_moving(self) -> float:
         """End the sensor as a crash does, while both arms follow and move; the wall time of it."""
         moving = {name: arm.moving for name, arm in self.arms.items()}
         assert self.until(lambda: self.in_state(State.FOLLOWING) and all(m() for m in moving.values()), 90.0), {
-            name: (self.said(name), self.log(name)[-2000:]) for name in self.arms
+            name: (self.robot(name), self.log(f"{name}_commands")[-2000:]) for name in self.arms
         }
         player = self.processes.pop("bag_player")
         killed = time.time()
@@ -256,14 +211,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             assert robots.until(lambda: robots.in_state(State.HOLDING)), robots.diagnostics
             assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.diagnostics
             for robot in BODIES:
-                reasons[robot].append(robots.said(robot)[""])
+                reasons[robot].append(robots.robot(robot)[""])
             robots.until(lambda: False, timeout=1.0)  # commands that were on their way
             quiet.append({robot: len(arm.told) for robot, arm in robots.arms.items()})
             robots.until(lambda: False, timeout=0.5)
             assert quiet[-1] == {robot: len(arm.told) for robot, arm in robots.arms.items()}
-        for robot in (*BODIES, "calibration"):
-            assert stop(robots.processes.pop(robot)) == 0, robots.log(robot)
-        logs = {robot: robots.log(robot) for robot in BODIES}
+        for name in (*(f"{robot}_commands" for robot in BODIES), "calibration"):
+            assert stop(robots.processes.pop(name)) == 0, robots.log(name)
+        logs = {robot: robots.log(f"{robot}_commands") for robot in BODIES}
         yield Run(dict(robots.arms), tuple(killed), followed, reasons, tuple(quiet), logs)
 
 
@@ -391,13 +346,7 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         topic = graph.joint_states_topic("body1")
         robots.node.create_subscription(JointState, topic, lambda each: angles.append((time.time(), each)), RELIABLE)
         words = ["--bag", BAG, "--filter", "ekf", "--robot", mapping_file("two_joint_arm"), "--log-dir", tmp_path]
-        with (tmp_path / "up.log").open("wb") as log:
-            up = robots.processes["up"] = subprocess.Popen(
-                [sys.executable, "-m", "body_tracking.cli", "up", *words],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=robots.environment,
-            )
+        up = robots.start_module("up", "body_tracking.cli", "up", *words)
 
         def state() -> str | None:
             return robots.diagnostics.get("robot_commands", {}).get("state")

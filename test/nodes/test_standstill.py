@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +13,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from running import RELIABLE, Running  # noqa: E402
+from running import RELIABLE, Running, free_port  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from body_tracking import dds, graph  # noqa: E402
@@ -24,7 +21,6 @@ from body_tracking.backlog import MAX_AGE  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS  # noqa: E402
 
-BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 STOPPED = 2.5
 """Seconds for which a node is stopped."""
 
@@ -39,17 +35,12 @@ class Live(Running):
         with patch.dict(os.environ, self.environment, clear=True):
             dds.stay_on_this_machine()
             self.environment = dict(os.environ)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port = free_port()
         for name in ("calibration", "fusion", "skeleton_filter"):
             self.start(name, sensors="[kinect1]")
         self.start("joint_angles")
         self.start("kinect_skeleton", sensor="kinect1", backend="network", port=port)
-        command = [sys.executable, "-m", "body_tracking.sensors.kinect_sender", "--loop", "--replay", str(BAG)]
-        self.processes["kinect_sender"] = subprocess.Popen(
-            [*command, "--to", f"127.0.0.1:{port}"], stderr=subprocess.DEVNULL, env=self.environment
-        )
+        self.replay("kinect_sender", port)
         self.stamps: list[tuple[int, int]] = []
         """Capture and arrival of the angles, nanoseconds."""
         self.node.create_subscription(JointState, graph.joint_states_topic("body1"), self.note, RELIABLE)

@@ -17,13 +17,11 @@ from body_tracking.messages.imus import message_to_magnetic_field, message_to_sa
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.info import bag_info
-from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.sensors.mvnx import MvnxRecording
 from body_tracking.skeleton import JOINT_NAMES, Skeleton
 from draws import some
-
-COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
+from skeleton_files import COORDINATES, FIRST_ID, csv_row, skeleton_text, write_csv
 
 
 def skeletons(bag: Path) -> dict[str, list[tuple[int, tuple[Skeleton, ...]]]]:
@@ -37,19 +35,14 @@ def skeletons(bag: Path) -> dict[str, list[tuple[int, tuple[Skeleton, ...]]]]:
     return found
 
 
-def write_csv(path: Path, rows: list[dict[str, object]]) -> Path:
-    columns = [*(name for name in rows[0] if name not in COORDINATES), *COORDINATES]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows({**{name: index / 50 for index, name in enumerate(COORDINATES)}, **row} for row in rows)
-    return path
+def frames(path: Path, *stamps: object, **more: object) -> Path:
+    """A CSV recording of one body at these stamps."""
+    return write_csv(path, [csv_row(stamp, **more) for stamp in stamps])
 
 
 def write_ntu(path: Path, n_frames: int) -> Path:
-    joint = "0.1 0.2 2.5 277.4 191.8 1036.6 519.1 -0.2 0.05 0.97 0.1 2"
-    body = ["1", "72057594037944738 0 1 1 1 1 0 0.02 0.05 2", "25", *[joint] * 25]
-    path.write_text("\n".join([str(n_frames), *body * n_frames]) + "\n")
+    body = FIRST_ID, np.ones((25, 3)), np.full(25, 2)
+    path.write_bytes(skeleton_text([[body]] * n_frames).encode())
     return path
 
 
@@ -88,13 +81,6 @@ def test_the_real_states_are_imported_as_they_are(shared_data, tmp_path):
         assert body.states.tolist() == [int(row[f"{joint}_state"]) for joint in JOINT_NAMES]
 
 
-def test_topics_are_sensor_data(tmp_path):
-    import_files([write_csv(tmp_path / "a.csv", [{"stamp": 0}, {"stamp": 1}])], tmp_path / "bag")
-    with BagReader(tmp_path / "bag") as reader:
-        (topic,) = reader.topics.values()
-        assert topic.type_name == POINT_CLOUD and topic.offered == (SENSOR_DATA,)
-
-
 def test_several_views_are_one_bag_in_time_order(tmp_path):
     files = [write_ntu(tmp_path / f"S001C00{camera}P003R001A010.skeleton", 10) for camera in (1, 2, 3)]
     report = import_files(files, tmp_path / "bag")
@@ -109,13 +95,13 @@ def test_several_views_are_one_bag_in_time_order(tmp_path):
 
 
 def test_names_of_files_without_sensors(tmp_path):
-    files = [write_csv(tmp_path / f"{name}.csv", [{"stamp": 0}]) for name in "abc"]
+    files = [frames(tmp_path / f"{name}.csv", 0) for name in "abc"]
     report = import_files(files, tmp_path / "bag", sensors={files[1]: "side"})
     assert set(report.sensors) == {"kinect1", "side", "kinect3"}
 
 
 def test_a_sensor_in_two_files_is_refused(tmp_path):
-    files = [write_csv(tmp_path / f"{name}.csv", [{"sensor": "k", "stamp": 0}]) for name in "ab"]
+    files = [frames(tmp_path / f"{name}.csv", 0, sensor="k") for name in "ab"]
     with pytest.raises(BodyTrackingError, match=r"sensor 'k' is in .*a\.csv and in .*b\.csv"):
         import_files(files, tmp_path / "bag")
     with pytest.raises(BodyTrackingError, match="twice"):
@@ -124,8 +110,8 @@ def test_a_sensor_in_two_files_is_refused(tmp_path):
 
 
 def test_a_bad_file_leaves_no_bag_and_costs_none(tmp_path):
-    good = write_csv(tmp_path / "good.csv", [{"stamp": index} for index in range(3000)])
-    bad = write_csv(tmp_path / "bad.csv", [{"stamp": index} for index in range(3000)] + [{"stamp": "x"}])
+    good = frames(tmp_path / "good.csv", *range(3000))
+    bad = frames(tmp_path / "bad.csv", *range(3000), "x")
     with pytest.raises(BodyTrackingError, match="line 3002"):
         import_files([bad], tmp_path / "bag")
     assert not (tmp_path / "bag").exists()
@@ -138,9 +124,9 @@ def test_a_bad_file_leaves_no_bag_and_costs_none(tmp_path):
 
 
 def test_a_stamp_or_receipt_before_time_0_is_refused(tmp_path):
-    for row in ({"stamp": 1, "received": -0.5}, {"stamp": -1.5, "received": 0}):
+    for stamp, received in ((1, -0.5), (-1.5, 0)):
         with pytest.raises(BodyTrackingError, match=r"line 2: .* is not a time in seconds"):
-            import_files([write_csv(tmp_path / "a.csv", [row])], tmp_path / "bag")
+            import_files([frames(tmp_path / "a.csv", stamp, received=received)], tmp_path / "bag")
 
 
 # --- the command
@@ -152,8 +138,8 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return code, output.out, output.err
 
 
-def test_import_and_info_as_json(tmp_path, capsys):
-    file = write_csv(tmp_path / "a.csv", [{"stamp": index / 10} for index in range(11)])
+def test_import_and_info_as_json_and_for_people(tmp_path, capsys):
+    file = frames(tmp_path / "a.csv", *(index / 10 for index in range(11)))
     code, out, _ = run(capsys, "import", file, "-o", tmp_path / "bag", "--sensor", "left", "--json")
     report = json.loads(out)
     assert code == 0 and report["frames"] == 11 and report["recording_s"] == 1.0
@@ -162,27 +148,19 @@ def test_import_and_info_as_json(tmp_path, capsys):
     info = json.loads(out)
     assert code == 0 and info["messages"] == 11 and info["duration_s"] == 1.0 and info["warnings"] == []
     (topic,) = info["topics"]
-    assert (topic["name"], topic["type"], topic["count"], topic["rate"]) == (
-        "/left/skeleton",
-        POINT_CLOUD,
-        11,
-        pytest.approx(10.0),
-    )
+    assert (topic["name"], topic["type"], topic["count"]) == ("/left/skeleton", POINT_CLOUD, 11)
+    assert topic["rate"] == pytest.approx(10.0)
     assert topic["qos"][0]["reliability"] == "best_effort"
-
-
-def test_import_and_info_for_people(tmp_path, capsys):
-    file = write_csv(tmp_path / "a.csv", [{"stamp": stamp} for stamp in (0, 1, 1, 0.5)])
-    code, out, err = run(capsys, "import", file, "-o", tmp_path / "bag")
+    code, out, err = run(capsys, "import", frames(tmp_path / "b.csv", 0, 1, 1, 0.5), "-o", tmp_path / "other")
     assert code == 0 and err == ""
     assert "/kinect1/skeleton: 4 frames" in out and "1 stamps that repeat" in out
-    code, out, err = run(capsys, "bag", "info", tmp_path / "bag")
+    code, out, err = run(capsys, "bag", "info", tmp_path / "other")
     assert code == 0 and err == ""
     assert "/kinect1/skeleton" in out and "best_effort" in out and "4" in out
 
 
 def test_a_cut_recording_is_told_of_and_closed(tmp_path, capsys):
-    rows = [{"stamp": index / 30, "Head_x": index * 0.123} for index in range(3000)]
+    rows = [csv_row(index / 30, index * 0.123) for index in range(3000)]
     import_files([write_csv(tmp_path / "a.csv", rows)], tmp_path / "bag")
     path = next((tmp_path / "bag").glob("*.mcap"))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -213,7 +191,7 @@ def test_a_cut_recording_is_told_of_and_closed(tmp_path, capsys):
 def test_what_is_wrong_is_one_line(tmp_path, monkeypatch, capsys, arguments, text):
     monkeypatch.chdir(tmp_path)
     for name in "ab":
-        write_csv(tmp_path / f"{name}.csv", [{"stamp": 0}])
+        frames(tmp_path / f"{name}.csv", 0)
     (tmp_path / "a.txt").write_text("no recording")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").touch()
@@ -245,13 +223,16 @@ def inertial(bag: Path) -> dict[str, list[tuple[int, object]]]:
 
 def test_inertial_readings_go_where_those_of_drivers_go(tmp_path):
     (tmp_path / "imu.csv").write_text(IMU_CSV)
-    report = import_files([tmp_path / "imu.csv"], tmp_path / "bag")
+    report = import_files([frames(tmp_path / "a.csv", 5.005), tmp_path / "imu.csv"], tmp_path / "bag")
+    bodies = {name: sensor.bodies for name, sensor in report.sensors.items()}
+    assert bodies == {"kinect1": 1, "forearm_left": 0, "hand_left": 0}
     assert report.sensors["forearm_left"].topics == ("/forearm_left/imu/data_raw", "/forearm_left/imu/mag")
     found = inertial(tmp_path / "bag")
     assert {topic: [at for at, _ in messages] for topic, messages in found.items()} == {
         "/forearm_left/imu/data_raw": [5_000_000_000, 5_020_000_000],
         "/forearm_left/imu/mag": [5_000_000_000],
         "/hand_left/imu/data_raw": [5_010_000_000],
+        "/kinect1/skeleton": [5_005_000_000],
     }
     sample = message_to_sample(found["/forearm_left/imu/data_raw"][0][1])
     assert (sample.stamp_ns, sample.frame_id) == (100_000_000_000, "forearm_left_link")
@@ -261,17 +242,6 @@ def test_inertial_readings_go_where_those_of_drivers_go(tmp_path):
     _, frame_id, magnetic = message_to_magnetic_field(found["/forearm_left/imu/mag"][0][1])
     assert frame_id == "forearm_left_link"
     np.testing.assert_array_equal(magnetic, [2e-5, 0.0, -4e-5])
-
-
-def test_inertial_readings_and_skeletons_are_one_bag(tmp_path):
-    (tmp_path / "imu.csv").write_text(IMU_CSV)
-    files = [write_csv(tmp_path / "a.csv", [{"stamp": 5.005}]), tmp_path / "imu.csv"]
-    report = import_files(files, tmp_path / "bag")
-    assert {name: sensor.bodies for name, sensor in report.sensors.items()} == {
-        "kinect1": 1,
-        "forearm_left": 0,
-        "hand_left": 0,
-    }
 
 
 def test_a_suit_goes_along_with_its_own_angles(shared_data, tmp_path):

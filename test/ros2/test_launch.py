@@ -89,8 +89,3 @@ def test_what_a_node_finds_wrong_ends_it_too(tools: Tools) -> None:
     assert launch.ended() == 1, launch.text()
     assert [line for line in launch.text().splitlines() if "calibration.yaml" in line], launch.text()
     assert "Traceback" not in launch.text()
-
-
-def test_its_arguments_are_shown(tools: Tools) -> None:
-    text = tools.ask("launch", "body_tracking", "two_kinects.launch.py", "--show-args")
-    assert "'bag':" in text and "'namespace':" in text

@@ -74,9 +74,3 @@ def test_what_a_node_cannot_do_without_is_said(tools: Tools) -> None:
         assert tool.ended() == 2
         said, of_ros2_run = tool.text().splitlines()
         assert said.startswith(f"{name}: ") and "exit" in of_ros2_run
-
-
-def test_help_of_nodes_and_commands(tools: Tools) -> None:
-    names = (*some(systems.EXECUTABLES), "body_tracking", "kinect_sender")
-    for text in tools.all([("run", "body_tracking", name, "--help") for name in names]):
-        assert text.startswith("usage: ")

@@ -68,6 +68,10 @@ class Partner:
         self.answer(arrival_ns)
         return result
 
+    def stream(self, begin_ns: int, count: int) -> list[ReceivedFrame | None]:
+        """So many frames, 30 a second; what the receiver makes of each."""
+        return [self.give(self.frame(begin_ns + k * FRAME_NS), begin_ns + k * FRAME_NS) for k in range(count)]
+
     def answer(self, now_ns: int) -> None:
         """Answer every request of the receiver, which is made now."""
         self.receiver.ask_clock(now_ns)

@@ -50,19 +50,13 @@ def test_an_empty_group_is_a_quantity_that_is_not_there(tmp_path: Path) -> None:
     assert reading.sample.angular_velocity is not None
 
 
-def test_readings_that_cannot_be_are_counted_and_the_first_is_shown(tmp_path: Path) -> None:
-    rows = ROW + ROW.replace("0,0,0,1,", "0,0,0,0,") + ROW.replace("9.8", "nan")
+def test_readings_that_cannot_be_and_stamps_that_repeat_are_counted_and_the_first_is_shown(tmp_path: Path) -> None:
+    rows = ROW + ROW.replace("0,0,0,1,", "0,0,0,0,") + ROW.replace("9.8", "nan") + ROW
     readings, recording = read(written(tmp_path, OWN + rows))
-    assert len(readings) == 1
-    assert recording.problems[BAD] == 2
+    assert len(readings) == 2
+    assert (recording.problems[BAD], recording.problems[BACKWARDS]) == (2, 1)
     (warning,) = recording.warnings
     assert "line 3" in warning and "zero quaternion" in warning
-
-
-def test_stamps_that_repeat_are_counted(tmp_path: Path) -> None:
-    readings, recording = read(written(tmp_path, OWN + ROW + ROW))
-    assert len(readings) == 2
-    assert recording.problems[BACKWARDS] == 1
 
 
 @pytest.mark.parametrize(
@@ -71,7 +65,7 @@ def test_stamps_that_repeat_are_counted(tmp_path: Path) -> None:
         ("", "empty"),
         (OWN, "no rows"),
         (OWN + ROW + ROW.replace("0.2", "O.2"), "line 3: 'O.2' is not a number"),
-        (OWN + ROW.replace("1700000000.123456789", "noon"), "line 2: 'noon' is not a time"),
+        (OWN + ROW.replace("1700000000.123456789", "noon"), "line 2: stamp: 'noon' is not a number"),
         (OWN + ROW.replace("1700000000.123456789", "1e300"), "line 2: .* not a time in seconds"),
         (OWN + ROW.replace(",87", ""), "line 2: 13 columns, expected 14"),
         (OWN + ROW.replace("wrist", "left wrist"), "line 2: sensor name 'left wrist'"),

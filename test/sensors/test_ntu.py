@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skeleton_files import FIRST_ID, skeleton_text
 
 from body_tracking.sensors import NOT_FINITE
 from body_tracking.sensors.ntu import EMPTY, NtuError, NtuRecording, sensor_of
 from body_tracking.skeleton import TrackingState
+from skeleton_files import FIRST_ID, skeleton_text
 
 NAME = "S001C002P003R001A010.skeleton"
 

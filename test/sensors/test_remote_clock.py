@@ -70,12 +70,11 @@ def test_equal_ways_tell_the_offset_exactly_and_drift_is_followed() -> None:
 
 def test_five_milliseconds_of_jitter_leave_less_than_one() -> None:
     numbers = np.random.default_rng(3)
-    errors = []
-    trips = RoundTrips()
+    trips, errors = RoundTrips(), []
     for k in range(240):
-        there, back = (int(x) for x in numbers.uniform(0.2 * MS, 5.2 * MS, size=2))
-        ask(trips, k * NANOSECONDS // 4, -300 * MS, 20e-6, there, back)
         local = k * NANOSECONDS // 4
+        there, back = (int(x) for x in numbers.uniform(0.2 * MS, 5.2 * MS, size=2))
+        ask(trips, local, -300 * MS, 20e-6, there, back)
         true = true_offset(local, -300 * MS, 20e-6)
         errors.append(abs(trips.offset_ns(round(local - true)) - true))
     assert max(errors[40:]) < 1 * MS
@@ -142,11 +141,6 @@ def test_after_a_cut_of_half_a_minute_slow_frames_and_answers_do_not_move_the_st
         assert abs(stamp - true - 20 * MS) < MS // 2
 
 
-def test_the_least_delay_is_taken_off() -> None:
-    clock = CaptureClock(20 * MS)
-    assert clock.stamp(0, 20 * MS, 5) == 5
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32), st.floats(-3e-4, 3e-4), st.floats(0.0, 0.5))
 def test_stamps_never_run_backwards(seed: int, drift: float, chance: float) -> None:
@@ -165,16 +159,16 @@ def test_stamps_never_run_backwards(seed: int, drift: float, chance: float) -> N
     assert (np.diff(stamps) > 0).all()
 
 
-def test_a_sensor_that_counts_anew_goes_on_where_time_is() -> None:
-    clock = CaptureClock()
+@pytest.mark.parametrize(
+    ("counted_ns", "offset_ns", "expected_ns"),
+    [
+        (-FRAME_NS, 0, 0),  # a sensor that counts anew goes on where time is
+        (100 * FRAME_NS, -3600 * NANOSECONDS, -3600 * NANOSECONDS),  # where this computer's clock is set back
+    ],
+)
+def test_stamps_follow_what_is_set_anew(counted_ns: int, offset_ns: int, expected_ns: int) -> None:
+    clock = CaptureClock(20 * MS)
     for k in range(100):
-        clock.stamp(k * FRAME_NS + 10**15, k * FRAME_NS + 20 * MS, 0)
-    assert clock.stamp(5, 101 * FRAME_NS + 20 * MS, 0) == 101 * FRAME_NS + 20 * MS
-
-
-def test_where_this_computers_clock_is_set_back_by_an_hour_stamps_follow() -> None:
-    clock = CaptureClock()
-    for k in range(100):
-        clock.stamp(k * FRAME_NS, k * FRAME_NS, 0)
-    hour = 3600 * NANOSECONDS
-    assert clock.stamp(100 * FRAME_NS, 100 * FRAME_NS, -hour) == 100 * FRAME_NS - hour
+        assert clock.stamp(k * FRAME_NS, k * FRAME_NS + 20 * MS, 0) == k * FRAME_NS  # the least delay is taken off
+    sent_ns = 100 * FRAME_NS + 20 * MS
+    assert clock.stamp(counted_ns, sent_ns, offset_ns) == 100 * FRAME_NS + expected_ns
