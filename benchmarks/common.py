@@ -16,6 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -137,8 +138,9 @@ def progress(text: str) -> None:
 def mapped(work: Callable[[_Job], _Result], jobs: Sequence[_Job], processes: int) -> list[_Result]:
     """The results of all jobs, in their order; shows how far it is."""
     began, results = time.monotonic(), []
-    with multiprocessing.get_context("spawn").Pool(max(1, min(processes, len(jobs)))) as pool:
-        for result in pool.imap(work, jobs):
+    # processes that may have children: `replay` runs in two
+    with ProcessPoolExecutor(max(1, min(processes, len(jobs))), multiprocessing.get_context("spawn")) as pool:
+        for result in pool.map(work, jobs):
             results.append(result)
             left = (time.monotonic() - began) / len(results) * (len(jobs) - len(results))
             print(f"\r{len(results)} of {len(jobs)} runs, {left:.0f} s left ", end="", file=sys.stderr, flush=True)

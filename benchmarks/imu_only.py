@@ -261,8 +261,8 @@ def show(name: str, figures: list[Figures]) -> None:
     print(
         f"{name}: eight angles {f['eight']:.2f} deg RMS (constant {f['constant']:.2f}, varying {f['varying']:.2f}), "
         f"stated {f['stated']:.2f}, covered {100.0 * f['covered']:.0f} %; pronation {f['pronation rms']:.1f} deg, "
-        f"stated {f['pronation stated']:.1f}, covered {100.0 * f['pronation covered']:.0f} %; {f['computing']:.2f} s of "
-        "computing per second"
+        f"stated {f['pronation stated']:.1f}, covered {100.0 * f['pronation covered']:.0f} %; "
+        f"{f['computing']:.2f} s of computing per second"
     )
 
 

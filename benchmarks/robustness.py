@@ -15,6 +15,9 @@ excess     greatest angle beyond a range of motion at any frame (ranges.excess)
 surprise   greatest error of an observed angle over its stated standard deviation, median of the last 0.5 s: shows
            runs that fit the points with a wrong pose
 
+With ``--standing`` instead a person who stands still: by how much each angle that nothing observes, averaged over a
+second, leaves its average over the first one. White noise of 20 mm is measured.
+
   python benchmarks/robustness.py                  1,000 runs
   python benchmarks/robustness.py --only 123       that run alone, frame by frame
 """
@@ -31,7 +34,9 @@ import common
 import numpy as np
 from honesty import NAMES, OBSERVED, all_runs, new_filter
 
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     MODEL,
     POSTURES,
@@ -54,6 +59,8 @@ BACK_WITHIN = 1.0
 """Seconds of good data after which the filter must be back."""
 EXCESS_BAR = 15.0
 """Degrees."""
+DRIFT_BAR, STANDING_NOISE, STANDING_RATE = 10.0, 0.02, 30.0
+"""Of a person who stands still: degrees, metres, Hz."""
 WRONG_START = np.radians(60.0)
 LONGEST_DROPOUT, LONGEST_GAP = 2.0, 1.0
 """Seconds."""
@@ -325,6 +332,28 @@ def run(settings: Settings, number: int) -> Outcome:
     )
 
 
+def standing(minutes: float, seed: int, parameters: Mapping[str, float]) -> dict[str, float]:
+    """Greatest departure of each unobserved angle from its start, degrees, for a person who stands still."""
+    rng = np.random.default_rng(seed)
+    lengths, times = RandomPerson.draw(rng).lengths, capture_times(60.0 * minutes, rng, STANDING_RATE)
+    # upright to some degrees, the arms hanging with slightly bent elbows
+    tangent = np.zeros(MODEL.nv)
+    tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
+    tangent[[NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(rng.uniform(5, 25, 2))
+    q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
+    positions = MODEL.forward(q, lengths).positions
+    truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
+    estimator = ExtendedKalmanFilter(EkfParameters(**parameters))
+    columns, second = [NAMES.index(each) for each in UNOBSERVED], round(STANDING_RATE)
+    history = []
+    for skeleton in observe(truth, MeasurementErrors(STANDING_NOISE), rng).skeletons:
+        estimator.update(skeleton)
+        if estimator.estimate is not None:
+            history.append(np.degrees(MODEL.difference(MODEL.neutral(), estimator.estimate.q)[columns]))
+    averages = np.array(history[: len(history) // second * second]).reshape(-1, second, len(columns)).mean(axis=1)
+    return dict(zip(UNOBSERVED, np.abs(averages - averages[0]).max(axis=0).tolist(), strict=True))
+
+
 def bound(scenario: Scenario) -> float:
     """Metres: greatest RMS error of the 19 points of a filter that is back."""
     return float(np.sqrt(3.0) * scenario.noise + 0.03)
@@ -429,12 +458,18 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=6.0, help="length of a run (default: %(default)g)")
     parser.add_argument("--worst", type=int, default=5, metavar="N", help="runs to list of a kind (default: 5)")
     parser.add_argument("--overlap", action="store_true", help="dropouts and gaps may add up to longer ones: harder")
+    parser.add_argument("--standing", type=float, metavar="MINUTES", help="a person who stands still, instead")
     common.add_set(parser)
     args = parser.parse_args()
     if args.seconds < GOOD + 3.0:
         parser.error(f"--seconds {args.seconds:g}: at least {GOOD + 3.0:g}")
     settings = Settings(args.seed, args.seconds, args.overlap, dict(args.set))
     new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
+    if args.standing is not None:
+        drift = standing(args.standing, args.seed, settings.parameters)
+        text = "\n".join(f"{name}: up to {value:.1f} deg from its first second" for name, value in drift.items())
+        common.report(args, drift, lambda: print(text))
+        return common.verdicts(args, {f"{name} below {DRIFT_BAR:g} deg": x <= DRIFT_BAR for name, x in drift.items()})
     if args.only is not None:
         frame_by_frame(args.only, settings)
         return 0
