@@ -29,7 +29,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
-from body_tracking import dds, graph
+from body_tracking import graph
 from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
 from body_tracking.calibration.storage import save
 from body_tracking.cdr import encode_skeletons
@@ -176,7 +176,6 @@ class Ear:
     """
 
     def __init__(self, name: str, now: Callable[[], int] = time.perf_counter_ns) -> None:
-        dds.prepare()
         rclpy.init()
         self.node = rclpy.create_node(name)
         self.executor = SingleThreadedExecutor()

@@ -39,6 +39,7 @@ from body_tracking.cdr import decode_skeletons
 from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.graph import GraphOptions
+from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import sensor_topics
 from body_tracking.recording.rosbag2 import BagReader
@@ -203,9 +204,12 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
 
 def streams_of(recording: SimulatedRecording) -> dict[str, live.Stream]:
     """What each sensor saw, to and fro."""
-    frames = {sensor.pose.sensor: [f.skeletons for f in recording.frames if f.sensor == sensor.pose.sensor]
-              for sensor in recording.sensors}  # fmt: skip
-    return {s.pose.sensor: live.Stream(frames[s.pose.sensor], s.clock, back=True) for s in recording.sensors}
+    found = {}
+    for sensor in recording.sensors:
+        name = sensor.pose.sensor
+        frames = [frame.skeletons for frame in recording.frames if frame.sensor == name]
+        found[name] = live.Stream(frames, sensor.clock, back=True)
+    return found
 
 
 class Ear(live.Bench):
@@ -218,9 +222,8 @@ class Ear(live.Bench):
 
     def on_diagnostics(self, message: Any, _info: Any = None) -> None:
         super().on_diagnostics(message)
-        for name, (_, status) in self.statuses.items():
-            if status.name == message.status[0].name and status.level and status.text.startswith("too slow"):
-                self.warnings[name] += 1
+        for status in statuses(message):
+            self.warnings[status.node] += status.level > 0 and status.text.startswith("too slow")
 
 
 def run_live(filter_name: str, recording: SimulatedRecording, people: int, seconds: float) -> dict[str, Any]:
@@ -276,7 +279,7 @@ def figures_of(ear: Ear, seconds: float) -> dict[str, Any]:
         "delay ms, median of each quarter": [round(float(np.median(each)), 1) for each in quarters if len(each)],
         "delay ms, 99 % of each quarter": [round(float(np.percentile(each, 99)), 1) for each in quarters if len(each)],
         "dropped and lost": dropped,
-        "seconds in which diagnostics said that it is too slow": dict(ear.warnings),
+        "seconds in which diagnostics said that it is too slow": dict(+ear.warnings),
         "association": {key: value for key, value in ear.values("fusion").items() if key.startswith("association")},
     }
 

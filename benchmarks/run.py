@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from common import DATA
+
 FOLDER = Path(__file__).resolve().parent
-DATA = Path(os.environ.get("BODY_TRACKING_DATA", FOLDER.parent.parent / "shared" / "data"))
 LEFT_OUT = (2, 77)
 """Exit codes of a benchmark that found that it cannot run here."""
 
@@ -78,12 +79,12 @@ BENCHMARKS = (
         recordings("imu"),
         1,
     ),
-    Benchmark("people", "who is who: crossings, two real people, six people live", PAIRS, 15),
+    Benchmark("people", "who is who: crossings, two real people, six people live", PAIRS, 10),
     Benchmark(
         "accuracy",
         "errors of one sensor, of the thesis's methods and of this package, on simulated people",
         NOTHING,
-        300,
+        120,
         "--seeds 2 --layout-seeds 1 --sensitivity-seeds 1",
     ),
     Benchmark(
@@ -99,11 +100,11 @@ BENCHMARKS = (
         "imu_and_camera",
         "inertial sensors on both wrists beside one Kinect, against the Kinect alone",
         NOTHING,
-        60,
+        40,
         "--seeds 1",
     ),
     Benchmark(
-        "imu_only", "arm angles of seven inertial sensors without a camera", NOTHING, 60, "--motions reaching,punching"
+        "imu_only", "arm angles of seven inertial sensors without a camera", NOTHING, 25, "--motions reaching,punching"
     ),
     Benchmark(
         "imu_faults",
@@ -122,7 +123,7 @@ BENCHMARKS = (
         "simulated_pairs",
         "statistics of real pairs of sensors beside simulated ones; writes docs/simulator.md",
         PAIRS,
-        3,
+        4,
     ),
     Benchmark("latency", "delay from capture to angles through the live graph, beside bare relays", NOTHING, 1),
     Benchmark("four_sensors", "four sensors live with `ekf`: frames lost, processor time, delay", NOTHING, 1),

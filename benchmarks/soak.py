@@ -43,7 +43,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from body_tracking import graph
+from body_tracking import dds, graph
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import FloatArray
@@ -89,6 +89,7 @@ class Ear(live.Ear):
     """Hears a reference sensor, the angles and the diagnostics."""
 
     def __init__(self, sensor: str) -> None:
+        dds.prepare()
         super().__init__("soak_bench")
         self.sent: dict[bytes, int] = {}
         self.latencies: list[float] = []

@@ -139,8 +139,8 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     subprocess.run([*sender, "--replay", str(folder / "bag"), "--sensor", "nobody"], stderr=subprocess.DEVNULL)
     lead = LEAD + LEAD_FACTOR * (time.monotonic() - begun)
     ports = {name: _PORT + k for k, name in enumerate(names)}
-    common_values = {"backend": "network", "address": hosts.INSIDE, "key_file": str(key)}
-    values = {f"{name}_skeleton": {**common_values, "port": port} for name, port in ports.items()}
+    network = {"backend": "network", "address": hosts.INSIDE, "key_file": str(key)}
+    values = {f"{name}_skeleton": {**network, "port": port} for name, port in ports.items()}
     parameters = live.parameters_file(folder / "parameters.yaml", values)
     up = live.up_command("--filter", options.filter, "--sensors", ",".join(names), "--params-file", parameters)
     up += ["--calibration", str(folder / "received.yaml"), "--record", str(folder / "live")]
