@@ -17,9 +17,9 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import FILTERS
 from body_tracking.graph import EXECUTABLES, TOPICS, GraphOptions, NodeSpec, all_nodes_for, nodes_for
 from body_tracking.kinematics.positional import ANGLE_NAMES
+from body_tracking.node_parameters import parameters_for
 from body_tracking.parameters import ParameterError
 from body_tracking.recording.rosbag2 import is_known
-from body_tracking.up import parameters_for
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH = ROOT / "launch" / "two_kinects.launch.py"

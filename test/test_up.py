@@ -26,24 +26,26 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from body_tracking import cli, graph  # noqa: E402
-from body_tracking.calibration.online import CalibrationParameters  # noqa: E402
 from body_tracking.calibration.result import CalibrationResult, SensorQuality  # noqa: E402
 from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.cdr import decode_skeletons  # noqa: E402
-from body_tracking.fusion.fusion import FusionParameters  # noqa: E402
 from body_tracking.fusion.people import PeopleParameters  # noqa: E402
 from body_tracking.fusion.subject import ALL  # noqa: E402
 from body_tracking.graph import GraphOptions  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
-from body_tracking.parameters import SECTION, ParameterError  # noqa: E402
+from body_tracking.node_parameters import parameters_for  # noqa: E402
+from body_tracking.parameters import (  # noqa: E402
+    SECTION,
+    ParameterError,
+    Value,
+)
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.simulation.bags import write_bag  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, lanes, simulate  # noqa: E402
 from body_tracking.skeleton import NANOSECONDS  # noqa: E402
-from body_tracking.up import parameters_for  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
@@ -124,7 +126,7 @@ def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
         each.close()
 
 
-PATIENT = {
+PATIENT: dict[str, dict[str, Value]] = {
     "calibration": {"activation_delay": 5.0},
     "fusion": {"max_wait": 1.0},
     "skeleton_filter": {"order_wait": 1.0, "predict_after": 1000.0},
@@ -142,13 +144,7 @@ def patiently(folder: Path) -> tuple[str | Path, ...]:
 
 def patient(**settings: Any) -> ReplaySettings:
     """The same for a replay."""
-    return ReplaySettings(
-        ("kinect1", "kinect2"),
-        calibration=CalibrationParameters(**PATIENT["calibration"]),
-        fusion=FusionParameters(**PATIENT["fusion"]),
-        **PATIENT["skeleton_filter"],
-        **settings,
-    )
+    return ReplaySettings(("kinect1", "kinect2"), parameters=PATIENT, **settings)
 
 
 def reference_frames(bag: Path) -> int:

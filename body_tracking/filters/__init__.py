@@ -84,9 +84,20 @@ def parameter_classes() -> dict[str, type[Any]]:
     return {prefix: _from(module, name) for module, _, name, prefix in _FILTERS.values()}
 
 
+def _row(name: str) -> tuple[str, str, str, str]:
+    if name not in _FILTERS:
+        error: type[Exception] = _from("linear", "FilterError")
+        raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
+    return _FILTERS[name]
+
+
 def parameter_prefix(name: str) -> str:
-    """The prefix of the parameters of a filter; see :func:`parameter_classes`."""
-    return _FILTERS[name][3]
+    """The prefix of the parameters of a filter; see :func:`parameter_classes`.
+
+    Raises:
+        FilterError: an unknown name.
+    """
+    return _row(name)[3]
 
 
 def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
@@ -99,14 +110,11 @@ def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
     Raises:
         FilterError: an unknown name, an unknown parameter, a value out of range.
     """
-    if name not in _FILTERS:
-        error: type[Exception] = _from("linear", "FilterError")
-        raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
-    module, filter_name, parameters_name, _ = _FILTERS[name]
+    module, filter_name, parameters_name, _ = _row(name)
     parameter_class = _from(module, parameters_name)
     unknown = parameters.keys() - {item.name for item in fields(parameter_class)}
     if unknown:
-        error = _from("linear", "FilterError")
+        error: type[Exception] = _from("linear", "FilterError")
         raise error(f"filter {name}: unknown parameter(s) {', '.join(sorted(unknown))}")
     made = _from(module, filter_name)
     settings = parameter_class(**parameters)

@@ -169,6 +169,10 @@ class StageNode(GraphNode):
                 self.send(publisher, cdr, output.stamp_ns, self.sent_ns)
             elif self.sent_ns is None or not self.is_stale(publisher.topic_name, self.sent_ns):
                 publisher.publish(cdr)
+        self.log_events()
+
+    def log_events(self) -> None:
+        """Write what the stage has to say to the log."""
         while self.stage.events:
             self.get_logger().info(self.stage.events.pop(0))
 
@@ -195,7 +199,9 @@ class StageNode(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """The stage's own."""
-        return self.stage.state(self.now_ns())
+        found = self.stage.state(self.now_ns())
+        self.log_events()
+        return found
 
     def close(self) -> None:
         """Save the last state."""

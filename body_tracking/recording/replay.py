@@ -100,6 +100,7 @@ class ReplaySettings:
         Raises:
             BodyTrackingError: they do not go together.
         """
+        specs = graph.nodes_for(self.options())
         prefix = parameter_prefix(self.filter_name)
         people = asdict(self.people)
         own: dict[str, dict[str, Any]] = {
@@ -110,7 +111,7 @@ class ReplaySettings:
             "joint_angles": {"subject": self.people.subject, "people": self.people.people},
         }
         found = {}
-        for spec in graph.nodes_for(self.options()):
+        for spec in specs:
             if spec.name in STAGES:
                 given = {**spec.defaults, **own[spec.name], **spec.parameters, "reference": self.reference}
                 given |= self.parameters.get(spec.name, {})

@@ -12,7 +12,6 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from body_tracking.imu_tracking import ImuSettings  # noqa: E402
 from running import RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -153,7 +152,7 @@ def test_pronation_follows_the_truth_that_no_skeleton_camera_sees(wrists: Wrists
 
 
 def test_offline_gives_the_angles_that_the_graph_gave(wrists: Wrists, tmp_path: Path) -> None:
-    settings = ReplaySettings(("kinect1",), filter_name="ekf", imus=ImuSettings(FOREARMS), orientations=FOREARMS)
+    settings = ReplaySettings(("kinect1",), filter_name="ekf", imus=FOREARMS)
     replay(wrists.bag, tmp_path / "offline", settings)
     with BagReader(tmp_path / "offline") as reader:
         first = next(reader.messages([graph.joint_states_topic("body1")]))

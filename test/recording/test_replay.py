@@ -28,9 +28,10 @@ from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import ParameterError
-from body_tracking.recording import replay as replay_module
-from body_tracking.recording import stages
-from body_tracking.recording.replay import Downstream, ForkedDownstream, ReplayError, ReplaySettings, replay
+from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.recording import forked
+from body_tracking.recording.forked import Downstream, ForkedDownstream
+from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.kinect import KinectErrors
@@ -89,7 +90,7 @@ def test_everything_that_the_graph_publishes_is_in_the_new_bag(replayed_wave: Pa
 
 
 def test_the_same_bag_gives_the_same_messages(replayed_wave: Path, wave: Path, tmp_path: Path) -> None:
-    replay(wave, tmp_path / "again", ReplaySettings(()))
+    replay(wave, tmp_path / "again", ReplaySettings())
     assert contents(tmp_path / "again") == contents(replayed_wave)
 
 
@@ -97,10 +98,10 @@ def test_the_same_bag_gives_the_same_messages(replayed_wave: Path, wave: Path, t
 def test_one_process_and_two_give_the_same_messages(
     wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
 ) -> None:
-    settings = ReplaySettings((), filter_name=filter_name)
+    settings = ReplaySettings(filter_name=filter_name)
     reports = {}
     for stage in (Downstream, ForkedDownstream):
-        monkeypatch.setattr(replay_module, "start_downstream", stage)
+        monkeypatch.setattr(forked, "start_downstream", stage)
         reports[stage] = replay(wave, tmp_path / stage.__name__, settings)
     assert contents(tmp_path / "Downstream") == contents(tmp_path / "ForkedDownstream")
     assert reports[Downstream].counters == reports[ForkedDownstream].counters
@@ -121,23 +122,28 @@ def test_the_other_process_does_not_take_down_what_it_inherits(
     wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Collecting(Downstream):
-        def finish(self) -> stages.Written:
+        def finish(self, at_ns: int) -> forked.Written:
             gc.collect()
-            return super().finish()
+            return super().finish(at_ns)
 
-    monkeypatch.setattr(stages, "Downstream", Collecting)
-    monkeypatch.setattr(replay_module, "start_downstream", ForkedDownstream)
+    monkeypatch.setattr(forked, "Downstream", Collecting)
+    monkeypatch.setattr(forked, "start_downstream", ForkedDownstream)
     notes = tmp_path / "notes"
     thresholds = gc.get_threshold()
     gc.set_threshold(10**9)  # the garbage is still there at the fork
     try:
         Owner(notes)
-        replay(wave, tmp_path / "out", ReplaySettings(()))
+        replay(wave, tmp_path / "out", ReplaySettings())
     finally:
         gc.set_threshold(*thresholds)
     assert gc.isenabled()
     gc.collect()
     assert notes.read_text() == f"{os.getpid()}\n"
+
+
+def job(out: Path, **settings: str) -> forked.Job:
+    chosen = ReplaySettings(("kinect1",), **settings)  # type: ignore[arg-type]
+    return forked.Job(chosen.values(), out, {}, overwrite=False, model_covariance=False)
 
 
 def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,12 +152,12 @@ def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytes
             time.sleep(0.2)  # until more has come, which stays unread
             os._exit(7)
 
-    monkeypatch.setattr(stages, "Downstream", Ending)
-    stage = ForkedDownstream(ReplaySettings(("kinect1",)), tmp_path / "out", {}, overwrite=False)
+    monkeypatch.setattr(forked, "Downstream", Ending)
+    stage = ForkedDownstream(job(tmp_path / "out"))
     for _ in range(300):
         stage.take(graph.FUSED, b"", 0)
     with pytest.raises(BagError, match="ended with code 7"):
-        stage.finish()
+        stage.finish(0)
 
 
 MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.segments_topic("body1"))
@@ -160,7 +166,7 @@ MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.segments_topi
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     out = tmp_path_factory.mktemp("extended") / "out"
-    replay(wave, out, ReplaySettings((), filter_name="ekf", convention="isb"))
+    replay(wave, out, ReplaySettings(filter_name="ekf", convention="isb"))
     return out
 
 
@@ -184,7 +190,7 @@ def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed_wav
 def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else_changes(
     extended: Path, wave: Path, tmp_path: Path
 ) -> None:
-    settings = ReplaySettings((), filter_name="ekf", convention="isb", model_covariance=True)
+    settings = ReplaySettings(filter_name="ekf", convention="isb", model_covariance=True)
     report = replay(wave, tmp_path / "whole", settings)
     whole = contents(tmp_path / "whole")
     assert sum(raw.topic == graph.MODEL_COVARIANCE for raw in whole) == report.frames
@@ -193,7 +199,7 @@ def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else
 
 @pytest.mark.parametrize("filter_name", some(["schlagenhauf_ekf", "lkf_constant_velocity"]))
 def test_every_filter_gives_the_angles_of_a_model(wave: Path, tmp_path: Path, filter_name: str) -> None:
-    report = replay(wave, tmp_path / "out", ReplaySettings((), filter_name=filter_name, convention="model"))
+    report = replay(wave, tmp_path / "out", ReplaySettings(filter_name=filter_name, convention="model"))
     with BagReader(tmp_path / "out") as bag:
         assert bag.topics[ANGLES].count == bag.topics["/filtered/skeleton"].count == report.frames
         calibrating = report.counters.get("filter calibrating", 0)  # frames from which a filter learns the person
@@ -217,7 +223,7 @@ def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Pa
                 writer.write(raw.topic, raw.cdr, raw.log_time_ns)
             if raw.log_time_ns > end + NANOSECONDS // 2:
                 break
-    report = replay(tmp_path / "gap", tmp_path / "out", ReplaySettings((), filter_name="ekf"))
+    report = replay(tmp_path / "gap", tmp_path / "out", ReplaySettings(filter_name="ekf"))
     with BagReader(tmp_path / "out") as bag:
         frames = [cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))[0] for raw in bag.messages([graph.FILTERED])]
         assert bag.topics[ANGLES].count == len(frames)
@@ -249,7 +255,7 @@ def test_the_angles_follow_the_truth(replayed_wave: Path, tmp_path: Path) -> Non
     errors = KinectErrors()
     clean = replace(KinectErrors.none(), white=errors.white, lost=errors.lost, delay=errors.delay)
     write_bag(simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=clean)), tmp_path / "clean")
-    replay(tmp_path / "clean", tmp_path / "out", ReplaySettings(()))
+    replay(tmp_path / "clean", tmp_path / "out", ReplaySettings())
     found, truth = elbows(tmp_path / "out")
     assert np.degrees(np.sqrt(np.nanmean((found - truth) ** 2, axis=1))).max() < 3.0
     for found, truth in zip(*elbows(replayed_wave), strict=True):
@@ -337,14 +343,14 @@ def test_a_failure_of_the_second_stage_is_told_and_leaves_no_bag(tmp_path: Path)
     (tmp_path / "file").write_text("")
     for stage in (Downstream, ForkedDownstream):
         with pytest.raises(BagError):
-            stage(ReplaySettings(("kinect1",)), tmp_path / "file" / "out", {}, overwrite=False)
+            stage(job(tmp_path / "file" / "out"))
         with pytest.raises(BodyTrackingError, match="no_such_filter"):
-            stage(ReplaySettings(("kinect1",), filter_name="no_such_filter"), tmp_path / "out", {}, overwrite=False)
-    broken = ForkedDownstream(ReplaySettings(("kinect1",)), tmp_path / "out", {}, overwrite=False)
+            stage(job(tmp_path / "out", filter_name="no_such_filter"))
+    broken = ForkedDownstream(job(tmp_path / "out"))
     with pytest.raises(BagError):
         for _ in range(1000):
             broken.take("/nobody", b"", 0)
-        broken.finish()
+        broken.finish(0)
     assert not (tmp_path / "out").exists()
 
 
@@ -370,7 +376,7 @@ def test_an_error_of_the_first_stage_leaves_the_bag_that_was_to_be_replaced(
 ) -> None:
     shutil.copytree(replayed_wave, tmp_path / "out")
     with pytest.raises(BodyTrackingError, match="kinect9"):
-        replay(BAG, tmp_path / "out", ReplaySettings((), reference="kinect9"), overwrite=True)
+        replay(BAG, tmp_path / "out", ReplaySettings(reference="kinect9"), overwrite=True)
     assert contents(tmp_path / "out") == contents(replayed_wave)
 
 
@@ -378,10 +384,10 @@ def test_an_error_while_frames_come_ends_both_processes(tmp_path: Path, monkeypa
     def fail(self: object, *frame: object) -> None:
         raise ReplayError("no more")
 
-    monkeypatch.setattr(replay_module, "start_downstream", ForkedDownstream)
-    monkeypatch.setattr(stages.Upstream, "push", fail)
+    monkeypatch.setattr(forked, "start_downstream", ForkedDownstream)
+    monkeypatch.setattr(OfflineRunner, "push", fail)
     with pytest.raises(ReplayError, match="no more"):
-        replay(BAG, tmp_path / "out", ReplaySettings(()))
+        replay(BAG, tmp_path / "out", ReplaySettings())
     assert not (tmp_path / "out").exists()
     assert not multiprocessing.active_children()
 

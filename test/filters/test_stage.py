@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from body_tracking.filtering import FilterSettings, FilterStage, PeopleStage, make_stage
 from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking import graph
 from body_tracking.calibration.result import level_pose
-from body_tracking.cdr import decode_skeletons
+from body_tracking.filters.stage import FilterSettings, PeopleFilter, PersonFilter, filter_of
 from body_tracking.fusion.people import PeopleParameters
 from body_tracking.fusion.subject import ALL
 from body_tracking.kinematics.upper_body import SEGMENTS
@@ -35,7 +35,7 @@ DELAYS = 0.02, 0.045
 SECONDS = 2.0
 
 Event = tuple[int, str, Skeleton]
-Staged = tuple[FilterStage, list[tuple[str, int]], list[Skeleton]]
+Staged = tuple[PersonFilter, list[tuple[str, int]], list[Skeleton]]
 
 
 @pytest.fixture(scope="module")
@@ -64,19 +64,20 @@ def staged(
     published: list[tuple[str, int]] = []
     skeletons: list[Skeleton] = []
 
-    def publish(topic: str, cdr: bytes, stamp_ns: int) -> None:
+    def publish(topic: str, payload: Any, stamp_ns: int) -> None:
         published.append((topic, stamp_ns))
         if topic == graph.FILTERED:
-            skeletons.extend(decode_skeletons(cdr) or ())
+            skeletons.extend(payload)
 
     chosen = FilterSettings("ekf", sensors=SENSORS, **settings)  # type: ignore[arg-type]
-    stage = FilterStage(chosen, publish, wanted)
+    stage = PersonFilter(chosen, publish, wanted)
     for sensor in SENSORS:
         stage.set_pose(level_pose(sensor))
     looked_ns = events[0][0]
     for now_ns, sensor, skeleton in events:
         if busy == 0.0:
-            stage.on_sensor(sensor, [skeleton], now_ns)
+            stage.hold(sensor, [skeleton], now_ns)
+            stage.poll(now_ns)
             continue
         while now_ns > looked_ns:
             stage.poll(looked_ns)
@@ -154,17 +155,17 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
     """Two who stand 2 m apart, of whom the second is hidden for a while."""
     whom = PeopleParameters(ALL, 3)
     ids = graph.bodies(whom.people)
-    told: dict[str, list[tuple[str, bytes]]] = {"together": [], "alone 1": [], "alone 2": []}
+    published: dict[str, list[tuple[str, Any]]] = {"together": [], "alone 1": [], "alone 2": []}
 
-    def stage_of(who: str) -> PeopleStage:
+    def stage_of(who: str) -> PeopleFilter:
         settings = FilterSettings(name, sensors=SENSORS, people=whom)
-        made = make_stage(settings, lambda topic, cdr, stamp_ns: told[who].append((topic, cdr)))
-        assert isinstance(made, PeopleStage)
+        made = filter_of(settings, lambda topic, payload, stamp_ns: published[who].append((topic, payload)))
+        assert isinstance(made, PeopleFilter)
         for sensor in SENSORS:
             made.set_pose(level_pose(sensor))
         return made
 
-    stages = {who: stage_of(who) for who in told}
+    stages = {who: stage_of(who) for who in published}
     by_sensor = stages["together"].by_sensor
     taken = events[:70]
     for number, (now_ns, sensor, one) in enumerate(taken):
@@ -176,15 +177,16 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
             if not bodies:
                 stages[who].poll(now_ns)
             elif by_sensor:
-                stages[who].on_sensor(sensor, bodies, now_ns)
+                stages[who].hold(sensor, bodies, now_ns)
+                stages[who].poll(now_ns)
             elif sensor == SENSORS[0]:  # as the fusion has them
                 placed = [_fused(body) for body in bodies]
                 stages[who].on_fused(placed, now_ns)
     filtered: dict[str, list[Skeleton]] = {
-        who: [each for topic, cdr in messages if topic == graph.FILTERED for each in decode_skeletons(cdr) or ()]
-        for who, messages in told.items()
+        who: [each for topic, payload in messages if topic == graph.FILTERED for each in payload]
+        for who, messages in published.items()
     }
-    assert any(len(decode_skeletons(cdr) or ()) == 2 for topic, cdr in told["together"] if topic == graph.FILTERED)
+    assert any(len(payload) == 2 for topic, payload in published["together"] if topic == graph.FILTERED)
     assert stages["together"].tracked == ids[:2]
     for number in (1, 2):
         mine = [each for each in filtered["together"] if each.body == number]
@@ -197,8 +199,9 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
         if by_sensor:
             state = graph.model_topics(ids[number - 1], several=True).state
             alone = graph.model_topics(ids[0], several=True).state
-            states = [cdr for topic, cdr in told["together"] if topic == state]
-            assert states == [cdr for topic, cdr in told[f"alone {number}"] if topic == alone] and len(states) > 20
+            states = [each.q.tolist() for topic, each in published["together"] if topic == state]
+            same_states = [each.q.tolist() for topic, each in published[f"alone {number}"] if topic == alone]
+            assert states == same_states and len(states) > 20
 
 
 def _fused(seen: Skeleton) -> Skeleton:
@@ -230,16 +233,17 @@ def test_orientations_alone_are_published_at_the_rate_of_predicted_frames() -> N
     times = np.arange(0.0, 3.0, 0.02)
     rotations = MODEL.forward(motion.configuration(times), person.lengths).rotations
     published: list[tuple[str, int]] = []
-    stage = FilterStage(
-        FilterSettings("ekf", sensors=SENSORS), lambda topic, cdr, stamp_ns: published.append((topic, stamp_ns))
+    stage = PersonFilter(
+        FilterSettings("ekf", sensors=SENSORS), lambda topic, payload, stamp_ns: published.append((topic, stamp_ns))
     )
-    linear = FilterStage(FilterSettings("lkf_constant_velocity"), lambda topic, cdr, stamp_ns: None)
+    linear = PersonFilter(FilterSettings("lkf_constant_velocity"), lambda topic, payload, stamp_ns: None)
     for time, posture in zip(times, rotations, strict=True):
         stamp_ns = START_NS + round(time * NANOSECONDS)
         for number, name in enumerate(("pelvis", "upper_trunk", "forearm_left")):
             rotation = posture[SEGMENTS.index(name)]
             measurement = SegmentOrientation(stamp_ns + number, name, name, rotation, 1e-4 * np.eye(3))
             stage.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
+            stage.poll(stamp_ns + NANOSECONDS // 100)
             linear.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
     stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
     assert len(stamps) > 40 and stamps == sorted(stamps)  # 30 Hz of the 1.9 s after the start
