@@ -4,7 +4,7 @@ The setting of Jatesiktat et al. (2018). Every run is a person who does one thin
 that errs like a real one (``calibrate_simulator.py``) and with an inertial sensor on each forearm that errs like a
 consumer's (``simulation.imus``: noise, biases, tissue that gives and follows the twist in part, a driver's own fusion).
 The filter ``ekf`` at its defaults gets the same frames twice: alone, and with the orientations of the forearms. Of
-these it is told only what an alignment would leave: the mounting to ``misalignment_stddev`` and the heading to
+these it gets only what an alignment would leave: the mounting to ``misalignment_stddev`` and the heading to
 ``heading_stddev``, drawn for each sensor; how the sensor errs else, as its driver states it.
 
 Errors of the joints of both arms in world, at the frames of the Kinect, from a second after the start of the filter:

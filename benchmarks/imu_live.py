@@ -130,7 +130,7 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    """The benchmark: 1 where a bar is missed, 2 where this machine cannot tell."""
+    """The benchmark: 1 where a bar is missed, 2 where this machine is too busy to judge."""
     parser = common.parser(__doc__)
     parser.add_argument("--seconds", type=float, default=40.0, metavar="S", help="to measure (default: %(default)g)")
     args = parser.parse_args()

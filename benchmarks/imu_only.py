@@ -165,11 +165,11 @@ def measure(run: Run) -> Figures:
     due = TPOSE_S
     begin = time.process_time()
     for received_ns, segment, k in events:
-        told = tracker.add(segment, sample(*worn[segment], k), received_ns)
-        if told.orientation is None:
+        found = tracker.add(segment, sample(*worn[segment], k), received_ns)
+        if found.orientation is None:
             continue
-        estimator.take_orientation(told.orientation)
-        now = (told.orientation.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS
+        estimator.take_orientation(found.orientation)
+        now = (found.orientation.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS
         if now < due:
             continue
         due += _EVERY_S

@@ -1,7 +1,7 @@
 """Orientation from raw inertial data against Vicon: a pendulum of three links, 174 s (Szczesna et al. 2016).
 
 Each link carries an inertial sensor, from whose rate, acceleration and magnetic field ``OrientationEstimator`` makes
-orientations, reading by reading; the gyroscopes' range is told. Fitted per link, as published comparisons do: one
+orientations, reading by reading; the gyroscopes' range is known. Fitted per link, as published comparisons do: one
 constant rotation from the sensor to the link, one from the earth to Vicon's frame (among them the heading).
 
 - ``total``: RMS of the angle of what is left between ours and Vicon's orientation, degrees; ``inclination``: of that
@@ -10,7 +10,7 @@ constant rotation from the sensor to the link, one from the earth to Vicon's fra
 
 Vicon's clock wanders against that of the sensors, by the same on each link (the three agree to some milliseconds): its
 frames were laid evenly over the rows, also where the log of the sensors stood still for 0.02 to 0.18 s. At 5 rad/s
-20 ms are 6 degrees. So for each link a course of the offset is taken that the two other links tell, by their own rates
+20 ms are 6 degrees. So for each link a course of the offset is estimated from the two other links, from their own rates
 against those of their own Vicon; the link itself has no say in it. ``1 offset`` beside it: the figures by one constant
 offset, of up to 0.1 s, that is fitted to the link itself. The bars are those of the former.
 
@@ -258,7 +258,7 @@ def hinge(upper: Fitted, lower: Fitted) -> float:
 
 
 def measure(recordings: list[Recording]) -> tuple[list[Link], list[Fitted]]:
-    """Each link by the clock that the others tell."""
+    """Each link with the clock offset that the others give."""
     constant = [one_offset(recording) for recording in recordings]
     links, fits = [], []
     for k, recording in enumerate(recordings):

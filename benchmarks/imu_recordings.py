@@ -7,10 +7,10 @@ through it. The arm never stops, so that each is a person's own as well as ours.
 xsens_upper_body: ISB angles of the segments of an Xsens MVN suit from its sensors' orientations, against the joint
 angles that the file states. Its own conventions, all taken from the file: its segments are zero in the T-pose (frame
 "tpose") and its joints in "tpose-isb", so that a constant rotation leads from one to the other, and a quarter turn of
-pronation to ours; the shoulder is told against the clavicle (jT4Shoulder) and in ZXY, so that both joints are put
-together and told as YXY against the thorax; and abduction is positive on both sides, so that x is the opposite on the
-right, y on the left. The file has no sensor orientation in the T-pose: the alignment that MVN found there is read off
-the first half second, and the rest is judged.
+pronation to ours; the shoulder is stated against the clavicle (jT4Shoulder) and in ZXY, so that both joints are
+combined and expressed as YXY against the thorax; and abduction is positive on both sides, so that x is the opposite on
+the right, y on the left. The file has no sensor orientation in the T-pose: the alignment that MVN found there is read
+off the first half second, and the rest is judged.
 """
 
 from __future__ import annotations
@@ -216,14 +216,14 @@ def xsens(path: Path) -> dict[str, Any]:
         rigid[segment] = float(np.degrees(np.sqrt((off[ALIGNED_FRAMES:] ** 2).sum(axis=1).mean())))
     angles = SegmentAngles(MODEL)
 
-    def told(rotations: FloatArray) -> FloatArray:
+    def angles_of(rotations: FloatArray) -> FloatArray:
         found, previous = [], None
         for each in rotations:
             previous = angles(0, each, None, previous)
             found.append(previous.position)
         return np.array(found)
 
-    from_sensors, from_segments = told(ours), told(theirs)
+    from_sensors, from_segments = angles_of(ours), angles_of(theirs)
     figures: dict[str, Any] = {"frames": count - ALIGNED_FRAMES, "sensor_to_segment_deg": rigid, "tpose_deg": tpose}
     for side in ("left", "right"):
         for name, stated in stated_angles(data, side).items():

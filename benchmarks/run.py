@@ -110,7 +110,7 @@ BENCHMARKS = (
         "imu_faults",
         "what becomes of angles when an inertial sensor fails, and whether it is named",
         NOTHING,
-        40,
+        20,
         "--seeds 1",
     ),
     Benchmark(

@@ -11,7 +11,7 @@ The angles are compared with those that the same chain makes offline of the same
 without the frames that were lost on the way, which shows what the loss alone does. Where the chain's own standard
 deviation of an angle exceeds 15 degrees in one of them, nothing is compared; nor from the beginning of the cut until a
 second after its end. The time of each capture is known, so are the errors of the stamps; the delay of the fastest
-frame, which no receiver can tell, is taken off.
+frame, which no receiver can know, is subtracted.
 
 The bars: the angles are as far from those of the recording as the loss alone puts them, and half a degree more at most
 (RMS of each; a quarter of a degree more all together); angles come again within a second after the link is back, and
