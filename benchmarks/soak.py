@@ -153,7 +153,9 @@ def simulated(folder: Path, imus: bool) -> Path:
     bag = folder / "bag"
     command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
     command += ["--seconds", str(BAG_SECONDS)]
-    subprocess.run(command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True)
+    subprocess.run(
+        command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True, stdout=subprocess.DEVNULL
+    )
     return bag
 
 
