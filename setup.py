@@ -85,7 +85,6 @@ setup(
         "c3d": ["ezc3d>=1.7"],
         "bench": ["psutil"],
         "examples": ["mujoco-core>=4"],
-        "peers": ["biorbd==1.12.4", "opensim==4.6"],
     },
     entry_points={
         "console_scripts": [

@@ -22,30 +22,22 @@ People, motions, layouts and seeds are none that anything was tuned on.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
 import contextlib
 import math
-import multiprocessing
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import common
 import numpy as np
 from accuracy import TEN, Run, run_ours
 from real_pairs import reversals, skeletons
-from scipy.stats import t as student
 
-from body_tracking.evaluation.metrics import Curve
-from body_tracking.evaluation.summary import nearest, read
+from body_tracking.evaluation.metrics import Curve, wrapped
+from body_tracking.evaluation.summary import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion
@@ -62,7 +54,6 @@ _SHOULDERS, _HIPS = (
     (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT),
     (Joint.HIP_LEFT, Joint.HIP_RIGHT),
 )
-_ROOT = Path(__file__).resolve().parent.parent
 _FIRST_SEED = 5000
 """Far from the seeds of every other benchmark."""
 
@@ -114,9 +105,16 @@ def _heading(points: FloatArray, pair: tuple[int, int]) -> FloatArray:
     return heading
 
 
-def _off(found: FloatArray, true: FloatArray) -> FloatArray:
-    away: FloatArray = np.remainder(found - true + np.pi, 2.0 * np.pi) - np.pi
-    return away
+def _against_truth(
+    angles: AngleSeries, truth: AngleSeries | None, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """(n, k) radians: errors of angles where the truth is known, and their stated standard deviations."""
+    assert truth is not None
+    matches = nearest(truth.stamps_ns, angles.stamps_ns)
+    here = matches >= 0
+    own = [angles.names.index(each) for each in names]
+    true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
+    return wrapped(angles.position[here][:, own] - true), angles.stddev[here][:, own]
 
 
 def of_sides(run: Run, name: str) -> dict[str, float]:
@@ -131,12 +129,12 @@ def of_sides(run: Run, name: str) -> dict[str, float]:
     inside = (times >= curve.span[0]) & (times <= curve.span[1])
     found = np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in fused])[inside]
     true = curve.at(times[inside])
-    turned = [_off(_heading(found, pair), _heading(true, pair)) for pair in (_SHOULDERS, _HIPS)]
-    twist = _off(turned[0], turned[1])
+    turned = [wrapped(_heading(found, pair) - _heading(true, pair)) for pair in (_SHOULDERS, _HIPS)]
+    twist = wrapped(turned[0] - turned[1])
     twist = twist[np.isfinite(twist)]
     reversed_ = np.abs(np.stack(turned)) > np.pi / 2
     return {
-        "twist": float(np.degrees(np.sqrt((twist**2).mean()))),
+        "twist": common.rms_deg(twist),
         "beyond 60": 100.0 * float((np.abs(twist) > np.pi / 3).mean()),
         "reversed": 100.0 * float(reversed_.any(axis=0).mean()),
         "joints": 1e3 * float(np.nanmean(np.linalg.norm(found - true, axis=-1)[:, TEN])),
@@ -151,18 +149,12 @@ def of_posture(run: Run, name: str) -> dict[str, float]:
         settings = ReplaySettings((), filter_name="ekf", filter_parameters=parameters)
         replay(Path(folder) / "in", Path(folder) / "out", settings)
         tracked = read(Path(folder) / "out")
-    angles, truth = tracked.angles, tracked.true_angles
-    assert truth is not None
-    matches = nearest(truth.stamps_ns, angles.stamps_ns)
-    here = matches >= 0
     figures: dict[str, float] = {}
     within: list[FloatArray] = []
     for label, names in FLEXIONS.items():
-        own = [angles.names.index(each) for each in names]
-        true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
-        away = _off(angles.position[here][:, own], true)
-        figures[label] = float(np.degrees(np.sqrt((away**2).mean())))
-        within.append(np.abs(away) <= 1.96 * angles.stddev[here][:, own])
+        away, stddev = _against_truth(tracked.angles, tracked.true_angles, names)
+        figures[label] = common.rms_deg(away)
+        within.append(np.abs(away) <= 1.96 * stddev)
     figures["within"] = 100.0 * float(np.concatenate(within, axis=1).mean())
     return figures
 
@@ -175,8 +167,8 @@ def of_real(file: Path, name: str) -> dict[str, float]:
         filtered = np.stack([each.positions for each in skeletons(Path(folder) / "out", FILTERED)])
     axes = left_right_axes(filtered)
     headings = np.arctan2(axes[..., 1], axes[..., 0])
-    twist = np.abs(_off(headings[:, 0], headings[:, 1]))
-    turns = np.abs(_off(headings[1:], headings[:-1]))
+    twist = np.abs(wrapped(headings[:, 0] - headings[:, 1]))
+    turns = np.abs(wrapped(headings[1:] - headings[:-1]))
     return {
         "reversals": float(sum(reversals(axes[:, half]) for half in (0, 1))),
         "turns over 30": float((turns > np.pi / 6).sum()),
@@ -189,14 +181,9 @@ def of_shipped(bag: Path, name: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder, SIDES[name]():
         replay(bag, Path(folder) / "out", ReplaySettings(()))
         tracked = read(Path(folder) / "out")
-    angles, truth = tracked.angles, tracked.true_angles
-    assert truth is not None
-    matches = nearest(truth.stamps_ns, angles.stamps_ns)
-    here = matches >= 0
-    names = [each for each in angles.names if each in truth.names]
-    own = [angles.names.index(each) for each in names]
-    true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
-    away, stddev = _off(angles.position[here][:, own], true), angles.stddev[here][:, own]
+    assert tracked.true_angles is not None
+    names = [each for each in tracked.angles.names if each in tracked.true_angles.names]
+    away, stddev = _against_truth(tracked.angles, tracked.true_angles, names)
     trunk = [each.startswith("trunk") for each in names]
     known = np.isfinite(stddev)
     return {
@@ -218,56 +205,57 @@ def _measure(job: tuple[str, Any, str]) -> dict[str, float]:
     return _FIGURES[part](run, name)
 
 
-def table(part: str, names: Sequence[str], runs: Sequence[Any], workers: int) -> None:
-    """Measure one part and print it."""
+def table(part: str, names: Sequence[str], runs: Sequence[Any], processes: int) -> tuple[dict[str, Any], str]:
+    """Measure one part; the figures of each mechanism, and a table of them."""
     jobs = [(part, run, name) for run in runs for name in names]
-    began, results = time.monotonic(), {}
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for number, (job, figures) in enumerate(zip(jobs, pool.map(_measure, jobs), strict=True), start=1):
-            results[job] = figures
-            left = (time.monotonic() - began) / number * (len(jobs) - number)
-            print(f"\r{number} of {len(jobs)}, {left / 60:.0f} min left ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
+    results = dict(zip(jobs, common.mapped(_measure, jobs, processes), strict=True))
     columns = list(next(iter(results.values())))
-    print(f"\n{part}: {len(runs)} recordings\n{'without':24}" + "".join(f"{each:>20}" for each in columns))
+    lines = [f"\n{part}: {len(runs)} recordings", f"{'without':24}" + "".join(f"{each:>20}" for each in columns)]
+    figures: dict[str, Any] = {}
     for name in names:
-        cells = []
+        cells, figures[name] = [], {}
         for column in columns:
             values = np.array([results[part, run, name][column] for run in runs])
-            cell = f"{values.mean():.1f}"
-            if name != ALL and len(runs) > 1:
-                apart = values - [results[part, run, ALL][column] for run in runs]
-                half = student.ppf(0.975, len(runs) - 1) * apart.std(ddof=1) / math.sqrt(len(runs))
-                cell += f" ({apart.mean():+.1f} ±{half:.1f})"
-            cells.append(f"{cell:>20}")
-        print(f"{name:24}" + "".join(cells))
+            mean, apart = (
+                common.Mean.of(each) for each in (values, values - [results[part, run, ALL][column] for run in runs])
+            )
+            figures[name][column] = {"mean": mean.value, "difference": apart}
+            change = f" ({apart.value:+.1f} ±{apart.half:.1f})" if name != ALL and len(runs) > 1 else ""
+            cells.append(f"{f'{mean.value:.1f}{change}':>20}")
+        lines.append(f"{name:24}" + "".join(cells))
+    return figures, "\n".join(lines)
 
 
-def main() -> None:
+def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=2, help="people for each motion and layout")
-    parser.add_argument("--layouts", default="2,3,4", help="of the sensors")
-    parser.add_argument("--motions", default="squat,punching,torso_twist,walking_and_turning", help="of the people")
-    parser.add_argument("--parts", default=",".join(_FIGURES), help="which tables (default: %(default)s)")
-    data = Path(os.environ.get("BODY_TRACKING_DATA", _ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    motions = ("squat", "punching", "torso_twist", "walking_and_turning")
+    parser = common.parser(__doc__, seeds=2, motions=motions, jobs=True, data=True)
+    parser.add_argument("--layouts", type=common.names, default=["2", "3", "4"], help="of the sensors (default: 2,3,4)")
+    parser.add_argument(
+        "--parts", type=common.names, default=list(_FIGURES), help=f"which tables of {','.join(_FIGURES)}"
+    )
     args = parser.parse_args()
     runs = [
         Run(motion, int(number), _FIRST_SEED + seed)
-        for motion in args.motions.split(",")
-        for number in args.layouts.split(",")
+        for motion in args.motions
+        for number in args.layouts
         for seed in range(args.seeds)
     ]
     pairs = sorted((args.data / "kinect_pairs").glob("p??_*.csv.gz"))
-    of_part = {"real": pairs, "shipped": [_ROOT / "bags" / name for name in SHIPPED]}
-    for part in args.parts.split(","):
+    of_part = {"real": pairs, "shipped": [common.ROOT / "bags" / name for name in SHIPPED]}
+    figures = {}
+    for part in args.parts:
         if not of_part.get(part, runs):
-            print(f"{part}: left out, no recordings in {args.data}")
+            common.progress(f"{part}: left out, no recordings in {args.data}")
             continue
-        table(part, list(POSTURE if part == "posture" else SIDES), of_part.get(part, runs), args.workers)
+        figures[part], text = table(
+            part, list(POSTURE if part == "posture" else SIDES), of_part.get(part, runs), args.jobs
+        )
+        if not common.prints_json(args):
+            print(text)
+    common.report(args, figures, lambda: None)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -22,22 +22,17 @@ docs/accuracy.md and its figure.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
 import json
-import multiprocessing
 import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import common
 import numpy as np
-from scipy.stats import t as student
+from common import Mean
+from offline_graph import OfflineGraph
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
 from body_tracking import graph
@@ -47,7 +42,7 @@ from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.recording.replay import FilterAndAngles, ReplaySettings, Upstream
+from body_tracking.recording.replay import ReplaySettings
 from body_tracking.simulation.kinect import KinectErrors, parameters
 from body_tracking.simulation.layouts import NUMBERS, layout
 from body_tracking.simulation.occlusion import cover
@@ -70,7 +65,6 @@ ANGLES = {
 _FIRST_SEED = 1000
 """Far from the subjects of the calibration."""
 _HIDDEN_FROM = 0.35
-_NORMAL = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,44 +102,21 @@ class Figures:
     frames: float
 
 
-class _Collector:
-    """The second half of the graph, in memory."""
-
-    def __init__(self, settings: ReplaySettings) -> None:
-        self.fused: list[Skeleton] = []
-        self.filtered: list[Skeleton] = []
-        self._rest = FilterAndAngles(settings, self._published)
-
-    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
-        """One message of the first half, or of a sensor."""
-        if topic == graph.FUSED:
-            self.fused += decode_skeletons(cdr) or ()
-        self._rest.take(topic, cdr, log_time_ns)
-
-    def finish(self) -> None:
-        self._rest.finish()
-
-    def _published(self, topic: str, cdr: bytes) -> None:
-        if topic == graph.FILTERED:
-            self.filtered += decode_skeletons(cdr) or ()
-
-
 def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skeleton], list[Skeleton]]:
     """Fused and filtered skeletons of the graph at its defaults."""
+    found: dict[str, list[Skeleton]] = {graph.FUSED: [], graph.FILTERED: []}
+
+    def take(topic: str, cdr: bytes, _at_ns: int) -> None:
+        if topic in found:
+            found[topic] += decode_skeletons(cdr) or ()
+
     sensors = tuple(sensor.pose.sensor for sensor in recording.sensors)
-    settings = ReplaySettings(sensors, filter_name=filter_name)
-    collector = _Collector(settings)
-    upstream = Upstream(settings)
-    upstream.sink = collector
-    upstream.start(recording.frames[0].received_ns)
+    whole = OfflineGraph(ReplaySettings(sensors, filter_name=filter_name), take, map(graph.skeleton_topic, sensors))
+    whole.start(recording.frames[0].received_ns)
     for frame in recording.frames:
-        cdr = encode_skeletons(frame.skeletons)
-        skeletons = decode_skeletons(cdr) or ()
-        collector.take(graph.skeleton_topic(frame.sensor), cdr, frame.received_ns)
-        upstream.push(frame.sensor, skeletons, frame.received_ns)
-    upstream.finish(recording.frames[-1].received_ns)
-    collector.finish()
-    return collector.fused, collector.filtered
+        whole.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
+    whole.finish(recording.frames[-1].received_ns)
+    return found[graph.FUSED], found[graph.FILTERED]
 
 
 def reported(recording: SimulatedRecording) -> list[Skeleton]:
@@ -211,7 +182,7 @@ def _figures(skeletons: Sequence[Skeleton], recording: SimulatedRecording, curve
     angles, stddev = _angles(skeletons)
     right, _ = _angles([_true_skeleton(each) for each in true])
     off = wrapped(angles - right)
-    covered = np.where(np.isfinite(stddev), np.abs(off) <= _NORMAL * stddev, np.nan)
+    covered = np.where(np.isfinite(stddev), np.abs(off) <= common.NORMAL * stddev, np.nan)
     rmse = {name: float(np.degrees(np.sqrt(np.nanmean(off[:, columns] ** 2)))) for name, columns in ANGLES.items()}
     cover_of = {name: _nanmean(covered[:, columns]) for name, columns in ANGLES.items()}
     delay = find_delay(Trajectory(times, found), curve, window=0.25)
@@ -262,39 +233,6 @@ def _measure(job: tuple[Run, tuple[str, ...]]) -> dict[str, Figures]:
     return figures_of(*job)
 
 
-def measure(jobs: Sequence[tuple[Run, tuple[str, ...]]], workers: int) -> list[dict[str, Figures]]:
-    """All runs, in their order, on several processors; shows how far it is."""
-    began, results = time.monotonic(), []
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        for number, result in enumerate(pool.imap(_measure, jobs, chunksize=1), start=1):
-            results.append(result)
-            left = (time.monotonic() - began) / number * (len(jobs) - number)
-            print(f"\r{number} of {len(jobs)} runs, {left / 60:.0f} min left ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    return results
-
-
-@dataclass(frozen=True, slots=True)
-class Mean:
-    """A mean over seeds, half the width of its 95 % confidence interval, and of how many it is."""
-
-    value: float
-    half: float
-    count: int
-
-    @classmethod
-    def of(cls, values: Iterable[float]) -> Mean:
-        """Over those that are finite."""
-        known_ones = np.array([value for value in values if np.isfinite(value)])
-        if len(known_ones) == 0:
-            return cls(float("nan"), float("nan"), 0)
-        if len(known_ones) == 1:
-            return cls(float(known_ones[0]), float("nan"), 1)
-        spread = float(known_ones.std(ddof=1)) / np.sqrt(len(known_ones))
-        half = float(student.ppf(0.975, len(known_ones) - 1)) * spread
-        return cls(float(known_ones.mean()), half, len(known_ones))
-
-
 Table = dict[str, dict[str, dict[str, Mean]]]
 """Motion (or another kind of run), method, figure."""
 
@@ -314,7 +252,7 @@ def table_of(kinds: Sequence[str], results: Sequence[Mapping[str, Figures]]) -> 
 def main_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
     """Every motion in layout 4."""
     runs = [Run(motion, seed=_FIRST_SEED + seed) for motion in motions for seed in range(seeds)]
-    return table_of([run.motion for run in runs], measure([(run, METHODS) for run in runs], workers))
+    return table_of([run.motion for run in runs], common.mapped(_measure, [(run, METHODS) for run in runs], workers))
 
 
 def layouts_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
@@ -323,7 +261,7 @@ def layouts_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
         Run(motion, number, _FIRST_SEED + seed) for motion in motions for number in NUMBERS for seed in range(seeds)
     ]
     kinds = [f"{run.motion} {run.layout}" for run in runs]
-    return table_of(kinds, measure([(run, (LKF2, DEFAULT)) for run in runs], workers))
+    return table_of(kinds, common.mapped(_measure, [(run, (LKF2, DEFAULT)) for run in runs], workers))
 
 
 def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
@@ -336,7 +274,7 @@ def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
         for seed in range(seeds)
     ]
     kinds = [f"{run.parameter} x{run.factor:g}" for run in runs]
-    return table_of(kinds, measure([(run, (LKF2, EKF, DEFAULT, OURS)) for run in runs], workers))
+    return table_of(kinds, common.mapped(_measure, [(run, (LKF2, EKF, DEFAULT, OURS)) for run in runs], workers))
 
 
 def show(table: Table, figures: Sequence[str]) -> None:
@@ -353,7 +291,7 @@ def show(table: Table, figures: Sequence[str]) -> None:
 
 # --- the page
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = common.ROOT / "docs"
 _HEAD = """# How accurate it is
 
 Simulated people before two Kinect v2 sensors that err like real ones ([simulator.md](simulator.md) says how like), of
@@ -424,17 +362,6 @@ def _unposed(motions: Iterable[str]) -> list[str]:
 
 def _people(table: Table) -> int:
     return max(row[DEFAULT]["error"].count for row in table.values())
-
-
-def _save(parts: Mapping[str, Table], path: Path) -> None:
-    plain = {
-        part: {
-            kind: {method: {name: asdict(mean) for name, mean in row.items()} for method, row in rows.items()}
-            for kind, rows in table.items()
-        }
-        for part, table in parts.items()
-    }
-    path.write_text(json.dumps(plain, indent=1) + "\n")
 
 
 def _read(path: Path) -> dict[str, Table]:
@@ -511,34 +438,32 @@ def _frame(column: int, row: int) -> Any:
 
 def main() -> int:
     """The benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="people per motion (default: 20)")
+    parser = common.parser(__doc__, seeds=20, motions=MOTIONS, jobs=True)
     parser.add_argument("--layout-seeds", type=int, default=4, metavar="N", help="of the layouts (default: 4)")
     parser.add_argument("--sensitivity-seeds", type=int, default=2, metavar="N", help="of each change (default: 2)")
-    parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: all")
-    parser.add_argument("--parts", default="main,layouts,sensitivity", metavar="A,B", help="default: %(default)s")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write all figures there; parts that it has from before stay in it"
+        "--parts",
+        type=common.names,
+        default=["main", "layouts", "sensitivity"],
+        metavar="A,B",
+        help="of main,layouts,sensitivity (default: all); parts that FILE has from before stay in it",
     )
     parser.add_argument("--write", action="store_true", help="write docs/accuracy.md and its figure")
     args = parser.parse_args()
-    motions = args.motions.split(",")
-    parts = _read(args.json) if args.json and args.json.exists() else {}
-    for part in filter(None, args.parts.split(",")):
+    parts = _read(args.out) if args.out and args.out.exists() else {}
+    everything = [item.name for item in fields(Figures)]
+    for part in args.parts:
         if part == "main":
-            parts[part] = main_part(args.seeds, args.workers, motions)
-            show(parts[part], [item.name for item in fields(Figures)])
+            parts[part] = main_part(args.seeds, args.jobs, args.motions)
         elif part == "layouts":
-            parts[part] = layouts_part(args.layout_seeds, args.workers, motions)
-            show(parts[part], ["error", "fixed"])
+            parts[part] = layouts_part(args.layout_seeds, args.jobs, args.motions)
         elif part == "sensitivity":
-            parts[part] = sensitivity_part(args.sensitivity_seeds, args.workers, [TWIST, "reaching"])
-            show(parts[part], ["error", "fixed"])
+            parts[part] = sensitivity_part(args.sensitivity_seeds, args.jobs, [TWIST, "reaching"])
         else:
             parser.error(f"no such part: {part}")
-    if args.json:
-        _save(parts, args.json)
+        if not common.prints_json(args):
+            show(parts[part], everything if part == "main" else ["error", "fixed"])
+    common.report(args, parts, lambda: None)
     if args.write:
         (DOCS / "accuracy.md").write_text(page(parts))
         if "layouts" in parts:

@@ -16,18 +16,14 @@ simulates anew. Everything else has been set from recordings of real pairs; our 
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import common
 import numpy as np
+from common import between
 from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 from thesis_pipeline import LKF2, run_thesis
@@ -39,7 +35,7 @@ from body_tracking.simulation.kinect import ANATOMICAL, KinectErrors, read_error
 from body_tracking.simulation.layouts import around, layout
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
 E1_MOTIONS = ("two_handed_wave", "slow_down", "torso_twist")
 E1: dict[Joint, tuple[float, float, float]] = {
@@ -188,11 +184,6 @@ def _filled(times: FloatArray, points: FloatArray) -> FloatArray:
 
 def _angles(p: FloatArray) -> FloatArray:
     """(n, 4) radians: elbows between the lines of forearm and upper arm, shoulders between upper arm and trunk."""
-
-    def between(a: FloatArray, b: FloatArray) -> FloatArray:
-        result: FloatArray = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))
-        return result
-
     columns = []
     down = p[:, Joint.SPINE_MID] - p[:, Joint.SPINE_SHOULDER]
     for part in ("elbow", "shoulder"):
@@ -301,11 +292,10 @@ def _spread(offsets: FloatArray) -> None:
 
 def main() -> int:
     """Print both tables; exit code 1 where table E.1 is off by more than 25 % anywhere."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__)
     parser.add_argument("--subjects", type=int, default=12, metavar="N", help="simulated subjects (default: 12)")
     parser.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit the offsets, and print them")
     parser.add_argument("--config", type=Path, metavar="FILE", help="errors as in config/simulator.yaml")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
     parser.add_argument("--write", action="store_true", help="write docs/simulator.md, but for its part on real pairs")
     args = parser.parse_args()
     errors = KinectErrors() if args.config is None else read_errors(args.config)
@@ -313,32 +303,31 @@ def main() -> int:
         for joint, row in zip(Joint, fit(errors, args.subjects, args.fit), strict=True):
             print(f'    "{joint.name}": ({", ".join(f"{value:.4f}" for value in row)}),')
     mae = table_e1(subjects_of(errors, args.subjects))
-    missed = show_e1(mae)
     tables = table_4_4(errors, args.subjects)
-    show_4_4(tables)
-    if args.json:
-        args.json.write_text(json.dumps({"E.1": mae.tolist(), "4.4": tables}, indent=1) + "\n")
+    common.report(args, {"E.1": mae, "4.4": tables}, lambda: (show_e1(mae), show_4_4(tables)))
     if args.write:
         write_page(mae, tables, args.subjects)
-    return int(missed > 0)
+    return int(off_by_too_much(mae).any())
 
 
-def show_e1(mae: FloatArray) -> int:
-    """Print table E.1; how many figures are off by more than they may be."""
+def off_by_too_much(mae: FloatArray) -> BoolArray:
+    """(10, 3) which figures of table E.1 are off by more than they may be."""
+    return np.abs(mae / np.array(list(E1.values())) - 1.0) > WITHIN
+
+
+def show_e1(mae: FloatArray) -> None:
+    """Print table E.1."""
     print(f"\ntable E.1, LKF2, MAE in mm: simulated (thesis)\n{'':16}{'x':>16}{'y':>16}{'z':>16}")
-    missed = 0
-    for joint, row in zip(TEN, mae, strict=True):
-        hers = E1[Joint(joint)]
-        off = [abs(own / other - 1.0) > WITHIN for own, other in zip(row, hers, strict=True)]
-        missed += sum(off)
+    far = off_by_too_much(mae)
+    for (joint, hers), row, marks in zip(E1.items(), mae, far, strict=True):
         cells = (
-            f"{own:7.1f} ({other:5.1f}){'*' if far else ' '}" for own, other, far in zip(row, hers, off, strict=True)
+            f"{own:7.1f} ({other:5.1f}){'*' if mark else ' '}"
+            for own, other, mark in zip(row, hers, marks, strict=True)
         )
-        print(f"{Joint(joint).name.lower():16}" + " ".join(cells))
+        print(f"{joint.name.lower():16}" + " ".join(cells))
     means = np.array(list(E1.values())).mean(axis=0)
     print(f"{'mean':16}" + " ".join(f"{a:7.1f} ({b:5.1f}) " for a, b in zip(mae.mean(axis=0), means, strict=True)))
-    print(f"{missed} of 30 are off by more than {WITHIN:.0%}")
-    return missed
+    print(f"{far.sum()} of 30 are off by more than {WITHIN:.0%}")
 
 
 def table_4_4(errors: KinectErrors, subjects: int) -> dict[str, dict[str, list[list[float]]]]:
@@ -371,7 +360,7 @@ def show_4_4(tables: dict[str, dict[str, list[list[float]]]]) -> None:
     print(f"(3D errors of {JOINT_ERROR[0]:.0f} to {JOINT_ERROR[1]:.0f} mm are reported of one sensor)")
 
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "simulator.md"
+PAGE = common.ROOT / "docs" / "simulator.md"
 PAIRS = "## Real and simulated pairs"
 _HEAD = """# How like real sensors the simulated ones are
 
@@ -396,12 +385,12 @@ def write_page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]],
         "| joint | x | y | z |",
         "|---|---:|---:|---:|",
     ]
-    for joint, row in zip(TEN, mae, strict=True):
-        cells = []
-        for own, hers in zip(row, E1[Joint(joint)], strict=True):
-            mark = "**" if abs(own / hers - 1.0) > WITHIN else ""
-            cells.append(f"{mark}{own:.1f}{mark} ({hers:.1f})")
-        lines.append(f"| {Joint(joint).name.lower()} | {' | '.join(cells)} |")
+    for (joint, theirs), row, far in zip(E1.items(), mae, off_by_too_much(mae), strict=True):
+        cells = (
+            f"{(mark := '**' * bool(is_far))}{own:.1f}{mark} ({hers:.1f})"
+            for own, hers, is_far in zip(row, theirs, far, strict=True)
+        )
+        lines.append(f"| {joint.name.lower()} | {' | '.join(cells)} |")
     lines += [
         "",
         "## Table 4.4",

@@ -13,45 +13,27 @@ later one even so has no output of its own: the filter takes the later ones agai
 the recording and on the machine, which holds sensors and filter up; the filter counts them.
 
 The bars: no frame that a sensor delivered is lost or refused, and the filter takes less than 30 % of one core. A filter
-that loses frames works less: what it takes is counted as if it had told of every one. The bars are meant for a machine
-that does nothing else; the table says what else it did, and what its host took from it.
+that loses frames works less: what it takes is counted as if it had an output for every one. The bars are meant for a
+machine that does nothing else; the table says what else it did, and what its host took from it.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
-import os
-import random
-import signal
-import struct
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-
+import common
+import live
 import numpy as np
 import psutil
-import rclpy
-import yaml
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from sensor_msgs.msg import JointState
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, SensorQuality
-from body_tracking.calibration.storage import save
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.parameters import SECTION
-from body_tracking.recording.qos import RELIABLE
 from body_tracking.sensors import RecordedFrame
 from body_tracking.simulation import scene
 from body_tracking.simulation.bags import write_bag
@@ -78,7 +60,6 @@ _DELAYS = ((0.022, 0.003), (0.034, 0.004), (0.028, 0.003), (0.045, 0.006))
 
 # Frames that the filter was given and did not take, by its counters.
 _REFUSED = ("too_late", "repeated_stamps", "alignment uncalibrated", "alignment other_clock", "malformed", "refused")
-_STAMP = struct.Struct("<iI")
 
 
 # --- the recording
@@ -111,97 +92,25 @@ def disorder(taken: Sequence[int]) -> int:
 # --- the measurement
 
 
-class Ear:
-    """Receives what the graph puts out, and its diagnostics."""
-
-    def __init__(self) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node("four_sensors_bench")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.outputs: dict[str, dict[int, int]] = {"model_state": {}, "joint_states": {}}
-        self.statuses: dict[str, tuple[float, dict[str, str]]] = {}
-        best_effort, reliable = to_profile(graph.SKELETON), to_profile(RELIABLE)
-        self.node.create_subscription(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, reliable)
-        for name, topic, qos in (
-            ("model_state", graph.MODEL_STATE, best_effort),
-            ("joint_states", graph.joint_states_topic(graph.DEFAULT_BODY), reliable),
-        ):
-            self.node.create_subscription(JointState, topic, self._taker(self.outputs[name]), qos, raw=True)
-
-    def _taker(self, received: dict[int, int]) -> Callable[[bytes], None]:
-        def on_message(cdr: bytes) -> None:
-            sec, nanosec = _STAMP.unpack_from(cdr, 4)
-            received.setdefault(sec * NANOSECONDS + nanosec, time.time_ns())
-
-        return on_message
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            name = status.name.split(":")[0]
-            self.statuses[name] = time.time(), {pair.key: pair.value for pair in status.values}
-
-    def until(self, wall: float, alive: Callable[[], bool]) -> None:
-        """Listen until a wall time."""
-        while time.time() < wall:
-            if not alive():
-                raise SystemExit("four_sensors: the graph ended too early")
-            self.executor.spin_once(timeout_sec=min(0.2, max(0.0, wall - time.time())))
-
-    def close(self) -> None:
-        rclpy.try_shutdown()
-
-
-@contextlib.contextmanager
-def running_up(command: Sequence[str], log_file: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A ``body_tracking up`` by its command line, ended as Ctrl-C does."""
-    with log_file.open("wb") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)  # it ends its nodes itself
-        try:
-            process.wait(30.0)
-        except subprocess.TimeoutExpired:
-            process.kill()  # and its nodes with it
-            process.wait()
-
-
-@contextlib.contextmanager
-def running_graph(folder: Path, recording: SimulatedRecording, start: float) -> Iterator[subprocess.Popen[bytes]]:
+def up_command(folder: Path, recording: SimulatedRecording, start: float) -> list[str]:
     """``body_tracking up`` with four sensor nodes that begin to play at a wall time."""
-    bag, calibration, file = folder / "bag", folder / "calibration.yaml", folder / "parameters.yaml"
+    bag = folder / "bag"
     write_bag(recording, bag)
-    names = [sensor.pose.sensor for sensor in recording.sensors]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500, 1.0) for name in names}
-    save(CalibrationResult(names[0], poses, clocks, quality), calibration)
-    values = {f"{name}_skeleton": {SECTION: {"file": str(bag), "start_time": start}} for name in names}
-    file.write_text(yaml.safe_dump(values), encoding="utf-8")
-    command = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", FILTER, "--sensors", ",".join(names)]
-    command += ["--params-file", str(file), "--calibration", str(calibration), "--log-dir", str(folder)]
-    with running_up(command, folder / "up.log") as process:
-        yield process
+    calibration = live.calibrated(folder / "calibration.yaml", poses, clocks, 1.0)
+    values = {f"{name}_skeleton": {"file": str(bag), "start_time": start} for name in poses}
+    parameters = live.parameters_file(folder / "parameters.yaml", values)
+    words = ["--filter", FILTER, "--sensors", ",".join(poses), "--params-file", parameters]
+    return live.up_command(*words, "--calibration", calibration, "--log-dir", folder)
 
 
-def nodes_of(pid: int) -> dict[str, psutil.Process]:
-    """The node processes of a graph by name."""
-    found = {}
-    for process in psutil.Process(pid).children():
-        with contextlib.suppress(psutil.Error):
-            words = process.cmdline()
-            names = [word.removeprefix("__node:=") for word in words if word.startswith("__node:=")]
-            if names:
-                found[names[0]] = process
-    return found
-
-
-def _cpu(process: psutil.Process) -> FloatArray:
-    """(2,) seconds of user and system time."""
-    times = process.cpu_times()
-    return np.array([times.user, times.system])
+def listen(ear: live.Ear, wall: float, alive: Callable[[], bool]) -> None:
+    """Until a wall time."""
+    while time.time() < wall:
+        if not alive():
+            raise SystemExit("four_sensors: the graph ended too early")
+        ear.executor.spin_once(timeout_sec=min(0.2, max(0.0, wall - time.time())))
 
 
 def _machine() -> FloatArray:
@@ -217,62 +126,56 @@ def measure(seconds: float) -> dict[str, Any]:
     start = time.time() + START_AFTER
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        up = stack.enter_context(running_graph(folder, recording, start))
-        ear = Ear()
+        command = up_command(folder, recording, start)
+        (up,) = stack.enter_context(live.processes([command], folder / "up.log"))
+        ear = live.Ear("four_sensors_bench", time.time_ns)
         stack.callback(ear.close)
+        ear.hear_diagnostics()
+        ear.time("model_state", graph.MODEL_STATE, qos=graph.SKELETON)
+        ear.time("joint_states", graph.joint_states_topic(graph.DEFAULT_BODY))
 
         def alive() -> bool:
             return up.poll() is None
 
-        ear.until(start + SETTLE, alive)
-        processes = nodes_of(up.pid)
+        listen(ear, start + SETTLE, alive)
+        processes = live.nodes_of(up.pid)
         everybody = {**processes, "up": psutil.Process(up.pid), "bench": psutil.Process()}
-        before = {name: _cpu(process) for name, process in everybody.items()}
+        before = {name: live.cpu_seconds(process) for name, process in everybody.items()}
         begin, machine = time.monotonic(), _machine()
-        ear.until(start + SETTLE + seconds, alive)
+        listen(ear, start + SETTLE + seconds, alive)
         elapsed = time.monotonic() - begin
-        used = {name: _cpu(process) - before[name] for name, process in everybody.items()}
+        used = {name: live.cpu_seconds(process) - before[name] for name, process in everybody.items()}
         busy, stolen = (_machine() - machine) / elapsed
         others = max(0.0, busy - sum(float(each.sum()) for each in used.values()) / elapsed)
         share = {name: float(used[name].sum()) / elapsed for name in processes}
         # The last frame is through, and everybody has reported once more.
-        ear.until(
-            start + max(frame.received_ns - RECEIVED_FROM_NS for frame in recording.frames) / NANOSECONDS + 2.5, alive
-        )
+        listen(ear, start + max(_delivered(frame) for frame in recording.frames) / NANOSECONDS + 2.5, alive)
     if "skeleton_filter" not in share or "skeleton_filter" not in ear.statuses:
         raise SystemExit("four_sensors: the filter node was not there")
     outputs = _delays(recording, taken, ear, start, SETTLE, SETTLE + seconds)
     due = sum(SETTLE * NANOSECONDS <= each < (SETTLE + seconds) * NANOSECONDS for each in taken)
-    told = min(1.0, outputs["model_state"]["count"] / due)
+    share_of_outputs = min(1.0, outputs["model_state"]["count"] / due)
     return {
         "seconds": round(elapsed, 1),
         "filter": FILTER,
         "sensors": _sensor_rows(recording, taken, ear),
-        "refused": _refused(ear),
+        "refused": {name: int(ear.number("skeleton_filter", name)) for name in _REFUSED},
         "late": {
             "delivered": disorder(taken),
-            **{name: _number(ear, "skeleton_filter", name) for name in ("frames", "late_frames", "taken_again")},
+            **{name: int(ear.number("skeleton_filter", name)) for name in ("frames", "late_frames", "taken_again")},
         },
         "outputs": outputs,
         "others_percent": round(100.0 * others, 1),
         "steal_percent": round(100.0 * stolen, 1),
         "cores": psutil.cpu_count(),
-        "filter_percent_of_all": round(100.0 * share["skeleton_filter"] / told, 1),
+        "filter_percent_of_all": round(100.0 * share["skeleton_filter"] / share_of_outputs, 1),
         "filter_user_s": round(float(used["skeleton_filter"][0]), 2),
         "filter_system_s": round(float(used["skeleton_filter"][1]), 2),
         "cpu_percent": {name: round(100.0 * value, 1) for name, value in sorted(share.items(), key=lambda i: -i[1])},
     }
 
 
-def _number(ear: Ear, node: str, key: str) -> int:
-    return int(ear.statuses.get(node, (0.0, {}))[1].get(key, 0))
-
-
-def _refused(ear: Ear) -> dict[str, int]:
-    return {name: _number(ear, "skeleton_filter", name) for name in _REFUSED}
-
-
-def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: Ear) -> dict[str, dict[str, float]]:
+def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: live.Ear) -> dict[str, dict[str, float]]:
     """Of each sensor: frames and delays."""
     rows = {}
     for sensor in recording.sensors:
@@ -281,8 +184,8 @@ def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: Ear) -> d
         delays = [(_delivered(recording.frames[k]) - taken[k]) / 1e6 for k in own]
         rows[name] = {
             "recorded": len(own),
-            "sent": _number(ear, f"{name}_skeleton", "published"),
-            "taken": _number(ear, "skeleton_filter", f"frames of {name}"),
+            "sent": int(ear.number(f"{name}_skeleton", "published")),
+            "taken": int(ear.number("skeleton_filter", f"frames of {name}")),
             "delay_median_ms": round(float(np.median(delays)), 1),
             "delay_max_ms": round(max(delays), 1),
         }
@@ -295,7 +198,7 @@ def _delivered(frame: RecordedFrame) -> int:
 
 
 def _delays(
-    recording: SimulatedRecording, taken: list[int], ear: Ear, start: float, begin: float, end: float
+    recording: SimulatedRecording, taken: list[int], ear: live.Ear, start: float, begin: float, end: float
 ) -> dict[str, dict[str, float]]:
     """Of each output, in the steady part: how many, and how long after capture and after delivery."""
     order = np.argsort(taken)
@@ -303,7 +206,7 @@ def _delays(
     delivered = np.array([_delivered(frame) for frame in recording.frames])[order]
     start_ns = round(start * NANOSECONDS)
     result = {}
-    for name, received in ear.outputs.items():
+    for name, received in ear.received.items():
         stamps = np.array(sorted(received)) - START_NS
         arrived = np.array([received[stamp] for stamp in sorted(received)]) - start_ns
         steady = (stamps >= begin * NANOSECONDS) & (stamps < end * NANOSECONDS)
@@ -363,25 +266,19 @@ def show(result: dict[str, Any]) -> None:
         f"  everything else on this machine: {result['others_percent']:.0f} % of one core, stolen by its host "
         f"{result['steal_percent']:.0f} %; it has {result['cores']}"
     )
-    for name, met in bars(result).items():
-        print(f"  {name}: {'met' if met else 'missed'}")
 
 
 def main() -> int:
     """The command: 0, or 1 when a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=30.0, help="steady seconds to measure (default 30)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser = common.parser(__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0, help="steady seconds to measure (default: %(default)g)")
     args = parser.parse_args()
     if not 1.0 <= args.seconds <= 600.0:
         parser.error(f"--seconds {args.seconds:g}: expected 1 to 600")
     result = measure(args.seconds)
     result["bars"] = bars(result)
-    if args.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-    return 0 if all(result["bars"].values()) else 1
+    common.report(args, result, lambda: show(result))
+    return common.verdicts(args, result["bars"])
 
 
 if __name__ == "__main__":

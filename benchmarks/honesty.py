@@ -1,7 +1,7 @@
 """Is the uncertainty of the extended filter true? Normalised errors over many simulated people.
 
 Each run draws a body, a motion, a noise level and dropouts, and filters what is measured at default settings; the
-filter is told neither body nor noise. Every error is divided by what the filter states of it. Where the filter is
+filter knows neither body nor noise. Every error is divided by what the filter states of it. Where the filter is
 honest, the normalised error squared e^2 / P of one coordinate follows chi-square(1), and that of all observed joint
 angles together (all but upper_body.UNOBSERVED, with their marginal covariance) chi-square(22), or chi-square(28) with
 the six coordinates of the base, which are no angles of a joint; 95 % of the time steps lie inside the 95 % band. "in
@@ -9,29 +9,22 @@ band" is the two-sided band, "below" the one-sided upper bound, "mean" the mean 
 more is too sure, less too modest. Beside that the classical test: the average over all runs at each time step against
 the band of that average (Bar-Shalom, Li and Kirubarajan 2001, chapter 5.4.2).
 
-  python benchmarks/honesty.py                              the issue's 200 runs
+  python benchmarks/honesty.py                              200 runs
   python benchmarks/honesty.py --runs 20 --set gate_probability=0.999
   python benchmarks/honesty.py --only 17                    that run alone, to look into
 """
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
+import functools
 import itertools
-import json
 import sys
 import time
-import traceback
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+import common
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -64,7 +57,7 @@ AFTER = 1.0
 """Seconds for which a dropout is looked after."""
 
 
-def new_filter(parameters: dict[str, float]) -> ExtendedKalmanFilter:
+def new_filter(parameters: Mapping[str, float]) -> ExtendedKalmanFilter:
     """The filter under test; the only place that knows how to make it."""
     # its people take poses at random over their ranges of motion: no posture is known of them
     return ExtendedKalmanFilter(EkfParameters(**({"posture": False} | parameters)))
@@ -80,7 +73,7 @@ class Settings:
     joint_factor: float
     dropouts: int
     outliers: float
-    parameters: dict[str, float]
+    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +110,7 @@ class Run:
     seconds_per_frame: float
 
 
-def simulate(number: int, settings: Settings) -> Run:
+def simulate(settings: Settings, number: int) -> Run:
     """One run from its number."""
     rng = np.random.default_rng([settings.seed, number])
     low, high = settings.noise
@@ -180,22 +173,13 @@ def simulate(number: int, settings: Settings) -> Run:
     )
 
 
-def simulate_all(
-    work: Callable[[int, Any], Any], numbers: list[int], settings: Any, jobs: int
-) -> Iterator[tuple[int, Any, str]]:
-    """(number, result, "") of each run as it ends, or (number, None, what went wrong); progress goes to stderr."""
-    begin = time.monotonic()
-    with ProcessPoolExecutor(jobs) as pool:
-        futures = {pool.submit(work, number, settings): number for number in numbers}
-        for done, future in enumerate(as_completed(futures), 1):
-            try:
-                result, problem = future.result(), ""
-            except Exception:  # whatever a filter raises is a finding, not the end of the benchmark
-                result, problem = None, traceback.format_exc()
-            left = (time.monotonic() - begin) / done * (len(numbers) - done)
-            print(f"\r{done}/{len(numbers)} runs, {left:4.0f} s left ", end="", file=sys.stderr, flush=True)
-            yield futures[future], result, problem
-    print(f"\r{len(numbers)} runs in {time.monotonic() - begin:.0f} s" + " " * 20, file=sys.stderr)
+def all_runs(
+    work: Callable[[Any, int], Any], settings: Any, numbers: Sequence[int], processes: int
+) -> tuple[list[Any], dict[int, str]]:
+    """The results of the runs in their order, and what went wrong in the others."""
+    found = common.mapped(functools.partial(common.attempt, functools.partial(work, settings)), numbers, processes)
+    broken = {number: problem for number, (_, problem) in zip(numbers, found, strict=True) if problem}
+    return [result for result, problem in found if not problem], broken
 
 
 def shares(normalised: FloatArray, dimension: int) -> tuple[float, float, float]:
@@ -229,9 +213,6 @@ def average_over_runs(runs: list[Run], pick: Callable[[Run], FloatArray], dimens
         "inside": float(((mean >= low) & (mean <= high)).mean()),
         "below": float((mean <= high).mean()),
         "median": float(np.median(mean)),
-        "mean": mean.round(4).tolist(),
-        "low": low.round(4).tolist(),
-        "high": high.round(4).tolist(),
     }
 
 
@@ -377,76 +358,40 @@ def show(summary: dict[str, Any]) -> None:
         print(f"in band in less than {100 * BAR:.0f} % of the time steps: " + ", ".join(summary["missed"]))
     else:
         print(f"all are in band in at least {100 * BAR:.0f} % of the time steps")
-
-
-def assignment(text: str) -> tuple[str, float]:
-    """``name=value`` of the command line."""
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected name=number") from None
+    if summary["broken_runs"]:
+        print(f"ended in an error: {', '.join(map(str, summary['broken_runs']))}")
 
 
 def main() -> int:
     """The benchmark; exit code 1 where the bar is missed or a run ended in an error."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, jobs=True)
     parser.add_argument("--runs", type=int, default=200, metavar="N", help="simulated runs (default: %(default)s)")
     parser.add_argument("--only", type=int, metavar="N", help="this run alone")
     parser.add_argument("--seed", type=int, default=0, help="of all chance (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a run (default: %(default)s)")
-    parser.add_argument(
-        "--noise", type=float, nargs=2, default=(5.0, 40.0), metavar=("LOW", "HIGH"),
-        help="mm, standard deviation per axis, log-uniform between (default: 5 40)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--joint-factor", type=float, default=1.0, metavar="F",
-        help="each joint's noise is that times 1/F to F, log-uniform (default: %(default)s)",
-    )  # fmt: skip
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a run (default: %(default)g)")
+    parser.add_argument("--noise", type=float, nargs=2, default=(5.0, 40.0), metavar=("LOW", "HIGH"),
+                        help="mm, standard deviation per axis, log-uniform between (default: 5 40)")  # fmt: skip
+    parser.add_argument("--joint-factor", type=float, default=1.0, metavar="F",
+                        help="each joint's noise is that times 1/F to F, log-uniform (default: 1)")  # fmt: skip
     parser.add_argument("--dropouts", type=int, default=3, metavar="N", help="at most so many (default: %(default)s)")
     parser.add_argument("--outliers", type=float, default=0.0, metavar="SHARE",
-                        help="of the joint samples, displaced by up to 1 m (default: %(default)s)")  # fmt: skip
-    parser.add_argument(
-        "--settle", type=float, nargs="+", default=[0.0, 1.0], metavar="S",
-        help="leave out the first S seconds; one table column each, the bar is for the first (default: 0 1)",
-    )  # fmt: skip
-    parser.add_argument("--set", type=assignment, action="append", default=[], metavar="NAME=VALUE",
-                        help="another value of a parameter of the filter (EkfParameters); may be repeated")  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, time series included")
-    parser.add_argument("--samples", type=Path, metavar="FILE.npz", help="write every normalised error there")
+                        help="of the joint samples, displaced by up to 1 m (default: 0)")  # fmt: skip
+    parser.add_argument("--settle", type=float, nargs="+", default=[0.0, 1.0], metavar="S",
+                        help="leave out the first S seconds; one column each, the bar is for the first")  # fmt: skip
+    common.add_set(parser)
     args = parser.parse_args()
-    settings = Settings(
-        args.seed, args.seconds, (1e-3 * args.noise[0], 1e-3 * args.noise[1]), args.joint_factor, args.dropouts,
-        args.outliers, dict(args.set),
-    )  # fmt: skip
-    new_filter(settings.parameters)  # a wrong parameter is told once, and now
+    noise = 1e-3 * args.noise[0], 1e-3 * args.noise[1]
+    settings = Settings(args.seed, args.seconds, noise, args.joint_factor, args.dropouts, args.outliers, dict(args.set))
+    new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
     numbers = [args.only] if args.only is not None else list(range(args.runs))
-    runs, broken = [], {}
-    for number, run, problem in simulate_all(simulate, numbers, settings, args.jobs):
-        if problem:
-            broken[number] = problem
-        else:
-            runs.append(run)
-    for number, problem in sorted(broken.items())[:3]:
-        print(f"run {number} ended in an error:\n{problem}", file=sys.stderr)
+    runs, broken = all_runs(simulate, settings, numbers, args.jobs)
+    for number, problem in itertools.islice(broken.items(), 3):
+        common.progress(f"run {number} ended in an error:\n{problem}")
     if not runs:
-        print("no run came to its end", file=sys.stderr)
-        return 1
-    runs.sort(key=lambda run: run.number)
+        raise SystemExit("no run came to its end")
     summary = summarise(runs, args.settle, args.seconds)
-    summary["broken_runs"] = sorted(broken)
-    show(summary)
-    if broken:
-        print(f"{len(broken)} runs ended in an error: {', '.join(map(str, sorted(broken)))}")
-    if args.json:
-        args.json.write_text(json.dumps(summary, indent=1))
-    if args.samples:
-        pieces = ("frame", "times", "still", "lost", "error", "stddev", "position", "velocity", *TOGETHER)
-        stacked = {what: np.concatenate([getattr(run, what) for run in runs]) for what in pieces}
-        number = np.concatenate([np.full(len(run.times), run.number) for run in runs])
-        noise = np.concatenate([np.full(len(run.times), run.noise) for run in runs])
-        np.savez_compressed(args.samples, names=NAMES, run=number, noise=noise, **stacked)
+    summary["broken_runs"] = list(broken)
+    common.report(args, summary, lambda: show(summary))
     return bool(summary["missed"] or broken)
 
 

@@ -2,22 +2,20 @@
 
 Knows only the standard library, so that its processes start at once. As a command:
 
-    hosts.py relay LOSS JITTER PID      link this host with that of a process; reads ``FROM TO`` (wall times of a cut)
-                                        on stdin, and ends with it
-    hosts.py shift SECONDS COMMAND...   run a command whose monotonic clock is so far ahead
+    hosts.py relay LOSS JITTER PORT...   pass datagrams on, both ways; reads ``FROM TO`` (wall times of a cut) on stdin
+    hosts.py shift SECONDS COMMAND...    run a command whose monotonic clock is so far ahead
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
 import heapq
 import os
 import random
 import select
 import signal
-import struct
+import socket
 import subprocess
 import sys
 import time
@@ -25,10 +23,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-OUTSIDE, INSIDE = "10.87.1.2", "10.87.1.1"
-"""Addresses of the far host and of this one."""
+OUTSIDE, RELAY_OUT, RELAY_IN, INSIDE = "10.87.1.2", "10.87.1.1", "10.87.2.1", "10.87.2.2"
+"""Addresses of the far host, of the relay on either side, and of this host."""
 
-_CLONE_NEWNET, _TUNSETIFF, _TUN_WITHOUT_INFO = 0x40000000, 0x400454CA, 0x1001
 _CLONE_NEWTIME = 0x80
 
 
@@ -57,54 +54,65 @@ def command(*words: object) -> list[str]:
 
 
 @contextlib.contextmanager
-def hosts(loss: float, jitter: float) -> Iterator[tuple[list[str], subprocess.Popen[bytes]]]:
-    """Another host and a link to it; for a process in a namespace of its own.
-
-    Args:
-        loss: probability that a packet is lost.
-        jitter: seconds by which a packet is held up at most; the times are uniform.
+def hosts() -> Iterator[tuple[list[str], list[str]]]:
+    """Two more hosts, the second one between the first and this one; for a process in a namespace of its own.
 
     Yields:
-        What to put before a command to run it on the far host, and the relay between, which takes the times of a cut.
-        Both end with this.
+        What to put before a command to run it on the far host, and on the one between. Both end with this.
     """
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-    holder = subprocess.Popen(["unshare", "--net", "sleep", "3600"])
-    between = None
+    _ip([], "link set lo up")
+    holders = [subprocess.Popen(["unshare", "--net", "sleep", "3600"]) for _ in range(2)]
     try:
+        outside, middle = (str(each.pid) for each in holders)
+        far, between = (["nsenter", "-t", pid, "-n"] for pid in (outside, middle))
         own, end = Path("/proc/self/ns/net").readlink(), time.monotonic() + 20.0
-        while Path(f"/proc/{holder.pid}/ns/net").readlink() == own:
+        while any(Path(f"/proc/{pid}/ns/net").readlink() == own for pid in (outside, middle)):
             if time.monotonic() > end:
                 raise SystemExit("hosts: no network namespace")
             time.sleep(0.01)
-        between = subprocess.Popen(
-            command("relay", loss, jitter, holder.pid), stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert between.stdout is not None
-        if not between.stdout.readline():
-            raise SystemExit("hosts: no link")
-        yield ["nsenter", "-t", str(holder.pid), "-n"], between
+        _ip([], f"link add inside type veth peer name relay1 netns {middle}")
+        _ip(between, f"link add relay0 type veth peer name outside netns {outside}")
+        for prefix, name, address in (
+            ([], "inside", INSIDE),
+            (between, "relay1", RELAY_IN),
+            (between, "relay0", RELAY_OUT),
+            (far, "outside", OUTSIDE),
+        ):
+            for words in (f"addr add {address}/24 dev {name}", f"link set {name} up", "link set lo up"):
+                _ip(prefix, words)
+        yield far, between
     finally:
-        for each in filter(None, (between, holder)):
+        for each in holders:
             each.kill()
             each.wait()
 
 
-def relay(loss: float, jitter: float, far: int) -> None:
-    """Pass IP packets on between this host and that of a process, until stdin ends; see :func:`hosts`."""
-    numbers, cut = random.Random(1), (0.0, 0.0)
-    inside = _interface("inside", INSIDE)
-    with Path(f"/proc/{far}/ns/net").open() as namespace:
-        if ctypes.CDLL(None, use_errno=True).setns(namespace.fileno(), _CLONE_NEWNET):
-            raise SystemExit(f"no network namespace: {os.strerror(ctypes.get_errno())}")
-    other_end = {inside: (outside := _interface("outside", OUTSIDE)), outside: inside}
-    print("linked", flush=True)
-    listened: list[Any] = [*other_end, sys.stdin]
-    waiting: list[tuple[float, int, int, bytes]] = []
+def _ip(prefix: Sequence[str], words: str) -> None:
+    subprocess.run([*prefix, "ip", *words.split()], check=True, capture_output=True)
+
+
+def relay(loss: float, jitter: float, ports: Sequence[int]) -> None:
+    """Pass datagrams on between the far host and the inner one, until stdin ends.
+
+    Args:
+        loss: probability that a packet is lost.
+        jitter: seconds by which a packet is held up at most; the times are uniform.
+        ports: to which the far host sends.
+    """
+    numbers = random.Random(1)
+    inner: dict[tuple[int, Any], socket.socket] = {}
+    ways: dict[socket.socket, tuple[socket.socket, Any]] = {}
+    outer: dict[socket.socket, int] = {}
+    cut = (0.0, 0.0)
+    for port in ports:
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.bind((RELAY_OUT, port))
+        outer[made] = port
+    waiting: list[tuple[float, int, socket.socket, bytes, Any]] = []
     count = 0
     while True:
         timeout = max(0.0, waiting[0][0] - time.time()) if waiting else 1.0
-        for each in select.select(listened, [], [], timeout)[0]:
+        for each in select.select([*outer, *ways, sys.stdin], [], [], timeout)[0]:
             if each is sys.stdin:
                 line = sys.stdin.readline()
                 if not line:
@@ -112,24 +120,25 @@ def relay(loss: float, jitter: float, far: int) -> None:
                 begin, end = line.split()
                 cut = float(begin), float(end)
                 continue
-            packet, now = os.read(each, 65535), time.time()
+            packet, source = each.recvfrom(65535)
+            if each in outer:
+                way = outer[each], source
+                if way not in inner:
+                    inner[way] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                    inner[way].bind((RELAY_IN, 0))
+                    ways[inner[way]] = each, source
+                through, target = inner[way], (INSIDE, outer[each])
+            else:
+                through, target = ways[each]
+            now = time.time()
             if numbers.random() < loss or cut[0] <= now < cut[1]:
                 continue
             count += 1
-            heapq.heappush(waiting, (now + numbers.uniform(0.0, jitter), count, other_end[each], packet))
+            heapq.heappush(waiting, (now + numbers.uniform(0.0, jitter), count, through, packet, target))
         while waiting and waiting[0][0] <= time.time():
-            _, _, through, packet = heapq.heappop(waiting)
+            _, _, through, packet, target = heapq.heappop(waiting)
             with contextlib.suppress(OSError):
-                os.write(through, packet)
-
-
-def _interface(name: str, address: str) -> int:
-    """A network interface of the present namespace whose packets this process reads and writes."""
-    made = os.open("/dev/net/tun", os.O_RDWR)
-    fcntl.ioctl(made, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _TUN_WITHOUT_INFO))
-    for words in (f"addr add {address}/24 dev {name}", f"link set {name} up", "link set lo up"):
-        subprocess.run(["ip", *words.split()], check=True)
-    return made
+                through.sendto(packet, target)
 
 
 def shift(seconds: float, words: Sequence[str]) -> int:
@@ -150,7 +159,7 @@ def main() -> int:
     what, first, *rest = sys.argv[1:]
     if what == "shift":
         return shift(float(first), rest)
-    relay(float(first), float(rest[0]), int(rest[1]))
+    relay(float(first), float(rest[0]), [int(port) for port in rest[1:]])
     return 0
 
 

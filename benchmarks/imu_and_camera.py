@@ -4,7 +4,7 @@ The setting of Jatesiktat et al. (2018). Every run is a person who does one thin
 that errs like a real one (``calibrate_simulator.py``) and with an inertial sensor on each forearm that errs like a
 consumer's (``simulation.imus``: noise, biases, tissue that gives and follows the twist in part, a driver's own fusion).
 The filter ``ekf`` at its defaults gets the same frames twice: alone, and with the orientations of the forearms. Of
-these it is told only what an alignment would leave: the mounting to ``misalignment_stddev`` and the heading to
+these it gets only what an alignment would leave: the mounting to ``misalignment_stddev`` and the heading to
 ``heading_stddev``, drawn for each sensor; how the sensor errs else, as its driver states it.
 
 Errors of the joints of both arms in world, at the frames of the Kinect, from a second after the start of the filter:
@@ -26,17 +26,12 @@ in reaching and standing_still. The default takes others.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
-import multiprocessing
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import common
 import numpy as np
 from accuracy import KNOWN
 
@@ -63,7 +58,6 @@ KINECT, WRISTS, ALONE = "Kinect", "Kinect, wrists", "offsets, wrists"
 _FIRST_SEED = 4200
 _HIDDEN_FROM = 0.35
 _SETTLED_NS = NANOSECONDS
-_NORMAL = 1.959964
 LOWER, LOWER_HIDDEN, TURN = 15.0, 40.0, 10.0
 """Percent, percent and degrees: the bars."""
 _Z = np.array([0.0, 0.0, 1.0])
@@ -224,81 +218,73 @@ def _turn(q: FloatArray, true: FloatArray, lengths: FloatArray) -> FloatArray:
 
 def summary(figures: list[Figures]) -> dict[str, float]:
     """Over several runs: mean errors in mm, RMS of the forearms' rotation in degrees, its coverage."""
-    distance = np.concatenate([each.distance.reshape(-1) for each in figures])
-    fixed = np.concatenate([each.fixed.reshape(-1) for each in figures])
-    hidden = np.concatenate([each.hidden.reshape(-1) for each in figures])
-    turn = np.concatenate([each.turn.reshape(-1) for each in figures])
-    rotation = np.concatenate([each.rotation.reshape(-1) for each in figures])
-    stddev = np.concatenate([each.stddev.reshape(-1) for each in figures])
+    distance, fixed, hidden, turn, rotation, stddev = (
+        np.concatenate([getattr(each, name).ravel() for each in figures])
+        for name in ("distance", "fixed", "hidden", "turn", "rotation", "stddev")
+    )
     return {
         "all": 1e3 * float(distance.mean()),
         "hidden": 1e3 * float(distance[hidden].mean()) if hidden.any() else float("nan"),
         "fixed": 1e3 * float(fixed.mean()),
         "fixed, hidden": 1e3 * float(fixed[hidden].mean()) if hidden.any() else float("nan"),
         "share hidden": float(hidden.mean()),
-        "turn": float(np.degrees(np.sqrt((turn**2).mean()))),
-        "pronation": float(np.degrees(np.sqrt((rotation**2).mean()))),
-        "covered": float((np.abs(rotation) < _NORMAL * stddev).mean()),
+        "turn": common.rms_deg(turn),
+        "pronation": common.rms_deg(rotation),
+        "covered": float((np.abs(rotation) < common.NORMAL * stddev).mean()),
         "ms/frame": 1e3 * float(np.mean([each.seconds for each in figures])),
     }
 
 
 def main() -> int:
     """The benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="people per motion (default: 5)")
-    parser.add_argument("--motions", default=",".join(HELD_OUT), metavar="A,B", help="default: the held-out ones")
+    parser = common.parser(__doc__, seeds=5, motions=HELD_OUT, jobs=True)
     parser.add_argument("--azimuth", type=float, default=0.0, metavar="DEG", help="of the Kinect from the front")
     parser.add_argument("--no-magnetometer", action="store_true", help="headings that drift")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument("--raw", action="store_true", help="the figures of each run")
-    parser.add_argument("--set", default="", metavar="A=1,B=2", help="other parameters of the filter")
+    common.add_set(parser)
     args = parser.parse_args()
-    changes = dict(change.split("=") for change in args.set.split(",") if change)
-    parameters = EkfParameters(**{name: json.loads(value) for name, value in changes.items()})
+    parameters = EkfParameters(**dict(args.set))
     runs = [
         Run(motion, _FIRST_SEED + seed, args.azimuth, not args.no_magnetometer, parameters)
-        for motion in args.motions.split(",")
+        for motion in args.motions
         for seed in range(args.seeds)
     ]
-    results: list[dict[str, Figures]] = []
-    begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
-        for number, result in enumerate(pool.imap(measure, runs), start=1):
-            results.append(result)
-            left = (time.monotonic() - begin) / number * (len(runs) - number)
-            print(f"\r{number} of {len(runs)} runs, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    parts: dict[str, list[int]] = {}
-    for number, run in enumerate(runs):
-        parts.setdefault(f"{run.motion} {run.seed}" if args.raw else run.motion, []).append(number)
-    parts["together"] = list(range(len(runs)))
-    for part, numbers in parts.items():
-        figures = show(part, [results[number] for number in numbers])
-    verdicts = {
-        f"error of the arms lower by {figures['all']:.1f} %, bar {LOWER:.0f} %": figures["all"] >= LOWER,
-        f"where hidden by {figures['hidden']:.1f} %, bar {LOWER_HIDDEN:.0f} %": figures["hidden"] >= LOWER_HIDDEN,
-        f"turn of the forearms {figures['turn']:.1f} deg RMS, bar {TURN:.0f}": figures["turn"] <= TURN,
-    }
-    for text, met in verdicts.items():
-        print("met    " if met else "MISSED ", text)
-    return 0 if all(verdicts.values()) else 1
+    results = common.mapped(measure, runs, args.jobs)
+    parts: dict[str, list[dict[str, Figures]]] = {}
+    for run, result in zip(runs, results, strict=True):
+        parts.setdefault(f"{run.motion} {run.seed}" if args.raw else run.motion, []).append(result)
+    parts["together"] = results
+    sums = {part: {way: summary([each[way] for each in own]) for way in own[0]} for part, own in parts.items()}
+    gains = gains_of(sums["together"])
+    common.report(args, sums, lambda: [show(part, sums[part], own) for part, own in parts.items()])
+    turn = sums["together"][WRISTS]["turn"]
+    return common.verdicts(
+        args,
+        {
+            f"error of the arms lower by {gains['all']:.1f} %, bar {LOWER:.0f} %": gains["all"] >= LOWER,
+            f"where hidden by {gains['hidden']:.1f} %, bar {LOWER_HIDDEN:.0f} %": gains["hidden"] >= LOWER_HIDDEN,
+            f"turn of the forearms {turn:.1f} deg RMS, bar {TURN:.0f}": turn <= TURN,
+        },
+    )
 
 
-def show(part: str, results: list[dict[str, Figures]]) -> dict[str, float]:
-    """Print the figures of some runs: how much lower errors are with wrist sensors (percent), and the turn then."""
-    sums = {way: summary([each[way] for each in results]) for way in results[0]}
+def gains_of(sums: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """How much lower errors are with wrist sensors, percent."""
+    before, after = sums[KINECT], sums[WRISTS]
+    return {name: 100.0 * (1.0 - after[name] / before[name]) for name in ("all", "hidden", "fixed", "fixed, hidden")}
+
+
+def show(part: str, sums: Mapping[str, Mapping[str, float]], results: Sequence[dict[str, Figures]]) -> None:
+    """Print the figures of some runs."""
     print(f"{part}")
     for way, figures in sums.items():
         print(f"  {way:15s}" + "".join(f"  {name} {value:7.2f}" for name, value in figures.items()))
-    before, after = sums[KINECT], sums[WRISTS]
-    gains = {name: 100.0 * (1.0 - after[name] / before[name]) for name in ("all", "hidden", "fixed", "fixed, hidden")}
-    counts: dict[str, int] = {}
-    for each in results:
-        for name in ("orientations_used", "orientations_rejected", "slips", "restarts"):
-            counts[name] = counts.get(name, 0) + each[WRISTS].counters[name]
-    print("  lower by" + "".join(f"  {name} {value:.1f} %" for name, value in gains.items()) + f"; {counts}")
-    return {**gains, "turn": after["turn"]}
+    counts = {
+        name: sum(each[WRISTS].counters[name] for each in results)
+        for name in ("orientations_used", "orientations_rejected", "slips", "restarts")
+    }
+    gains = "".join(f"  {name} {value:.1f} %" for name, value in gains_of(sums).items())
+    print(f"  lower by{gains}; {counts}")
 
 
 if __name__ == "__main__":

@@ -20,28 +20,21 @@ without a fault, to within 2 %, or 95 %.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import multiprocessing
 import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import common
 import numpy as np
-from body_tracking.imu_tracking import ImuSettings
-from imu_only import ANGLES, Angles, angle_errors, angle_variances, rms, true_configurations
-from tqdm import tqdm
+from imu_only import ANGLES, Angles, angle_errors, angle_variances, true_configurations
+from offline_graph import OfflineGraph
 
 from body_tracking import graph
-from body_tracking.cdr import decode_skeletons
-from body_tracking.messages.base import IMAGE, JOINT_STATE
-from body_tracking.messages.model import image_to_covariance, joint_state_to_model
-from body_tracking.recording.replay import FilterAndAngles, ReplaySettings, Upstream
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.inertial.stage import ImuStage
+from body_tracking.pipeline.codecs import ModelCovariance, ModelState
+from body_tracking.recording.replay import ReplaySettings
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.imus import Iron, SimulatedImu, Slip, Surroundings, usual_mounting
 from body_tracking.simulation.layouts import Layout, around
@@ -63,9 +56,9 @@ NAMED = {
 MOTIONS = ("reaching", "arm_raises")
 BEGIN, DISTURBED, OFF, SLIP = 30.0, 30.0, 10.0, float(np.radians(20.0))
 SETTLED, LAST, LOOKED = 8.0, 20.0, 0.2
-"""Seconds from the beginning that are not judged, at the end that are told apart, and between looks at diagnostics."""
+"""Seconds from the beginning that are not judged, at the end that have figures of their own, and from look to look at
+diagnostics."""
 ENOUGH, RIGHT, LESS = float(np.radians(10.0)), 0.95, 0.02
-_NORMAL = 1.959964
 _FIRST_SEED = 6500
 _RIGHT_ARM = [place for place, name in enumerate(ANGLES) if name.endswith("right")]
 _MOMENT = 30.0
@@ -137,88 +130,62 @@ class Figures(Angles):
     def right(self, since: float) -> FloatArray:
         """(10,) share of the frames in which each angle is right by what is enough, or by what is stated."""
         error, stddev = (np.abs(each[self.times >= since]) for each in (self.error, self.stddev))
-        return np.asarray(((error < ENOUGH) | (error < _NORMAL * stddev)).mean(axis=0), dtype=float)
+        return np.asarray(((error < ENOUGH) | (error < common.NORMAL * stddev)).mean(axis=0), dtype=float)
 
     def arm(self, since: float, until: float = np.inf) -> float:
         """Degrees RMS of the right arm's angles."""
-        return rms(self.error[(self.times >= since) & (self.times < until)][:, _RIGHT_ARM])
+        return common.rms_deg(self.error[(self.times >= since) & (self.times < until)][:, _RIGHT_ARM])
 
     def first(self, words: str) -> float:
         """When a line with these words was there first; infinite if never."""
         return min((when for line, when in self.named.items() if words in line), default=np.inf)
 
 
-class Chain:
-    """The graph as ``replay`` runs it, and an ear for what comes out.
-
-    Attributes:
-        states: stamp, configuration and covariance of each estimate.
-        oriented: receipt of the last orientation of ``FAULTY``.
-    """
-
-    def __init__(self, settings: ReplaySettings) -> None:
-        self.upstream = Upstream(settings)
-        self.upstream.sink = self
-        self.rest = FilterAndAngles(settings, self._published)
-        self.states: list[tuple[int, FloatArray, FloatArray]] = []
-        self.oriented = 0
-        self._configuration: FloatArray | None = None
-
-    def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
-        """What the first half publishes."""
-        if topic == graph.orientation_topic(FAULTY):
-            self.oriented = log_time_ns
-        self.rest.take(topic, cdr, log_time_ns)
-
-    def _published(self, topic: str, cdr: bytes) -> None:
-        if topic == graph.MODEL_STATE:
-            self._configuration = joint_state_to_model(deserialize(JOINT_STATE, cdr), MODEL)[2]
-        elif topic == graph.MODEL_COVARIANCE:
-            assert self._configuration is not None
-            stamp_ns, covariance = image_to_covariance(deserialize(IMAGE, cdr), MODEL)
-            self.states.append((stamp_ns, self._configuration, covariance))
-
-
 def measure(run: Run) -> Figures:
     """Simulate a run, and send it through the graph."""
     recording = run.recording()
-    settings = ReplaySettings(
-        ("kinect1",), filter_name="ekf", imus=ImuSettings(SEGMENTS), orientations=SEGMENTS, convention="model"
-    )
-    chain = Chain(settings)
-    tracker = chain.upstream.imus.tracker if chain.upstream.imus is not None else None
-    assert tracker is not None
+    configurations: list[FloatArray] = []
+    states: list[tuple[int, FloatArray, FloatArray]] = []  # stamp, configuration and covariance of each estimate
+    oriented = 0
+
+    def take(topic: str, cdr: bytes, at_ns: int) -> None:
+        nonlocal oriented
+        if topic == graph.orientation_topic(FAULTY):
+            oriented = at_ns
+        elif topic == graph.MODEL_STATE:
+            configurations.append(ModelState(MODEL).decode(cdr, BAG_WIRE)[2])
+        elif topic == graph.MODEL_COVARIANCE:
+            stamp_ns, spread = ModelCovariance(MODEL).decode(cdr, BAG_WIRE)
+            states.append((stamp_ns, configurations[-1], spread))
+
+    settings = ReplaySettings(("kinect1",), filter_name="ekf", imus=SEGMENTS, convention="model")
     named: dict[str, float] = {}
     looked = 0.0
     with tempfile.TemporaryDirectory() as folder:
         write_bag(recording, Path(folder) / "bag")
         with BagReader(Path(folder) / "bag") as bag:
-            skeletons = graph.skeleton_topic("kinect1")
-            chain.upstream.start(bag.start_ns)
-            for raw in bag.messages([skeletons, *graph.played_imu_topics(SEGMENTS, bag.topics)]):
-                if raw.topic == skeletons:
-                    chain.take(raw.topic, raw.cdr, raw.log_time_ns)
-                    frame = decode_skeletons(raw.cdr)
-                    assert frame is not None
-                    if any(each.valid.any() for each in frame):
-                        chain.upstream.push("kinect1", frame, raw.log_time_ns)
-                else:
-                    chain.upstream.feel(raw.topic, raw.cdr, raw.log_time_ns)
+            topics = [graph.skeleton_topic("kinect1"), *graph.played_imu_topics(SEGMENTS, bag.topics)]
+            whole = OfflineGraph(settings, take, topics)
+            stage = whole.stages["imu_skeleton"]
+            assert isinstance(stage, ImuStage)
+            whole.start(bag.start_ns)
+            for raw in bag.messages(topics):
+                whole.push(raw.topic, raw.cdr, raw.log_time_ns)
                 now = (raw.log_time_ns - RECEIVED_FROM_NS) / NANOSECONDS
                 if now - looked > LOOKED:
                     looked = now
-                    for line in tracker.problems(raw.log_time_ns):
+                    for line in stage.tracker.problems(raw.log_time_ns):
                         named.setdefault(line, now)
-    times = np.array([(stamp_ns - START_NS) / NANOSECONDS for stamp_ns, _, _ in chain.states])
+    times = np.array([(stamp_ns - START_NS) / NANOSECONDS for stamp_ns, _, _ in states])
     judged = times >= SETTLED
-    q = np.array([each[1] for each in chain.states])[judged]
-    variances = [angle_variances(*each[1:]) for each, is_judged in zip(chain.states, judged, strict=True) if is_judged]
+    q = np.array([each[1] for each in states])[judged]
+    variances = [angle_variances(*each[1:]) for each, is_judged in zip(states, judged, strict=True) if is_judged]
     return Figures(
         times[judged],
         angle_errors(q, true_configurations(recording, times[judged])),
         np.sqrt(np.array(variances)),
         named,
-        (chain.oriented - RECEIVED_FROM_NS) / NANOSECONDS,
+        (oriented - RECEIVED_FROM_NS) / NANOSECONDS,
     )
 
 
@@ -237,28 +204,24 @@ def show(fault: str, results: list[Figures], usual: list[Figures]) -> bool:
     begin = 0.0 if fault == "exchanged" else BEGIN
     after = [f"{when - begin:.1f}" if np.isfinite(when) else "never" for when in first]
     back = [each.oriented > until - 1.0 for each in results]
-    print(f"{line}named after {', '.join(after)} s; tells orientations at the end: {sum(back)} of {len(back)}")
+    print(f"{line}named after {', '.join(after)} s; orientations at the end: {sum(back)} of {len(back)}")
     return all(begin <= when < np.inf for when in first) and right >= min(RIGHT, as_usual - LESS)
 
 
 def main() -> int:
     """The benchmark: 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="people per motion (default: %(default)s)")
+    parser = common.parser(__doc__, seeds=2, motions=MOTIONS, jobs=True)
     parser.add_argument("--first-seed", type=int, default=_FIRST_SEED, metavar="N", help="default: %(default)s")
-    parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: %(default)s")
-    parser.add_argument("--faults", default=",".join(FAULTS[1:]), metavar="A,B", help="default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=90.0, metavar="S", help="of each run (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+    parser.add_argument("--faults", type=common.names, default=FAULTS[1:], metavar="A,B", help="(default: all)")
+    parser.add_argument("--seconds", type=float, default=90.0, metavar="S", help="of each run (default: %(default)g)")
     parser.add_argument("--raw", action="store_true", help="each run, and all that diagnostics named in it")
     args = parser.parse_args()
-    faults = ["none", *args.faults.split(",")]
+    faults = ["none", *args.faults]
     if unknown := set(faults) - set(FAULTS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(FAULTS)}")
-    people = [(motion, args.first_seed + seed) for seed in range(args.seeds) for motion in args.motions.split(",")]
+    people = [(motion, args.first_seed + seed) for seed in range(args.seeds) for motion in args.motions]
     runs = [Run(motion, seed, fault, args.seconds) for fault in faults for motion, seed in people]
-    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
-        results = list(tqdm(pool.imap(measure, runs), total=len(runs), unit="run", disable=None))
+    results = common.mapped(measure, runs, args.jobs)
     by_fault = {
         fault: [each for run, each in zip(runs, results, strict=True) if run.fault == fault] for fault in faults
     }
@@ -276,9 +239,7 @@ def main() -> int:
             print("  " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in right))
             for line, when in each.named.items():
                 print(f"  {when:5.1f} s: {line}")
-    for fault in faults[1:]:
-        print("met    " if met[fault] else "MISSED ", fault)
-    return 0 if all(met.values()) else 1
+    return common.verdicts(args, {fault: met[fault] for fault in faults[1:]})
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ orientations of the readings in the order of their receipt, and the filter ``ekf
 
 Eight angles, as many as OpenSenseRT judges (Slade et al., IEEE TBME 69 (2022) 664: 5.6 degrees): of both sides the
 rotation of the upper arm against the chest about the chest's three axes (as the model's errors are; Euler angles would
-divide by the sine of an angle that the T-pose makes zero), and the elbow's flexion. Pronation is told beside them. RMS
-errors in degrees from the end of the first pose on, of each sensor's own alignment nothing is told to anybody.
+divide by the sine of an angle that the T-pose makes zero), and the elbow's flexion. Pronation is printed beside them.
+RMS errors in degrees from the end of the first pose on; how the sensors are put on is not known to the tracker.
 
   with magnetometers in a clean field: RMSE over the eight angles, bar 5.6 deg
   without: error and stated standard deviation by the minute, and the share of the frames within 1.96 of the latter
@@ -20,17 +20,13 @@ how they are put on. What was changed of the library was chosen on seeds below 6
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import multiprocessing
 import sys
 import time
 from dataclasses import dataclass, replace
 
+import common
 import numpy as np
+from common import rms_deg
 
 from body_tracking.filters.ekf import ExtendedKalmanFilter
 from body_tracking.inertial.alignment import rotation_vectors
@@ -61,7 +57,6 @@ ANGLES = tuple(
 EIGHT = 8
 _FIRST_SEED = 6000
 _EVERY_S = 0.1
-_NORMAL = 1.959964
 BAR, COVERED = 5.6, 0.9
 _TRUNK = MODEL.segment_names.index("upper_trunk")
 _ARMS = [MODEL.segment_names.index(f"upper_arm_{side}") for side in ("left", "right")]
@@ -170,11 +165,11 @@ def measure(run: Run) -> Figures:
     due = TPOSE_S
     begin = time.process_time()
     for received_ns, segment, k in events:
-        told = tracker.add(segment, sample(*worn[segment], k), received_ns)
-        if told.orientation is None:
+        found = tracker.add(segment, sample(*worn[segment], k), received_ns)
+        if found.orientation is None:
             continue
-        estimator.take_orientation(told.orientation)
-        now = (told.orientation.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS
+        estimator.take_orientation(found.orientation)
+        now = (found.orientation.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS
         if now < due:
             continue
         due += _EVERY_S
@@ -238,41 +233,46 @@ def angle_errors(q: FloatArray, true: FloatArray) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def rms(values: FloatArray) -> float:
-    """Degrees."""
-    return float(np.degrees(np.sqrt((values**2).mean())))
+def _pooled(figures: list[Figures], columns: slice | list[int]) -> dict[str, float]:
+    """Of some angles: RMS, of which constant and varying, and stated, degrees; the share within 1.96 of the latter."""
+    errors = [each.error[:, columns] for each in figures]
+    means = [error.mean(axis=0, keepdims=True) for error in errors]
+    stddev = np.concatenate([each.stddev[:, columns] for each in figures])
+    error = np.concatenate(errors)
+    return {
+        "rms": rms_deg(error),
+        "constant": rms_deg(np.concatenate(means)),
+        "varying": rms_deg(np.concatenate([each - mean for each, mean in zip(errors, means, strict=True)])),
+        "stated": rms_deg(stddev),
+        "covered": float((np.abs(error) < common.NORMAL * stddev).mean()),
+    }
 
 
-def show(name: str, figures: list[Figures]) -> dict[str, float]:
-    """Print what some runs show."""
-    error = np.concatenate([each.error for each in figures])
-    stddev = np.concatenate([each.stddev for each in figures])
-    constant = np.concatenate([each.error.mean(axis=0, keepdims=True) for each in figures])
-    varying = np.concatenate([each.error - each.error.mean(axis=0) for each in figures])
-    inside = np.abs(error) < _NORMAL * stddev
-    eight = rms(error[:, :EIGHT])
+def summary(figures: list[Figures]) -> dict[str, float]:
+    """Of the eight angles, and of pronation."""
+    eight, pronation = _pooled(figures, slice(EIGHT)), _pooled(figures, slice(EIGHT, None))
+    spent = sum(each.seconds for each in figures) / sum(float(np.ptp(each.times)) for each in figures)
+    return eight | {"eight": eight["rms"], "computing": spent} | {f"pronation {k}": v for k, v in pronation.items()}
+
+
+def show(name: str, figures: list[Figures]) -> None:
+    """Print the figures of some runs."""
+    f = summary(figures)
     print(
-        f"{name}: eight angles {eight:.2f} deg RMS (constant {rms(constant[:, :EIGHT]):.2f}, varying "
-        f"{rms(varying[:, :EIGHT]):.2f}), stated {rms(stddev[:, :EIGHT]):.2f}, covered "
-        f"{100.0 * inside[:, :EIGHT].mean():.0f} %; pronation {rms(error[:, EIGHT:]):.1f} deg, stated "
-        f"{rms(stddev[:, EIGHT:]):.1f}, covered {100.0 * inside[:, EIGHT:].mean():.0f} %; "
-        f"{sum(each.seconds for each in figures) / sum(float(np.ptp(each.times)) for each in figures):.2f} s of "
-        "computing per second"
+        f"{name}: eight angles {f['eight']:.2f} deg RMS (constant {f['constant']:.2f}, varying {f['varying']:.2f}), "
+        f"stated {f['stated']:.2f}, covered {100.0 * f['covered']:.0f} %; pronation {f['pronation rms']:.1f} deg, "
+        f"stated {f['pronation stated']:.1f}, covered {100.0 * f['pronation covered']:.0f} %; "
+        f"{f['computing']:.2f} s of computing per second"
     )
-    return {"eight": eight, "covered": float(inside[:, :EIGHT].mean())}
 
 
 def by_angle(figures: list[Figures]) -> None:
     """Print each angle."""
     for kind in ("shoulder_x", "shoulder_y", "shoulder_z", "elbow", "pronation"):
-        columns = [place for place, name in enumerate(ANGLES) if name.startswith(kind)]
-        error = np.concatenate([each.error[:, columns] for each in figures])
-        stddev = np.concatenate([each.stddev[:, columns] for each in figures])
-        constant = np.concatenate([each.error[:, columns].mean(axis=0, keepdims=True) for each in figures])
-        covered = 100.0 * float((np.abs(error) < _NORMAL * stddev).mean())
+        f = _pooled(figures, [place for place, name in enumerate(ANGLES) if name.startswith(kind)])
         print(
-            f"  {kind:11s} {rms(error):5.2f} deg RMS, constant {rms(constant):5.2f}, stated {rms(stddev):5.2f}, "
-            f"covered {covered:3.0f} %"
+            f"  {kind:11s} {f['rms']:5.2f} deg RMS, constant {f['constant']:5.2f}, stated {f['stated']:5.2f}, "
+            f"covered {100.0 * f['covered']:3.0f} %"
         )
 
 
@@ -288,72 +288,53 @@ def over_time(figures: list[Figures], seconds: float) -> None:
             np.concatenate([getattr(each, name)[part, :EIGHT] for each, part in zip(figures, parts, strict=True)])
             for name in ("error", "stddev")
         )
-        covered = 100.0 * float((np.abs(error) < _NORMAL * stddev).mean())
-        print(f"  {start:6.0f}   {rms(error):9.2f}   {rms(stddev):10.2f}   {covered:5.0f} %")
+        covered = 100.0 * float((np.abs(error) < common.NORMAL * stddev).mean())
+        print(f"  {start:6.0f}   {rms_deg(error):9.2f}   {rms_deg(stddev):10.2f}   {covered:5.0f} %")
 
 
 def main() -> int:
     """The benchmark: 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="people per motion, all different (default: 1)"
-    )
-    parser.add_argument("--first-seed", type=int, default=_FIRST_SEED, metavar="N", help=f"default: {_FIRST_SEED}")
-    parser.add_argument("--motions", default=",".join(MOTIONS), metavar="A,B", help="default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="of each (default: 600)")
-    parser.add_argument("--rate", type=float, default=50.0, metavar="HZ", help="of each sensor (default: 50)")
+    parser = common.parser(__doc__, seeds=1, motions=MOTIONS, jobs=True)
+    parser.add_argument("--first-seed", type=int, default=_FIRST_SEED, metavar="N", help="default: %(default)s")
+    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="of each (default: %(default)g)")
+    parser.add_argument("--rate", type=float, default=50.0, metavar="HZ", help="of each sensor (default: %(default)g)")
     parser.add_argument("--only", choices=("with", "without"), help="only with, or without, magnetometers")
-    parser.add_argument("--oriented", action="store_true", help="drivers tell orientations instead of raw data")
+    parser.add_argument("--oriented", action="store_true", help="drivers publish orientations instead of raw data")
     parser.add_argument("--perfect-pose", action="store_true", help="people without habits of their own")
     parser.add_argument("--ideal", action="store_true", help="sensors err only by how they are put on")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument("--raw", action="store_true", help="the figures of each run")
     args = parser.parse_args()
     kinds = [kind for kind in ("with", "without") if args.only in (None, kind)]
+    sensors = args.oriented, args.perfect_pose, args.ideal
     runs = [
-        Run(
-            motion,
-            args.first_seed + number,
-            args.seconds,
-            args.rate,
-            kind == "with",
-            args.oriented,
-            args.perfect_pose,
-            args.ideal,
-        )
+        Run(motion, args.first_seed + number, args.seconds, args.rate, kind == "with", *sensors)
         for kind in kinds
-        for number, motion in enumerate(args.motions.split(",") * args.seeds)
+        for number, motion in enumerate(args.motions * args.seeds)
     ]
-    results: list[Figures] = []
-    begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
-        for number, result in enumerate(pool.imap(measure, runs), start=1):
-            results.append(result)
-            left = (time.monotonic() - begin) / number * (len(runs) - number)
-            print(f"\r{number} of {len(runs)} runs, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    verdicts: dict[str, bool] = {}
+    results = common.mapped(measure, runs, args.jobs)
+    met: dict[str, bool] = {}
+    figures: dict[str, dict[str, float]] = {}
     for kind in kinds:
         own = [(run, each) for run, each in zip(runs, results, strict=True) if run.magnetometer == (kind == "with")]
-        if args.raw:
-            for run, each in own:
+        together = [each for _, each in own]
+        found = figures[kind] = summary(together)
+        if not common.prints_json(args):
+            for run, each in own if args.raw else ():
                 show(f"  {run.motion} {run.seed}", [each])
                 by_angle([each])
                 for line in each.problems:
                     print(f"    named: {line}")
                 print(f"    {dict(sorted(each.counters.items()))}")
-        together = [each for _, each in own]
-        found = show(f"{kind} magnetometers, {len(own)} people, {args.seconds:g} s each", together)
-        by_angle(together)
-        over_time(together, args.seconds)
+            show(f"{kind} magnetometers, {len(own)} people, {args.seconds:g} s each", together)
+            by_angle(together)
+            over_time(together, args.seconds)
         if kind == "with":
-            verdicts[f"with magnetometers {found['eight']:.2f} deg RMS, bar {BAR}"] = found["eight"] <= BAR
+            met[f"with magnetometers {found['eight']:.2f} deg RMS, bar {BAR}"] = found["eight"] <= BAR
         else:
             text = f"without magnetometers {100.0 * found['covered']:.0f} % covered, bar {100.0 * COVERED:.0f} %"
-            verdicts[text] = found["covered"] >= COVERED
-    for text, met in verdicts.items():
-        print("met    " if met else "MISSED ", text)
-    return 0 if all(verdicts.values()) else 1
+            met[text] = found["covered"] >= COVERED
+    common.report(args, figures, lambda: None)
+    return common.verdicts(args, met)
 
 
 if __name__ == "__main__":

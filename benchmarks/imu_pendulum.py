@@ -1,7 +1,7 @@
 """Orientation from raw inertial data against Vicon: a pendulum of three links, 174 s (Szczesna et al. 2016).
 
 Each link carries an inertial sensor, from whose rate, acceleration and magnetic field ``OrientationEstimator`` makes
-orientations, reading by reading; the gyroscopes' range is told. Fitted per link, as published comparisons do: one
+orientations, reading by reading; the gyroscopes' range is known. Fitted per link, as published comparisons do: one
 constant rotation from the sensor to the link, one from the earth to Vicon's frame (among them the heading).
 
 - ``total``: RMS of the angle of what is left between ours and Vicon's orientation, degrees; ``inclination``: of that
@@ -10,7 +10,7 @@ constant rotation from the sensor to the link, one from the earth to Vicon's fra
 
 Vicon's clock wanders against that of the sensors, by the same on each link (the three agree to some milliseconds): its
 frames were laid evenly over the rows, also where the log of the sensors stood still for 0.02 to 0.18 s. At 5 rad/s
-20 ms are 6 degrees. So for each link a course of the offset is taken that the two other links tell, by their own rates
+20 ms are 6 degrees. So for each link a course of the offset is estimated from the two other links, from their own rates
 against those of their own Vicon; the link itself has no say in it. ``1 offset`` beside it: the figures by one constant
 offset, of up to 0.1 s, that is fitted to the link itself. The bars are those of the former.
 
@@ -26,22 +26,20 @@ The exit code is 1 where a bar is missed.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import common
 import numpy as np
+from common import rms_deg
 from scipy.ndimage import binary_opening, median_filter
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation, Slerp
 
-from body_tracking.errors import BodyTrackingError
 from body_tracking.sensors.imu_csv import ImuCsvRecording
 from body_tracking.sensors.imu_orientation import InertialErrors, OrientationEstimator
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray
@@ -126,13 +124,13 @@ class Fitted:
     @property
     def total(self) -> float:
         """Degrees."""
-        return _rms(np.linalg.norm(self.errors, axis=1))
+        return rms_deg(np.linalg.norm(self.errors, axis=1))
 
     @property
     def inclination(self) -> float:
         """Degrees."""
         up = self.world[:, 2]
-        return _rms(np.linalg.norm(self.errors - np.outer(self.errors @ up, up), axis=1))
+        return rms_deg(np.linalg.norm(self.errors - np.outer(self.errors @ up, up), axis=1))
 
 
 def nearest(matrix: FloatArray) -> FloatArray:
@@ -256,11 +254,11 @@ def hinge(upper: Fitted, lower: Fitted) -> float:
     for above, below in ((upper.ours, lower.ours), (upper.vicon, lower.vicon)):
         quats = Rotation.from_matrix(above[first].swapaxes(1, 2) @ below[second]).as_quat()
         angles.append(2.0 * np.arctan2(quats[:, 2], quats[:, 3]))
-    return _rms(np.angle(np.exp(1j * (angles[0] - angles[1]))))
+    return rms_deg(np.angle(np.exp(1j * (angles[0] - angles[1]))))
 
 
 def measure(recordings: list[Recording]) -> tuple[list[Link], list[Fitted]]:
-    """Each link by the clock that the others tell."""
+    """Each link with the clock offset that the others give."""
     constant = [one_offset(recording) for recording in recordings]
     links, fits = [], []
     for k, recording in enumerate(recordings):
@@ -274,8 +272,8 @@ def measure(recordings: list[Recording]) -> tuple[list[Link], list[Fitted]]:
                 left_out=float(1.0 - recording.kept.mean()),
                 total=result.total,
                 inclination=result.inclination,
-                stated_total=_rms(np.sqrt(recording.variances.sum(axis=1))),
-                stated_inclination=_rms(np.sqrt(recording.variances[:, :2].sum(axis=1))),
+                stated_total=rms_deg(np.sqrt(recording.variances.sum(axis=1))),
+                stated_inclination=rms_deg(np.sqrt(recording.variances[:, :2].sum(axis=1))),
                 worst=float(np.degrees(np.linalg.norm(result.errors, axis=1).max())),
                 disturbed=recording.disturbed,
                 one_offset_total=constant[k].total,
@@ -286,28 +284,12 @@ def measure(recordings: list[Recording]) -> tuple[list[Link], list[Fitted]]:
     return links, fits
 
 
-def _rms(radians: FloatArray) -> float:
-    return float(np.degrees(np.sqrt(np.mean(np.square(radians)))))
-
-
 def main() -> int:
-    """The benchmark; exit code 1 where a bar is missed or on an error, 2 where the files are absent."""
-    root = Path(__file__).resolve().parent.parent
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    args = parser.parse_args()
+    """The benchmark; exit code 1 where a bar is missed, 2 where the files are absent."""
+    args = common.parser(__doc__, data=True).parse_args()
     folder = args.data / "imu" / "pendulum_with_reference"
-    files = [folder / f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz" for link in LINKS]
-    if not all(path.is_file() for path in files):
-        print(f"the real recordings are absent ({folder})", file=sys.stderr)
-        return 2
-    try:
-        recordings = [record(path) for path in files]
-    except BodyTrackingError as error:
-        print(error, file=sys.stderr)
-        return 1
+    files = common.recordings(folder, [f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz" for link in LINKS])
+    recordings = [record(path) for path in files]
     links, fits = measure(recordings)
     joints = [hinge(upper, lower) for upper, lower in pairwise(fits)]
     missed = [
@@ -315,24 +297,25 @@ def main() -> int:
         *(f"link {k}: inclination" for k, link in zip(LINKS, links, strict=True) if link.inclination > INCLINATION_BAR),
         *(f"joint {k}-{k + 1}" for k, joint in zip(LINKS, joints, strict=False) if joint > JOINT_BAR),
     ]
-    if args.json:
-        print(json.dumps({"links": [asdict(link) for link in links], "joints": joints, "missed": missed}, indent=2))
-        return 1 if missed else 0
+    common.report(args, {"links": links, "joints": joints, "missed": missed}, lambda: show(links, joints))
+    if missed:
+        common.progress(f"missed: {', '.join(missed)}")
+    return 1 if missed else 0
+
+
+def show(links: list[Link], joints: list[float]) -> None:
+    """The table."""
     names = ("total", "stated", "1 offset", "inclination", "stated", "1 offset", "worst")
     print("degrees" + "".join(f"{name:>12}" for name in names) + f"{'left out':>12}{'disturbed':>12}   offset, ms")
     for number, link in zip(LINKS, links, strict=True):
         totals = link.total, link.stated_total, link.one_offset_total
         inclinations = link.inclination, link.stated_inclination, link.one_offset_inclination
-        cells = *totals, *inclinations, link.worst
-        print(f"link {number} " + "".join(f"{value:>12.2f}" for value in cells), end="")
         offsets = ", ".join(f"{1e3 * offset:.0f}" for offset in link.offsets_s)
-        print(f"{link.left_out:>12.1%}{link.disturbed:>12.1%}   {offsets}")
+        cells = "".join(f"{value:>12.2f}" for value in (*totals, *inclinations, link.worst))
+        print(f"link {number} {cells}{link.left_out:>12.1%}{link.disturbed:>12.1%}   {offsets}")
     for number, joint in zip(LINKS, joints, strict=False):
         print(f"joint {number}-{number + 1} {joint:>11.2f}")
     print(f"bars: total {TOTAL_BAR}, inclination {INCLINATION_BAR}, joint {JOINT_BAR}")
-    if missed:
-        print(f"missed: {', '.join(missed)}", file=sys.stderr)
-    return 1 if missed else 0
 
 
 if __name__ == "__main__":

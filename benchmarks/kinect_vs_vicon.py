@@ -21,11 +21,8 @@ raw skeleton.)
 
 from __future__ import annotations
 
-import argparse
 import csv
 import gzip
-import json
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -33,6 +30,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import common
 import numpy as np
 
 from body_tracking.evaluation.alignment import Agreement, TimeWarp, compare, estimate_warp, sample
@@ -134,12 +132,6 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return unit
 
 
-def _between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Angle between vectors, degrees."""
-    angle: FloatArray = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1)))
-    return angle
-
-
 def _arm(
     times: FloatArray, up: FloatArray, left: FloatArray, shoulder: FloatArray, elbow: FloatArray, wrist: FloatArray
 ) -> Arm:
@@ -148,7 +140,8 @@ def _arm(
     left = _unit(left - (left * up).sum(axis=-1, keepdims=True) * up)
     axes = np.stack([np.cross(left, up), left, up], axis=1)
     directions = [np.einsum("nij,nj->ni", axes, _unit(each)) for each in (upper, forearm)]
-    return Arm(times, _between(upper, -up), _between(upper, forearm), np.concatenate(directions, axis=1))
+    elevation, flexion = (np.degrees(common.between(upper, other)) for other in (-up, forearm))
+    return Arm(times, elevation, flexion, np.concatenate(directions, axis=1))
 
 
 def kinect_arm(skeletons: list[Skeleton]) -> Arm:
@@ -247,17 +240,11 @@ def measure(clip: str, folder: Path, methods: dict[str, Method], warp_by: str = 
 
 def main() -> int:
     """The benchmark; exit code 1 where a figure misses its bar."""
-    root = Path(__file__).resolve().parent.parent
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
+    parser = common.parser(__doc__, data=True)
     parser.add_argument("--warp", choices=(JOINT, OWN, RAW), default=JOINT, help="what aligns (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     args = parser.parse_args()
     folder = args.data / "kinect_vs_vicon"
-    if not all((folder / f"{clip}_{system}.csv.gz").is_file() for clip in CLIPS for system in ("kinect", "vicon")):
-        print(f"the real recordings are absent ({folder})", file=sys.stderr)
-        return 2
+    common.recordings(folder, [f"{clip}_{system}.csv.gz" for clip in CLIPS for system in ("kinect", "vicon")])
     rows = [measure(clip, folder, METHODS, args.warp) for clip in CLIPS]
     medians = {
         name: {
@@ -276,9 +263,13 @@ def main() -> int:
     missed += [
         f"median elevation of {best}" for best in HELD if medians[best]["elevation"]["debiased_rms"] > DEBIASED_LIMIT
     ]
-    if args.json:
-        print(json.dumps({"clips": rows, "median": medians, "missed": missed}, indent=2))
-        return bool(missed)
+    figures = {"clips": rows, "median": medians, "missed": missed}
+    common.report(args, figures, lambda: show(rows, medians, missed))
+    return bool(missed)
+
+
+def show(rows: list[dict[str, Any]], medians: dict[str, Any], missed: list[str]) -> None:
+    """The table."""
     print(f"{'':36}{'elevation, degrees':^38}   {'elbow flexion, degrees':^38}")
     columns = f"{'r':>6} {'gain':>6} {'bias':>7} {'rms':>7} {'debiased':>8}"
     print(f"{'clip':<12}{'method':<24}{columns}   {columns}   {'lag ms':>6} {'rate':>5} {'R^2':>6}  samples")
@@ -291,7 +282,6 @@ def main() -> int:
     for name in METHODS:
         print(f"{'median':<12}{name:<24}{_line(medians[name]['elevation'])}   {_line(medians[name]['flexion'])}")
     print("missed: " + ("; ".join(missed) or "nothing"))
-    return bool(missed)
 
 
 def _line(agreement: dict[str, float]) -> str:

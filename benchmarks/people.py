@@ -14,11 +14,7 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import random
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,28 +25,28 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-
-import node_processes
+import common
+import live
 import numpy as np
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import PointCloud2
 
 from body_tracking import graph
 from body_tracking.calibration.offline import calibrate
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.result import SensorPose
-from body_tracking.cdr import encode_skeletons
+from body_tracking.cdr import decode_skeletons
+from body_tracking.filters.roles import role_of
 from body_tracking.fusion.people import People, PeopleParameters
 from body_tracking.fusion.subject import ALL
-from body_tracking.graph import GraphOptions
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import frames_of, sensor_topics
+from body_tracking.recording.replay import sensor_topics
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, SimulatedRecording, lanes, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.systems import options_of
 
 _TRUNK = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
 EVERYBODY = PeopleParameters(ALL)
@@ -134,7 +130,7 @@ def crossings(seeds: Iterable[int], counts: Iterable[int] = (2, 3)) -> list[dict
     for people, sensors in cases:
         totals = {False: Counter[str](), True: Counter[str]()}
         for seed in seeds:
-            print(f"{people} people, {sensors} sensor(s), seed {seed}", file=sys.stderr, flush=True)
+            common.progress(f"{people} people, {sensors} sensor(s), seed {seed}")
             recording = crossing(seed, sensors, people)
             for worthless, total in totals.items():
                 total.update(switches(recording, worthless, seed))
@@ -166,7 +162,10 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
     apart: list[float] = []
     with BagReader(bag) as reader:
         topics = sensor_topics(reader)
-        for sensor, skeletons, _, _ in frames_of(reader, topics, Counter()):
+        for raw in reader.messages(topics):
+            sensor, skeletons = topics[raw.topic], decode_skeletons(raw.cdr)
+            if not skeletons or not any(body.valid.any() for body in skeletons):
+                continue
             counted["frames"] += 1
             counted["bodies"] += len(skeletons)
             at_ns = result.clocks[sensor].to_reference(skeletons[0].stamp_ns)
@@ -204,153 +203,96 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
 # --- 3: six people, live
 
 
-class Play:
-    """What the sensors saw, to and fro, so that nobody ever jumps."""
-
-    def __init__(self, recording: SimulatedRecording) -> None:
-        self.poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-        clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-        self._frames = {name: [f.skeletons for f in recording.frames if f.sensor == name] for name in clocks}
-        self._times = {
-            name: np.array([clocks[name].to_reference(each[0].stamp_ns) for each in frames])
-            for name, frames in self._frames.items()
-        }
-
-    def at(self, sensor: str, seconds: float, stamp_ns: int) -> bytes:
-        """The message at a time of the play, with a stamp."""
-        times = self._times[sensor]
-        length = int(times[-1] - times[0])
-        way = round(seconds * NANOSECONDS) % (2 * length)
-        wanted = times[0] + min(way, 2 * length - way)
-        skeletons = self._frames[sensor][int(np.abs(times - wanted).argmin())]
-        return encode_skeletons([replace(each, stamp_ns=stamp_ns) for each in skeletons])
+def streams_of(recording: SimulatedRecording) -> dict[str, live.Stream]:
+    """What each sensor saw, to and fro."""
+    found = {}
+    for sensor in recording.sensors:
+        name = sensor.pose.sensor
+        frames = [frame.skeletons for frame in recording.frames if frame.sensor == name]
+        found[name] = live.Stream(frames, sensor.clock, back=True)
+    return found
 
 
-class Ear:
-    """Takes the time of angles, and keeps what diagnostics say."""
+class Ear(live.Bench):
+    """Counts besides how often diagnostics said that a node is too slow."""
 
-    def __init__(self, bodies: tuple[str, ...]) -> None:
-        import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
-        from rclpy.executors import SingleThreadedExecutor
-        from sensor_msgs.msg import JointState
-
-        from body_tracking.nodes.bag_topics import to_profile
-        from body_tracking.recording.qos import RELIABLE
-
-        self.angles: list[tuple[str, int, int]] = []
-        self.values: dict[str, dict[str, str]] = {}
+    def __init__(self) -> None:
+        super().__init__("people_bench")
         self.warnings: Counter[str] = Counter()
-        self.node = rclpy.create_node("people_bench")
-        for body in bodies:
-            self.node.create_subscription(
-                JointState, graph.joint_states_topic(body), self._angles(body), to_profile(RELIABLE)
-            )
-        self.node.create_subscription(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._told, to_profile(RELIABLE))
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        self.hear_diagnostics()
 
-    def _angles(self, body: str) -> Any:
-        def come(message: Any) -> None:
-            stamp = message.header.stamp
-            self.angles.append((body, stamp.sec * NANOSECONDS + stamp.nanosec, time.time_ns()))
-
-        return come
-
-    def _told(self, message: Any) -> None:
+    def on_diagnostics(self, message: Any, _info: Any = None) -> None:
+        super().on_diagnostics(message)
         for status in statuses(message):
-            self.values[status.node] = dict(status.values)
-            if status.level and status.text.startswith("too slow"):
-                self.warnings[status.node] += 1
+            self.warnings[status.node] += status.level > 0 and status.text.startswith("too slow")
 
 
-def start(folder: Path, play: Play, filter_name: str, people: int) -> list[subprocess.Popen[bytes]]:
-    """The graph's nodes from its own table; this process takes the place of the sensors."""
-    calibration = node_processes.calibrated(folder, play.poses)
-    options = GraphOptions(
-        tuple(play.poses), filter_name=filter_name, subject=ALL, people=people, calibration_file=calibration
-    )
-    return node_processes.start(node_processes.commands(folder, options, level="ERROR"))
-
-
-def live(filter_name: str, play: Play, people: int, seconds: float) -> dict[str, Any]:
+def run_live(filter_name: str, recording: SimulatedRecording, people: int, seconds: float) -> dict[str, Any]:
     """The third measurement."""
-    import rclpy
-    from sensor_msgs.msg import PointCloud2
-
-    from body_tracking.nodes.bag_topics import to_profile
-
-    rclpy.init()
-    ear = Ear(graph.bodies(people))
-    qos = to_profile(graph.SKELETON)
-    outputs = {name: ear.node.create_publisher(PointCloud2, graph.skeleton_topic(name), qos) for name in play.poses}
-    by_sensor = graph.role_of(GraphOptions(filter_name=filter_name)).input == graph.SENSORS_INPUT
+    streams, ear = streams_of(recording), Ear()
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    by_sensor = role_of({"filter": filter_name}).input == graph.SENSORS_INPUT
+    for body in graph.bodies(people):
+        ear.time(body, graph.joint_states_topic(body))
+    topics = {name: graph.skeleton_topic(name) for name in streams}
+    for topic in topics.values():
+        ear.publisher(topic, PointCloud2)
+    moments = sorted(
+        ((k + 0.4 * number) / 30.0, sensor) for number, sensor in enumerate(topics) for k in range(round(30 * seconds))
+    )
+    events = ((at, topics[sensor], streams[sensor].at(at)) for at, sensor in moments)
     with tempfile.TemporaryDirectory() as name:
-        processes = start(Path(name), play, filter_name, people)
+        calibration = live.calibrated(Path(name) / "calibration.yaml", poses)
+        options = options_of(
+            sensors=tuple(poses), filter=filter_name, subject=ALL, people=people, calibration=calibration
+        )
         try:
-            end = time.monotonic() + 60.0
-            while not all(output.get_subscription_count() >= 2 + by_sensor for output in outputs.values()):
-                ear.executor.spin_once(timeout_sec=0.1)
-                if time.monotonic() > end or any(process.poll() is not None for process in processes):
-                    raise SystemExit("people: the processes did not come up")
-            begin_ns = time.time_ns() + NANOSECONDS // 2
-            events = sorted(
-                ((k + 0.4 * number) / 30.0, sensor)
-                for number, sensor in enumerate(outputs)
-                for k in range(round(30 * seconds))
-            )
-            print(f"{people} people, {filter_name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-            for at, sensor in events:
-                due_ns = begin_ns + round(at * NANOSECONDS)
-                while (left_ns := due_ns - time.time_ns()) > 0:
-                    ear.executor.spin_once(timeout_sec=left_ns / NANOSECONDS)
-                outputs[sensor].publish(play.at(sensor, at, due_ns))
-            end = time.monotonic() + 2.0
-            while time.monotonic() < end:
-                ear.executor.spin_once(timeout_sec=0.05)
+            with live.processes(live.node_commands(Path(name), options, level="ERROR")) as running:
+                expected = dict.fromkeys(topics.values(), 2 + by_sensor)
+                live.wait("people: the processes", lambda: ear.connected(expected), running)
+                ear.spin()
+                common.progress(f"{people} people, {filter_name}: {seconds:.0f} s")
+                ear.publish(events, {})
+                time.sleep(2.0)
         finally:
-            node_processes.stop(processes)
-            ear.node.destroy_node()
-            rclpy.shutdown()
-    return {"filter": filter_name, "people": people, "seconds": seconds, **told(ear, begin_ns, seconds)}
+            ear.close()
+    return {"filter": filter_name, "people": people, "seconds": seconds, **figures_of(ear, seconds)}
 
 
-def told(ear: Ear, begin_ns: int, seconds: float) -> dict[str, Any]:
+def figures_of(ear: Ear, seconds: float) -> dict[str, Any]:
     """Figures of one run; the first fifth, while everything starts, is not among the delays."""
-    stamps = np.array([stamp_ns - begin_ns for _, stamp_ns, _ in ear.angles]) / NANOSECONDS
-    delays = np.array([received_ns - stamp_ns for _, stamp_ns, received_ns in ear.angles]) / 1e6
-    counts = Counter(body for body, _, _ in ear.angles)
+    rows = [np.array(sorted(received.items())).reshape(-1, 2) for received in ear.received.values()]
+    stamps, received = np.concatenate(rows).T
+    delays, stamps = (received - stamps) / 1e6, (stamps - ear.start_ns) / NANOSECONDS
     parts = np.linspace(0.2 * seconds, seconds, 5)
     quarters = [delays[(stamps >= a) & (stamps < b)] for a, b in pairwise(parts)]
     dropped: dict[str, dict[str, int]] = {}
-    for node, values in ear.values.items():
+    for node in ear.statuses:
+        values = ear.values(node)
         found = {key: int(value) for key, value in values.items() if key.startswith(("dropped ", "lost "))}
         if any(found.values()):
             dropped[node] = found
     return {
-        "rate of each, Hz": {body: round(count / seconds, 1) for body, count in sorted(counts.items())},
+        "rate of each, Hz": {
+            body: round(len(each) / seconds, 1) for body, each in sorted(ear.received.items()) if each
+        },
         "angles in each quarter": [len(each) for each in quarters],
         "delay ms, median of each quarter": [round(float(np.median(each)), 1) for each in quarters if len(each)],
         "delay ms, 99 % of each quarter": [round(float(np.percentile(each, 99)), 1) for each in quarters if len(each)],
         "dropped and lost": dropped,
-        "seconds in which diagnostics said that it is too slow": dict(ear.warnings),
-        "association": {
-            key: value for key, value in ear.values.get("fusion", {}).items() if key.startswith("association")
-        },
+        "seconds in which diagnostics said that it is too slow": dict(+ear.warnings),
+        "association": {key: value for key, value in ear.values("fusion").items() if key.startswith("association")},
     }
 
 
 def main() -> int:
     """The benchmark; exit code 1 where a number was exchanged that should not have been."""
-    root = Path(__file__).resolve().parent.parent
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
+    parser = common.parser(__doc__, data=True, seeds=10)
     parser.add_argument("--only", choices=("crossings", "real", "live"), help="one of the three")
-    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="of the crossings (default: %(default)s)")
     parser.add_argument("--people", type=int, default=6, metavar="N", help="live (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=40.0, metavar="S", help="of each live run (default: 40)")
-    parser.add_argument("--filters", default="lkf_constant_velocity,ekf", metavar="A,B", help="live (default: both)")
+    parser.add_argument("--filters", type=common.names, default=["lkf_constant_velocity", "ekf"], metavar="A,B",
+                        help="live (default: both)")  # fmt: skip
     args = parser.parse_args()
     result: dict[str, Any] = {}
     if args.only in (None, "crossings"):
@@ -361,11 +303,11 @@ def main() -> int:
             with tempfile.TemporaryDirectory() as folder:
                 result["two real people"] = real(file, Path(folder))
         else:
-            print(f"the real recording is absent ({args.data})", file=sys.stderr)
+            common.progress(f"the real recording is absent ({args.data})")
     if args.only in (None, "live"):
-        play = Play(crossing(0, 2, args.people, seconds=10.0))
-        result["live"] = [live(name, play, args.people, args.seconds) for name in args.filters.split(",")]
-    print(json.dumps(result, indent=2))
+        recording = crossing(0, 2, args.people, seconds=10.0)
+        result["live"] = [run_live(name, recording, args.people, args.seconds) for name in args.filters]
+    common.report(args, result, lambda: print(json.dumps(result, indent=2)))
     return int(any(row["switches while all were visible to a sensor"] for row in result.get("crossings", ())))
 
 

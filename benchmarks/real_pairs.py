@@ -2,32 +2,42 @@
 
 Imports each recording of ``kinect_pairs`` into a bag, runs the graph over it offline (``body_tracking replay``) and
 calibrates it with both methods (``body_tracking calibrate``). The taped marks give the true relative yaw.
+
+With ``--ekf`` the extended filter on the same people, of whom nothing is known but that they stay the same:
+
+lengths   segment lengths from the first half of each recording (fused skeletons) against those from the second half,
+          both from scratch: the greatest difference of the 21, what is stated of it, and the median.
+NIS       the normalised innovation squared over its expectation, sums over all frames after the first seconds: of the
+          fused skeletons, and of both calibrated sensors unpaired, each frame at its own time. 1 is consistent; more:
+          stated deviations are too small; less: too large (Bar-Shalom, Li and Kirubarajan 2001, chapter 5.4.2).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import common
 import numpy as np
 
 from body_tracking.calibration.offline import calibrate, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.result import CalibrationResult
 from body_tracking.cdr import decode_skeletons
-from body_tracking.graph import CALIBRATION, FILTERED
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.fusion.alignment import SensorAlignment
+from body_tracking.graph import CALIBRATION, FILTERED, FUSED
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import left_right_axes
 from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.recording.importer import import_files
-from body_tracking.recording.replay import ReplaySettings, replay
+from body_tracking.recording.replay import ReplaySettings, replay, sensor_topics, skeletons_of
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
@@ -36,6 +46,12 @@ NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}
 
 LIMITS = {"parallel": 36.0, "45deg": 62.0, "90deg": 107.0}
 """Most that the two sensors may disagree on a joint, mean over joints and frames, median over recordings, mm."""
+
+LENGTH_BAR, NIS_BAR = 0.010, (0.7, 1.4)
+"""Metres; of the extended filter."""
+
+LEARNING = 2.0
+"""Seconds at the start, and after a gap, that do not count for the NIS: the filter is learning the noise."""
 
 PEOPLE = ("p02", "p07", "p12")
 
@@ -104,8 +120,74 @@ def reversals(axes: FloatArray) -> int:
     return int((np.einsum("ni,ni->n", axes[1:], axes[:-1]) <= 0.0).sum())
 
 
-def measure(file: Path, folder: Path) -> dict[str, Any]:
-    """All figures of one recording."""
+def unpaired_frames(bag: Path, result: CalibrationResult) -> list[tuple[str, Skeleton]]:
+    """Each sensor's frames in world, in the order in which they arrived."""
+    with BagReader(bag) as reader:
+        topics = sensor_topics(reader)
+        alignment = SensorAlignment(tuple(topics.values()), result.reference)
+        for sensor, clock in result.clocks.items():
+            alignment.set_clock(sensor, 0, clock)
+        for pose in result.poses.values():
+            alignment.set_pose(pose)
+        found = [(each[0], alignment.push(*each[:2])) for each in skeletons_of(reader, topics, Counter())]
+    return [(sensor, skeleton) for sensor, skeleton in found if skeleton is not None]
+
+
+def learnt(frames: Sequence[tuple[str, Skeleton]], parameters: EkfParameters) -> tuple[FloatArray, FloatArray]:
+    """(21,) lengths and their standard deviations after all frames, metres."""
+    estimator = ExtendedKalmanFilter(parameters)
+    for sensor, skeleton in frames:
+        estimator.update(skeleton, sensor)
+    estimate = estimator.estimate
+    if estimate is None:
+        raise RuntimeError("the filter had no estimate")
+    return estimate.lengths, estimate.lengths_stddev
+
+
+def halves(frames: Sequence[tuple[str, Skeleton]], parameters: EkfParameters) -> dict[str, Any]:
+    """Lengths of the first half of the time against those of the second one, metres."""
+    stamps = [skeleton.stamp_ns for _, skeleton in frames]
+    middle = (min(stamps) + max(stamps)) // 2
+    parts = [[frame for frame in frames if (frame[1].stamp_ns < middle) == first] for first in (True, False)]
+    (one, one_stddev), (two, two_stddev) = (learnt(part, parameters) for part in parts)
+    apart = np.abs(one - two)
+    worst = int(apart.argmax())
+    stated = float(np.hypot(one_stddev[worst], two_stddev[worst]))
+    which = UpperBody().length_names[worst]
+    return {"worst": float(apart[worst]), "median": float(np.median(apart)), "which": which, "stated": stated}
+
+
+def innovations(frames: Sequence[tuple[str, Skeleton]], parameters: EkfParameters) -> dict[str, float]:
+    """The NIS over its expectation, the share of measured points beyond the gate, and restarts."""
+    estimator = ExtendedKalmanFilter(parameters)
+    distance, dimension, gaps, counts_from = 0.0, 0, -1, 0
+    for sensor, skeleton in frames:
+        if gaps != estimator.counters["gaps"]:
+            gaps = estimator.counters["gaps"]
+            counts_from = skeleton.stamp_ns + round(LEARNING * NANOSECONDS)
+        measured = estimator.counters["measured"]
+        if estimator.update(skeleton, sensor) is None or skeleton.stamp_ns < counts_from:
+            continue
+        if estimator.counters["measured"] > measured:
+            distance += estimator.innovation_distance
+            dimension += estimator.innovation_dimension
+    counters = estimator.counters
+    rejected = counters["rejected"] / max(counters["measured"] + counters["rejected"], 1)
+    return {"nis": distance / max(dimension, 1), "rejected": rejected, "restarts": counters["restarts"]}
+
+
+def of_ekf(bag: Path, out: Path, result: CalibrationResult, parameters: EkfParameters) -> dict[str, Any]:
+    """The figures of the extended filter."""
+    fused = [("", each) for each in skeletons(out, FUSED)]
+    sources = {"fused": fused, "unpaired": unpaired_frames(bag, result)}
+    return {
+        "lengths": halves(fused, parameters),
+        **{name: innovations(frames, parameters) for name, frames in sources.items()},
+    }
+
+
+def measure(file: Path, folder: Path, parameters: EkfParameters | None = None) -> dict[str, Any]:
+    """All figures of one recording; those of the extended filter where its parameters are given."""
     layout = file.name.split("_")[1].split(".")[0]
     bag, out = folder / f"{file.name}.bag", folder / f"{file.name}.out"
     import_files([file], bag)
@@ -118,6 +200,7 @@ def measure(file: Path, folder: Path) -> dict[str, Any]:
         if method == "robust":
             figures["stddev_deg"] = float(np.degrees(result.quality["kinect2"].rotation_stddev))
             figures["clock_ms"] = 1e3 * result.clocks["kinect2"].offset
+            figures["ekf"] = of_ekf(bag, out, result, parameters) if parameters else {}
     stamps = np.array([each.stamp_ns for each in skeletons(bag, "/kinect1/skeleton")])
     movement = int(stamps[np.flatnonzero(np.diff(stamps) > PAUSE * NANOSECONDS)[0] + 1])
     figures["settling_s"] = settling(out, movement, NOMINAL[layout])
@@ -127,41 +210,25 @@ def measure(file: Path, folder: Path) -> dict[str, Any]:
     return figures
 
 
-def main() -> int:
-    """The benchmark; exit code 1 where a figure misses its bar."""
-    root = Path(__file__).resolve().parent.parent
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    args = parser.parse_args()
-    files = [args.data / "kinect_pairs" / f"{who}_{where}.csv.gz" for where in NOMINAL for who in PEOPLE]
-    if not all(file.is_file() for file in files):
-        print(f"the real recordings are absent ({args.data})", file=sys.stderr)
-        return 2
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for number, file in enumerate(files, 1):
-            print(f"{number}/{len(files)} {file.name}", file=sys.stderr, flush=True)
-            rows.append(measure(file, Path(folder)))
-    medians = {
-        layout: {
-            method: median(row[f"{method}_mm"] for row in rows if row["layout"] == layout)
-            for method in ("robust", "thesis")
-        }
-        for layout in NOMINAL
-    }
-    missed = [f"{layout}: apart" for layout, limit in LIMITS.items() if medians[layout]["robust"] > limit]
+def missed_bars(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """What misses its bar."""
+    missed = [f"{layout}: apart" for layout, own in medians.items() if own["robust"] > LIMITS[layout]]
+    low, high = NIS_BAR
     for row in rows:
-        if abs(row["robust_yaw_deg"] - NOMINAL[row["layout"]]) > 2.0:
-            missed.append(f"{row['recording']}: yaw")
-        if row["settling_s"] > 15.0:
-            missed.append(f"{row['recording']}: settling")
-        if row["reversals"] and row["layout"] == "90deg":
-            missed.append(f"{row['recording']}: reversals")
-    if args.json:
-        print(json.dumps({"recordings": rows, "median_mm": medians, "missed": missed}, indent=2))
-        return bool(missed)
+        found = {
+            "yaw": abs(row["robust_yaw_deg"] - NOMINAL[row["layout"]]) > 2.0,
+            "settling": row["settling_s"] > 15.0,
+            "reversals": row["reversals"] and row["layout"] == "90deg",
+        }
+        if row["ekf"]:
+            found["lengths"] = row["ekf"]["lengths"]["worst"] > LENGTH_BAR
+            found |= {f"NIS {name}": not low <= row["ekf"][name]["nis"] <= high for name in ("fused", "unpaired")}
+        missed += [f"{row['recording']}: {what}" for what, is_missed in found.items() if is_missed]
+    return missed
+
+
+def show(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]], missed: Sequence[str]) -> None:
+    """The tables."""
     print("                 yaw, degrees                          apart, mm")
     print("recording        marks  default +-sd  thesis  settled  default  thesis  clock  reversals  speed")
     for row in rows:
@@ -170,10 +237,52 @@ def main() -> int:
             f" {row['thesis_yaw_deg']:7.1f} {row['settling_s']:6.1f} s {row['robust_mm']:8.0f} {row['thesis_mm']:7.0f}"
             f" {row['clock_ms']:3.0f} ms {row['reversals']:10} {row['times_real_time']:4.0f} x"
         )
-    for layout, limit in LIMITS.items():
-        apart = medians[layout]
-        print(f"median, {layout}: {apart['robust']:.0f} mm apart (bar {limit:.0f}); thesis {apart['thesis']:.0f} mm")
+    for layout, apart in medians.items():
+        bar = LIMITS[layout]
+        print(f"median, {layout}: {apart['robust']:.0f} mm apart (bar {bar:.0f}); thesis {apart['thesis']:.0f} mm")
+    if any(row["ekf"] for row in rows):
+        print("ekf              lengths apart, mm: worst (stated sd), median      NIS (rejected %, restarts)")
+    for row in rows:
+        if row["ekf"]:
+            found = row["ekf"]["lengths"]
+            nis = "; ".join(
+                f"{name} {each['nis']:.2f} ({100 * each['rejected']:.1f}, {each['restarts']})"
+                for name, each in row["ekf"].items()
+                if name != "lengths"
+            )
+            worst, stated, middle = (1e3 * found[name] for name in ("worst", "stated", "median"))
+            lengths = f"{worst:.1f} ({stated:.1f}) {found['which']}, {middle:.1f}"
+            print(f"{row['recording']:15}  {lengths:48}  {nis}")
     print("missed: " + ", ".join(missed) if missed else "every bar is met")
+
+
+def main() -> int:
+    """The benchmark; exit code 1 where a figure misses its bar."""
+    parser = common.parser(__doc__, data=True)
+    parser.add_argument("--only", metavar="NAME", default="", help="recordings whose name contains this")
+    parser.add_argument("--ekf", action="store_true", help="the extended filter, too")
+    common.add_set(parser)
+    args = parser.parse_args()
+    wanted = [name for layout in NOMINAL for who in PEOPLE if args.only in (name := f"{who}_{layout}.csv.gz")]
+    files = common.recordings(args.data / "kinect_pairs", wanted)
+    parameters = EkfParameters(**dict(args.set)) if args.ekf or args.set else None
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, file in enumerate(files, 1):
+            common.progress(f"{number}/{len(files)} {file.name}")
+            rows.append(measure(file, Path(folder), parameters))
+    layouts = {row["layout"] for row in rows}
+    medians = {
+        layout: {
+            method: median(row[f"{method}_mm"] for row in rows if row["layout"] == layout)
+            for method in ("robust", "thesis")
+        }
+        for layout in NOMINAL
+        if layout in layouts
+    }
+    missed = missed_bars(rows, medians)
+    figures = {"recordings": rows, "median_mm": medians, "missed": missed}
+    common.report(args, figures, lambda: show(rows, medians, missed))
     return bool(missed)
 
 

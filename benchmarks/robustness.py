@@ -3,8 +3,8 @@
 Each run draws a body, a motion (half of them with a special posture, a third with full turns) and what is done to the
 filter: a start up to 60 degrees wrong in every angle, noise of 2 to 60 mm, dropouts of up to 2 s (of limbs, of the
 trunk, of everything), frame gaps of up to 1 s, 5 % outliers of up to 1 m. No joint is absent for more than 2 s on end.
-All of that ends 2 s before the run does; from then on only the noise remains. Default settings; the filter is told
-neither body nor noise nor what happened.
+All of that ends 2 s before the run does; from then on only the noise remains. Default settings; the filter
+knows neither body nor noise nor what happened.
 
 back       the RMS error of the 19 points is no more than that of the raw measurements, sqrt(3) times the noise, plus
            30 mm, from then on to the end; the time to it counts from the first frame of good data. A steady filter has
@@ -12,32 +12,31 @@ back       the RMS error of the 19 points is no more than that of the raw measur
 diverged   not back at the end, or some point is wrong by more than 3 times the noise + 80 mm there (median of the last
            0.5 s; the raw measurements' own median is 1.5 times the noise)
 excess     greatest angle beyond a range of motion at any frame (ranges.excess)
-surprise   greatest error of an observed angle over its stated standard deviation, median of the last 0.5 s: tells of
+surprise   greatest error of an observed angle over its stated standard deviation, median of the last 0.5 s: shows
            runs that fit the points with a wrong pose
 
-  python benchmarks/robustness.py                  the issue's 1,000 runs
+With ``--standing`` instead a person who stands still: by how much each angle that nothing observes, averaged over a
+second, leaves its average over the first one. White noise of 20 mm is measured.
+
+  python benchmarks/robustness.py                  1,000 runs
   python benchmarks/robustness.py --only 123       that run alone, frame by frame
 """
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
 import sys
 import warnings
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import common
 import numpy as np
-from honesty import NAMES, OBSERVED, assignment, new_filter, simulate_all
+from honesty import NAMES, OBSERVED, all_runs, new_filter
 
+from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     MODEL,
     POSTURES,
@@ -60,6 +59,8 @@ BACK_WITHIN = 1.0
 """Seconds of good data after which the filter must be back."""
 EXCESS_BAR = 15.0
 """Degrees."""
+DRIFT_BAR, STANDING_NOISE, STANDING_RATE = 10.0, 0.02, 30.0
+"""Of a person who stands still: degrees, metres, Hz."""
 WRONG_START = np.radians(60.0)
 LONGEST_DROPOUT, LONGEST_GAP = 2.0, 1.0
 """Seconds."""
@@ -77,7 +78,7 @@ class Settings:
     seed: int
     seconds: float
     overlap: bool
-    parameters: dict[str, float]
+    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,7 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
-        """Any bar of the issue is missed."""
+        """Any bar is missed."""
         slow = self.back_after > BACK_WITHIN or self.start_back_after > BACK_WITHIN
         return self.nan or self.diverged or self.excess > EXCESS_BAR or slow
 
@@ -245,7 +246,7 @@ class Course:
     counters: dict[str, int]
 
 
-def track(scenario: Scenario, truth: Truth, seen: Observation, parameters: dict[str, float], start: Any) -> Course:
+def track(scenario: Scenario, truth: Truth, seen: Observation, parameters: Mapping[str, float], start: Any) -> Course:
     """The filter over one run; ``start`` is a configuration to begin with, or None."""
     estimator = new_filter(parameters)
     count = len(seen.frames)
@@ -291,7 +292,7 @@ def first_lasting(times: FloatArray, good: BoolArray, begin: float, end: float) 
     return float(times[where[bad[-1] + 1 if len(bad) else 0]] - times[where[0]])
 
 
-def run(number: int, settings: Settings) -> Outcome:
+def run(settings: Settings, number: int) -> Outcome:
     """One run from its number."""
     scenario, truth, seen, start = prepare(number, settings)
     course = track(scenario, truth, seen, settings.parameters, start)
@@ -331,6 +332,28 @@ def run(number: int, settings: Settings) -> Outcome:
     )
 
 
+def standing(minutes: float, seed: int, parameters: Mapping[str, float]) -> dict[str, float]:
+    """Greatest departure of each unobserved angle from its start, degrees, for a person who stands still."""
+    rng = np.random.default_rng(seed)
+    lengths, times = RandomPerson.draw(rng).lengths, capture_times(60.0 * minutes, rng, STANDING_RATE)
+    # upright to some degrees, the arms hanging with slightly bent elbows
+    tangent = np.zeros(MODEL.nv)
+    tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
+    tangent[[NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(rng.uniform(5, 25, 2))
+    q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
+    positions = MODEL.forward(q, lengths).positions
+    truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
+    estimator = ExtendedKalmanFilter(EkfParameters(**parameters))
+    columns, second = [NAMES.index(each) for each in UNOBSERVED], round(STANDING_RATE)
+    history = []
+    for skeleton in observe(truth, MeasurementErrors(STANDING_NOISE), rng).skeletons:
+        estimator.update(skeleton)
+        if estimator.estimate is not None:
+            history.append(np.degrees(MODEL.difference(MODEL.neutral(), estimator.estimate.q)[columns]))
+    averages = np.array(history[: len(history) // second * second]).reshape(-1, second, len(columns)).mean(axis=1)
+    return dict(zip(UNOBSERVED, np.abs(averages - averages[0]).max(axis=0).tolist(), strict=True))
+
+
 def bound(scenario: Scenario) -> float:
     """Metres: greatest RMS error of the 19 points of a filter that is back."""
     return float(np.sqrt(3.0) * scenario.noise + 0.03)
@@ -358,7 +381,7 @@ def frame_by_frame(number: int, settings: Settings) -> None:
             f" {excess.max():6.1f} {NAMES[6 + int(excess.argmax())] if excess.max() > 0.0 else '':26}"
             f" {wrong[angle]:7.1f} +- {np.degrees(course.stddev[k, angle]):5.1f} {NAMES[angle]}"
         )
-    print(f"counters: {course.counters}\n{run(number, settings)}")
+    print(f"counters: {course.counters}\n{run(settings, number)}")
 
 
 def quantiles(values: list[float]) -> str:
@@ -392,35 +415,35 @@ def show(outcomes: list[Outcome], broken: dict[int, str], worst: int) -> None:
     print(f"error at the end / raw error: {quantiles(ratio)}")
     print(f"surprise, standard deviations: {quantiles([outcome.surprise for outcome in outcomes])}")
 
-    def rows(title: str, chosen: list[Outcome], tell: Any) -> None:
+    def listed(title: str, value: Callable[[Outcome], float], text: Callable[[Outcome], str], beyond: float) -> None:
+        chosen = [outcome for outcome in outcomes if not value(outcome) <= beyond and not np.isnan(value(outcome))]
         if chosen:
             print(f"\n{title}")
-        for outcome in chosen[:worst]:
-            print(f"  --only {outcome.number:<5} {tell(outcome)}; {outcome.scenario}")
+        for outcome in sorted(chosen, key=lambda each: -value(each))[:worst]:
+            print(f"  --only {outcome.number:<5} {text(outcome)}; {outcome.scenario}")
 
-    rows(
+    listed(
         "diverged or NaN:",
-        [outcome for outcome in outcomes if outcome.diverged or outcome.nan],
+        lambda o: float(o.diverged or o.nan),
         lambda o: (
             f"rms {1e3 * o.end_error:.0f} mm (raw {1e3 * o.end_noise:.0f}), "
             f"{o.end_worst_point} {1e3 * o.end_worst:.0f} mm"
         ),
+        0.0,
     )
-    rows(
-        "longest until back:",
-        sorted((o for o in outcomes if o.back_after > BACK_WITHIN), key=lambda o: -o.back_after),
-        lambda o: f"{o.back_after:.2f} s",
-    )
-    rows(
+    listed("longest until back:", lambda o: o.back_after, lambda o: f"{o.back_after:.2f} s", BACK_WITHIN)
+    listed(
         "longest until back from a wrong start:",
-        sorted((o for o in outcomes if o.start_back_after > BACK_WITHIN), key=lambda o: -o.start_back_after),
+        lambda o: o.start_back_after,
         lambda o: f"{o.start_back_after:.2f} s",
+        BACK_WITHIN,
     )
-    rows("greatest excess:", sorted(outcomes, key=lambda o: -o.excess), lambda o: f"{o.excess:.1f} deg, {o.excess_at}")
-    rows(
+    listed("greatest excess:", lambda o: o.excess, lambda o: f"{o.excess:.1f} deg, {o.excess_at}", -1.0)
+    listed(
         "greatest surprise:",
-        sorted(outcomes, key=lambda o: -np.nan_to_num(o.surprise, nan=np.inf)),
+        lambda o: float(np.nan_to_num(o.surprise, nan=np.inf)),
         lambda o: f"{o.surprise:.1f} standard deviations, {o.surprise_at}",
+        -1.0,
     )
     for number, problem in sorted(broken.items())[:worst]:
         print(f"\n--only {number} ended in an error:\n{problem}")
@@ -428,39 +451,30 @@ def show(outcomes: list[Outcome], broken: dict[int, str], worst: int) -> None:
 
 def main() -> int:
     """The benchmark; exit code 1 where any run misses a bar."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, jobs=True)
     parser.add_argument("--runs", type=int, default=1000, metavar="N", help="random runs (default: %(default)s)")
     parser.add_argument("--only", type=int, metavar="N", help="this run alone, frame by frame")
     parser.add_argument("--seed", type=int, default=0, help="of all chance (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=6.0, help="length of a run (default: %(default)s)")
-    parser.add_argument(
-        "--worst", type=int, default=5, metavar="N", help="runs to list of a kind (default: %(default)s)"
-    )
-    parser.add_argument("--set", type=assignment, action="append", default=[], metavar="NAME=VALUE",
-                        help="another value of a parameter of the filter (EkfParameters); may be repeated")  # fmt: skip
-    parser.add_argument(
-        "--overlap", action="store_true", help="dropouts and gaps may add up to longer ones: harder than the issue asks"
-    )
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every run's outcome there")
+    parser.add_argument("--seconds", type=float, default=6.0, help="length of a run (default: %(default)g)")
+    parser.add_argument("--worst", type=int, default=5, metavar="N", help="runs to list of a kind (default: 5)")
+    parser.add_argument("--overlap", action="store_true", help="dropouts and gaps may add up to longer ones: harder")
+    parser.add_argument("--standing", type=float, metavar="MINUTES", help="a person who stands still, instead")
+    common.add_set(parser)
     args = parser.parse_args()
     if args.seconds < GOOD + 3.0:
         parser.error(f"--seconds {args.seconds:g}: at least {GOOD + 3.0:g}")
     settings = Settings(args.seed, args.seconds, args.overlap, dict(args.set))
-    new_filter(settings.parameters)  # a wrong parameter is told once, and now
+    new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
+    if args.standing is not None:
+        drift = standing(args.standing, args.seed, settings.parameters)
+        text = "\n".join(f"{name}: up to {value:.1f} deg from its first second" for name, value in drift.items())
+        common.report(args, drift, lambda: print(text))
+        return common.verdicts(args, {f"{name} below {DRIFT_BAR:g} deg": x <= DRIFT_BAR for name, x in drift.items()})
     if args.only is not None:
         frame_by_frame(args.only, settings)
         return 0
-    outcomes, broken = [], {}
-    for number, outcome, problem in simulate_all(run, list(range(args.runs)), settings, args.jobs):
-        if problem:
-            broken[number] = problem
-        else:
-            outcomes.append(outcome)
-    outcomes.sort(key=lambda outcome: outcome.number)
-    show(outcomes, broken, args.worst)
-    if args.json:
-        args.json.write_text(json.dumps({"runs": [asdict(each) for each in outcomes], "broken": broken}, indent=1))
+    outcomes, broken = all_runs(run, settings, list(range(args.runs)), args.jobs)
+    common.report(args, {"runs": outcomes, "broken": broken}, lambda: show(outcomes, broken, args.worst))
     return bool(broken) or any(outcome.failed for outcome in outcomes)
 
 

@@ -39,17 +39,12 @@ simulated one only in very oblique ones. How often bodies are turned round takes
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import common
 import numpy as np
 from calibrate_simulator import PAGE, PAIRS
 from real_pairs import NOMINAL, PEOPLE, paired
@@ -467,31 +462,22 @@ def printed(rows: Sequence[Row]) -> str:
 
 def main() -> int:
     """The benchmark; it has no bar, the rows say where real and simulated differ."""
-    root = Path(__file__).resolve().parent.parent
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = Path(os.environ.get("BODY_TRACKING_DATA", root.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of real recordings (default: %(default)s)")
+    parser = common.parser(__doc__, data=True)
     parser.add_argument("--write", action="store_true", help="write the table into docs/simulator.md")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     args = parser.parse_args()
-    files = {layout: [args.data / "kinect_pairs" / f"{who}_{layout}.csv.gz" for who in PEOPLE] for layout in NOMINAL}
-    if not all(file.is_file() for those in files.values() for file in those):
-        print(f"the real recordings are absent ({args.data})", file=sys.stderr)
-        return 2
     rows: list[Row] = []
-    for layout, those in files.items():
+    for layout in NOMINAL:
         real, simulated = [], []
-        for seed, file in enumerate(those):
-            print(f"{layout}: {seed + 1}/{len(those)} {file.name}", file=sys.stderr, flush=True)
+        files = common.recordings(args.data / "kinect_pairs", [f"{who}_{layout}.csv.gz" for who in PEOPLE])
+        for seed, file in enumerate(files):
+            common.progress(f"{layout}: {seed + 1}/{len(files)} {file.name}")
             pair = real_pair(file)
             real.append(statistics(pair))
             simulated.append(statistics(simulated_pair(pair, seed)))
         rows += rows_of(layout, real, simulated)
     if args.write:
         PAGE.write_text(PAGE.read_text().partition(PAIRS)[0] + section(rows))
-    print(
-        json.dumps([{**asdict(row), "differs": row.differs} for row in rows], indent=2) if args.json else printed(rows)
-    )
+    common.report(args, [{**asdict(row), "differs": row.differs} for row in rows], lambda: print(printed(rows)))
     return 0
 
 

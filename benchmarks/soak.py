@@ -21,30 +21,23 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import json
 import os
-import random
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-
+import common
+import live
 import numpy as np
 import psutil
-import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from four_sensors import nodes_of, running_up
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Trigger
@@ -52,7 +45,6 @@ from tqdm import tqdm
 
 from body_tracking import dds, graph
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
-from body_tracking.parameters import SECTION
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import FloatArray
 
@@ -93,25 +85,21 @@ class Samples:
     deaths: list[str] = field(default_factory=list)
 
 
-class Ear:
+class Ear(live.Ear):
     """Hears a reference sensor, the angles and the diagnostics."""
 
     def __init__(self, sensor: str) -> None:
         dds.prepare()
-        rclpy.init()
-        self.node = rclpy.create_node("soak_bench")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        super().__init__("soak_bench")
         self.sent: dict[bytes, int] = {}
         self.latencies: list[float] = []
         self.angles_at = 0.0
-        self.statuses: dict[str, tuple[float, dict[str, str]]] = {}
         quick = QoSProfile(depth=_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
         # taken by listen(), and not by an executor; in this order
         topics: tuple[tuple[Any, str, Any, bool], ...] = (
             (PointCloud2, graph.skeleton_topic(sensor), self._on_frame, True),
             (JointState, graph.joint_states_topic(graph.DEFAULT_BODY), self._on_angles, True),
-            (DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, False),
+            (DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self.on_diagnostics, False),
         )
         self.subscriptions = [
             self.node.create_subscription(kind, topic, handle, quick, raw=raw) for kind, topic, handle, raw in topics
@@ -127,11 +115,6 @@ class Ear:
         # what is far off is the same stamp of another round of the bag
         if sent is not None and 0 <= info["source_timestamp"] - sent < 2_000_000_000:
             self.latencies.append((info["source_timestamp"] - sent) / 1e9)
-
-    def _on_diagnostics(self, message: DiagnosticArray, _info: Mapping[str, int]) -> None:
-        for status in message.status:
-            name = status.name.split(":")[0]
-            self.statuses[name] = time.time(), {pair.key: pair.value for pair in status.values}
 
     def listen(self, seconds: float) -> None:
         """Take what comes for so long."""
@@ -154,12 +137,15 @@ class Ear:
             return "gave no answer"
         return "" if answer.success else f"said {answer.message}"
 
-    def number(self, node: str, key: str) -> float:
-        """The latest of a node's values."""
-        return float(self.statuses.get(node, (0.0, {}))[1].get(key, 0.0))
 
-    def close(self) -> None:
-        rclpy.try_shutdown()
+def up_command(folder: Path, bag: Path, args: argparse.Namespace) -> list[str]:
+    """``body_tracking up`` with a bag that begins again at its end, and a recorder."""
+    values: dict[str, dict[str, Any]] = {"bag_player": {"loop": True}}
+    if args.imus:
+        values["imu_skeleton"] = {"segments": [f"{name}:imu_{name}" for name in graph.SOME_IMUS]}
+    parameters = live.parameters_file(folder / "parameters.yaml", values)
+    words = ["--bag", bag, "--rate", args.rate, "--filter", args.filter, "--record", folder / "recording"]
+    return live.up_command(*words, "--log-dir", folder, "--params-file", parameters)
 
 
 def simulated(folder: Path, imus: bool) -> Path:
@@ -167,24 +153,10 @@ def simulated(folder: Path, imus: bool) -> Path:
     bag = folder / "bag"
     command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
     command += ["--seconds", str(BAG_SECONDS)]
-    subprocess.run(command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True)
+    subprocess.run(
+        command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True, stdout=subprocess.DEVNULL
+    )
     return bag
-
-
-@contextlib.contextmanager
-def running_graph(folder: Path, bag: Path, args: argparse.Namespace) -> Iterator[subprocess.Popen[bytes]]:
-    """``body_tracking up`` with a bag that begins again at its end, and a recorder."""
-    values: dict[str, Any] = {"bag_player": {SECTION: {"loop": True}}}
-    if args.imus:
-        segments = [f"{name}:imu_{name}" for name in graph.SOME_IMUS]
-        values["imu_skeleton"] = {SECTION: {"segments": segments}}
-    file = folder / "parameters.yaml"
-    file.write_text(yaml.safe_dump(values), encoding="utf-8")
-    command = [sys.executable, "-m", "body_tracking.cli", "up", "--bag", str(bag), "--rate", str(args.rate)]
-    command += ["--filter", args.filter, "--record", str(folder / "recording"), "--log-dir", str(folder)]
-    command += ["--params-file", str(file)]
-    with running_up(command, folder / "up.log") as process:
-        yield process
 
 
 # --- the measurement
@@ -212,7 +184,7 @@ def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any
         duration = (reader.end_ns - reader.start_ns) / 1e9
         sensor = graph.sensors_among(reader.topics)[0]
     with contextlib.ExitStack() as stack:
-        up = stack.enter_context(running_graph(folder, bag, args))
+        (up,) = stack.enter_context(live.processes([up_command(folder, bag, args)], folder / "up.log"))
         ear = Ear(sensor)
         stack.callback(ear.close)
         begin = time.monotonic()
@@ -221,17 +193,17 @@ def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any
                 raise SystemExit(f"soak: the graph did not start:\n{(folder / 'up.log').read_text()}")
             ear.listen(0.5)
         begin, recorded_since = time.monotonic(), time.monotonic()
-        pids = {name: process.pid for name, process in nodes_of(up.pid).items()}
+        pids = {name: process.pid for name, process in live.nodes_of(up.pid).items()}
         total = 60.0 * args.minutes
         bar = stack.enter_context(
-            tqdm(total=total, unit="s", disable=args.json, bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} s")
+            tqdm(total=total, unit="s", disable=None, bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} s")
         )
         cpu: dict[str, float] = {}
         while (now := time.monotonic() - begin) < total:
             if up.poll() is not None:
                 samples.deaths.append(f"the whole graph after {now:.0f} s: {(folder / 'up.log').read_text()[-500:]}")
                 return samples, {"back_s": {}, "cpu": {}}
-            processes = nodes_of(up.pid)
+            processes = live.nodes_of(up.pid)
             for name, pid in pids.items():
                 if name not in processes or processes[name].pid != pid:
                     samples.deaths.append(f"{name} after {now:.0f} s")
@@ -248,22 +220,21 @@ def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any
             bar.update(now - bar.n)
             time.sleep(max(0.0, min(PERIOD, total) - LISTENING - (time.monotonic() - begin - now)))
             ear.listen(LISTENING)
-        for name, process in nodes_of(up.pid).items():
-            times = process.cpu_times()
-            cpu[name] = (times.user + times.system) / (time.time() - process.create_time())
+        for name, process in live.nodes_of(up.pid).items():
+            cpu[name] = float(live.cpu_seconds(process).sum()) / (time.time() - process.create_time())
         back = {name: _killed(name, up, ear) for name in pids} if args.kill else {}
     return samples, {"back_s": back, "cpu": cpu}
 
 
 def _killed(name: str, up: subprocess.Popen[bytes], ear: Ear) -> float | None:
     """Kill a node; seconds until it reports again and angles come; None where that did not happen."""
-    nodes_of(up.pid)[name].kill()
+    live.nodes_of(up.pid)[name].kill()
     killed, since = time.monotonic(), time.time()
     while time.monotonic() - killed < BACK_WITHIN:
         ear.listen(0.2)
         # what was on its way when the node died does not count
-        reported = ear.statuses.get(name, (0.0, {}))[0] > since + 0.5
-        if reported and name in nodes_of(up.pid) and ear.angles_at > since + 0.5:
+        reported = ear.statuses.get(name, (0.0, None))[0] > since + 0.5
+        if reported and name in live.nodes_of(up.pid) and ear.angles_at > since + 0.5:
             return round(time.monotonic() - killed, 1)
     return None
 
@@ -367,8 +338,6 @@ def show(result: Mapping[str, Any]) -> None:
     if result["back_s"]:
         texts = [f"{name} {'never' if at is None else f'{at:g} s'}" for name, at in result["back_s"].items()]
         print(f"  killed, and back with angles after: {', '.join(texts)}")
-    for name, met in bars(result).items():
-        print(f"  {name}: {'met' if met else 'missed'}")
 
 
 def draw(samples: Samples, path: Path) -> None:
@@ -397,15 +366,16 @@ def draw(samples: Samples, path: Path) -> None:
 
 def main() -> int:
     """The command: 0, or 1 when a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60.0, help="to run (default 60)")
-    parser.add_argument("--rate", type=float, default=10.0, help="times the rate of the recording (default 10)")
-    parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="(default %(default)s)")
+    parser = common.parser(__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0, help="to run (default: %(default)g)")
+    parser.add_argument("--rate", type=float, default=10.0, help="times the recording's (default: %(default)g)")
+    parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="(default: %(default)s)")
     parser.add_argument("--imus", action="store_true", help="inertial sensors on the forearms, too")
     parser.add_argument("--bag", type=Path, help="play this one (default: a minute is simulated)")
     parser.add_argument("--no-kill", dest="kill", action="store_false", help="kill no node at the end")
-    parser.add_argument("-o", "--output", type=Path, default=Path("soak.png"), help="the picture (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("soak.png"), help="the picture (default: %(default)s)"
+    )
     args = parser.parse_args()
     if not 0.5 <= args.minutes <= 1440.0:
         parser.error(f"--minutes {args.minutes:g}: expected 0.5 to 1440")
@@ -414,12 +384,9 @@ def main() -> int:
     result = result_of(samples, more, args)
     result["bars"] = bars(result)
     draw(samples, args.output)
-    if args.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-        print(f"picture: {args.output}")
-    return 0 if all(result["bars"].values()) else 1
+    common.report(args, result, lambda: show(result))
+    common.progress(f"picture: {args.output}")
+    return common.verdicts(args, result["bars"])
 
 
 if __name__ == "__main__":

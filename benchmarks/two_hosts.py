@@ -8,10 +8,10 @@ in its own clock, with no difference between their clocks. Needs root, or a syst
 every interface and namespace ends with the processes.
 
 The angles are compared with those that the same chain makes offline of the same recording: of all of it, and of it
-without the frames that were lost on the way, which tells what the loss alone does. Where the chain's own standard
+without the frames that were lost on the way, which shows what the loss alone does. Where the chain's own standard
 deviation of an angle exceeds 15 degrees in one of them, nothing is compared; nor from the beginning of the cut until a
 second after its end. The time of each capture is known, so are the errors of the stamps; the delay of the fastest
-frame, which no receiver can tell, is taken off.
+frame, which no receiver can know, is subtracted.
 
 The bars: the angles are as far from those of the recording as the loss alone puts them, and half a degree more at most
 (RMS of each; a quarter of a degree more all together); angles come again within a second after the link is back, and
@@ -24,11 +24,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import os
-import random
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -38,19 +34,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import common
 import hosts
+import live
 import numpy as np
-import yaml
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
-from body_tracking.calibration.storage import save
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.parameters import SECTION
 from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
 from body_tracking.simulation import scene
@@ -104,14 +98,10 @@ def simulate(seconds: float, folder: Path) -> SimulatedRecording:
     """The recording as a bag in a folder, and its calibration in two files."""
     recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
     write_bag(recording, folder / "bag")
-    names = [sensor.pose.sensor for sensor in recording.sensors]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
-    for file, clocks in (
-        ("recorded.yaml", {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}),
-        ("received.yaml", dict.fromkeys(names, ClockModel())),
-    ):
-        save(CalibrationResult(names[0], poses, clocks, quality), folder / file)
+    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    live.calibrated(folder / "recorded.yaml", poses, clocks)
+    live.calibrated(folder / "received.yaml", poses)
     return recording
 
 
@@ -142,38 +132,37 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     """Stream the recording."""
     link, before = options.link, SETTLE + options.seconds
     names = [sensor.pose.sensor for sensor in recording.sensors]
-    key, parameters = folder / "key", folder / "parameters.yaml"
+    key = folder / "key"
     sender = [sys.executable, "-m", "body_tracking.sensors.kinect_sender"]
     subprocess.run([*sender, "--make-key", str(key)], check=True, stdout=subprocess.DEVNULL)
     begun = time.monotonic()
     subprocess.run([*sender, "--replay", str(folder / "bag"), "--sensor", "nobody"], stderr=subprocess.DEVNULL)
     lead = LEAD + LEAD_FACTOR * (time.monotonic() - begun)
     ports = {name: _PORT + k for k, name in enumerate(names)}
-    values = {
-        f"{name}_skeleton": {
-            SECTION: {"backend": "network", "address": hosts.INSIDE, "port": port, "key_file": str(key)}
-        }
-        for name, port in ports.items()
-    }
-    parameters.write_text(yaml.safe_dump(values), encoding="utf-8")
-    up = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", options.filter, "--sensors", ",".join(names)]
-    up += ["--params-file", str(parameters), "--calibration", str(folder / "received.yaml")]
-    up += ["--record", str(folder / "live"), "--log-dir", str(folder), "--reliable"]
-    with hosts.hosts(link.loss, link.jitter) as (outside, middleman), contextlib.ExitStack() as stack:
+    network = {"backend": "network", "address": hosts.INSIDE, "key_file": str(key)}
+    values = {f"{name}_skeleton": {**network, "port": port} for name, port in ports.items()}
+    parameters = live.parameters_file(folder / "parameters.yaml", values)
+    up = live.up_command("--filter", options.filter, "--sensors", ",".join(names), "--params-file", parameters)
+    up += ["--calibration", str(folder / "received.yaml"), "--record", str(folder / "live")]
+    up += ["--log-dir", str(folder), "--reliable"]
+    with hosts.hosts() as (outside, middle), contextlib.ExitStack() as stack:
 
         def begin(name: str, command: Sequence[str]) -> subprocess.Popen[bytes]:
-            with (folder / f"{name}.log").open("wb") as log:
-                made = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT)
-            stack.callback(_stop, made)
+            log = folder / f"{name}.log"
+            (made,) = stack.enter_context(live.processes([command], log, 20.0, stdin=subprocess.PIPE))
             return made
 
+        middleman = begin("relay", [*middle, *hosts.command("relay", link.loss, link.jitter, *ports.values())])
         graph_process = begin("up", up)
         # The sensors' nodes come last, when everybody listens to whom they should.
-        end = time.monotonic() + READY_TIMEOUT
-        while not all(f":{port:04X}" in Path("/proc/net/udp").read_text() for port in ports.values()):
-            if graph_process.poll() is not None or time.monotonic() > end:
-                raise SystemExit(f"two_hosts: the graph did not come up\n{(folder / 'up.log').read_text()[-2000:]}")
-            time.sleep(0.1)
+        ports_open = [f":{port:04X}" for port in ports.values()]
+        live.wait(
+            "two_hosts: the graph",
+            lambda: all(port in Path("/proc/net/udp").read_text() for port in ports_open),
+            [graph_process],
+            READY_TIMEOUT,
+            folder / "up.log",
+        )
         start = time.time() + lead
         link = replace(link, cut=(start + before, start + before + options.cut) if options.cut else (0.0, 0.0))
         assert middleman.stdin is not None
@@ -182,7 +171,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
         senders = {}
         for name in names:
             words = [*sender, "--replay", str(folder / "bag"), "--sensor", name, "--key-file", str(key)]
-            words += ["--to", f"{hosts.INSIDE}:{ports[name]}", "--start-time", repr(start)]
+            words += ["--to", f"{hosts.RELAY_OUT}:{ports[name]}", "--start-time", repr(start)]
             senders[name] = begin(name, [*outside, *hosts.command("shift", options.shift, *words)])
         while time.time() < start + recording.duration + 1.0:
             if graph_process.poll() is not None or middleman.poll() is not None:
@@ -190,16 +179,6 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
             time.sleep(0.1)
         codes = {name: process.wait(60.0) for name, process in senders.items()}
     return Run(start, link, (folder / "up.log").read_text().count("starting it again"), codes)
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(20.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 # --- what came of it
@@ -409,8 +388,7 @@ def recovery(received: FloatArray, wall: FloatArray, apart: FloatArray, start: f
 
 
 def _rms(values: FloatArray) -> float:
-    finite = values[np.isfinite(values)]
-    return round(float(np.sqrt((finite**2).mean())), 3) if len(finite) else 0.0
+    return round(common.rms(values), 3) if np.isfinite(values).any() else 0.0
 
 
 def last_values(bag: Path) -> dict[str, dict[str, str]]:
@@ -448,7 +426,7 @@ def bars(result: dict[str, Any]) -> dict[str, bool]:
 
 def main() -> int:
     """The command: 0 where every bar is met, 1 where not, 77 where namespaces are not permitted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__)
     parser.add_argument(
         "--seconds", type=float, default=20.0, help="to compare before and after the cut, each (default 20)"
     )
@@ -458,7 +436,6 @@ def main() -> int:
     parser.add_argument("--shift", type=float, default=0.3, help="seconds between the clocks (default 0.3)")
     parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="default %(default)s")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for recordings and logs, to look at them later")
-    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if not args.inside:
@@ -466,23 +443,18 @@ def main() -> int:
     link = Link(args.loss / 100.0, args.jitter / 1e3)
     result = measure(Options(args.seconds, args.cut, args.shift, link, args.filter, args.keep))
     result["bars"] = bars(result)
-    if args.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-    return 0 if all(result["bars"].values()) else 1
+    common.report(args, result, lambda: show(result))
+    return common.verdicts(args, result["bars"])
 
 
 def _inside() -> int:
     """The same command in a network namespace of its own: the host of the graph."""
     reason = hosts.not_permitted()
     if reason:
-        print(f"two_hosts: network and time namespaces are not permitted here ({reason})", file=sys.stderr)
+        common.progress(f"two_hosts: network and time namespaces are not permitted here ({reason})")
         return NO_NAMESPACES
-    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    environment.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
     command = hosts.in_own_network([sys.executable, __file__, "--inside", *sys.argv[1:]])
-    process = subprocess.Popen(command, env=environment)
+    process = subprocess.Popen(command)  # in the ROS domain that `live` has chosen
     try:
         return process.wait()
     except KeyboardInterrupt:
@@ -513,8 +485,6 @@ def show(result: dict[str, Any]) -> None:
             f"{angles['recovery_limit_deg']} deg from {angles['recovery_s']} s on"
         )
     print(f"  restarts: {result['restarts']}")
-    for name, met in result["bars"].items():
-        print(f"  {'met   ' if met else 'MISSED'} {name}")
 
 
 if __name__ == "__main__":

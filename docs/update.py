@@ -1,4 +1,4 @@
-"""Write what the code defines: the tables of README.md, and the files in config/ with every parameter.
+"""Write what the code defines: the tables of README.md and benchmarks/README.md, and the files in config/.
 
 With ``--check`` it only says whether they are up to date.
 """
@@ -22,6 +22,17 @@ ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 CONFIG = ROOT / "config" / "body_tracking.yaml"
 SIMULATOR = ROOT / "config" / "simulator.yaml"
+BENCHMARKS = ROOT / "benchmarks" / "README.md"
+BENCHMARKS_HEADER = """\
+# Benchmarks
+
+Written by `make docs` from `benchmarks/run.py`. `python benchmarks/run.py NAME [options]` runs one of them, as
+`python benchmarks/NAME.py [options]` does; `--help` says more of each, `make bench` runs all that can run here. Times
+are those of a run with default options on two cores. The real recordings are looked for in `../shared/data`, or where
+`BODY_TRACKING_DATA` says. `--seeds N` sets how many people there are per case, `--jobs N` how many processes compute,
+`--out FILE` where all figures are written as JSON, `--json` prints these instead of tables. Exit codes: 0 every bar is
+met, 1 one is missed, 2 real recordings are absent.
+"""
 SIMULATOR_HEADER = """\
 # How much a simulated Kinect v2 errs. Written by `make docs` from the code; copy it, keep what you change:
 #   body_tracking simulate --config my_errors.yaml -o bag
@@ -145,10 +156,18 @@ def readme() -> str:
     return SECTION.sub(lambda match: f"{match[1]}{WRITERS[match[2]]()}{match[3]}", text)
 
 
+def benchmarks() -> str:
+    """The text of benchmarks/README.md."""
+    sys.path.insert(0, str(BENCHMARKS.parent))
+    import run
+
+    return BENCHMARKS_HEADER + "\n" + table(("benchmark", "what it shows", "needs", "takes about"), run.rows())
+
+
 def files() -> dict[Path, str]:
     """The text of each file as the code defines it now."""
     simulator = f"{SIMULATOR_HEADER}\n{kinect.errors_as_yaml()}"
-    return {README: readme(), CONFIG: systems.config_text(), SIMULATOR: simulator}
+    return {README: readme(), CONFIG: systems.config_text(), SIMULATOR: simulator, BENCHMARKS: benchmarks()}
 
 
 def main() -> int:

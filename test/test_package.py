@@ -255,6 +255,15 @@ def test_readme_and_parameters_file_are_those_of_the_code() -> None:
     run(sys.executable, "docs/update.py", "--check", cwd=ROOT)
 
 
+def test_the_table_of_benchmarks_lists_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ROOT / "benchmarks"
+    monkeypatch.syspath_prepend(str(folder))
+    import run as runner
+
+    scripts = {path.stem for path in folder.glob("*.py") if "common.parser(__doc__" in path.read_text()}
+    assert scripts == {each.name for each in runner.BENCHMARKS}
+
+
 def test_picture_shows_every_node_and_topic() -> None:
     picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
     texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}

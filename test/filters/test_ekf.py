@@ -868,7 +868,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     Points that are known exactly leave two directions, along which the prior decides. The filter applies it to its
     state and once more to its output, so the stated deviation is at least that of a prior that counts twice, less 5 %
     as it is evaluated at the estimate. It is never more than the prior's deviation before any measurement.
-    Ten minutes take too long here; benchmarks/real_people.py has them.
+    Ten minutes take too long here; ``benchmarks/robustness.py --standing 10`` has them.
     """
     seed = 0
     rng = np.random.default_rng(seed)

@@ -1,0 +1,315 @@
+"""Live benchmarks: the graph's nodes as processes, and a node that takes the sensors' place and the time of what comes.
+
+Imported before rclpy: the ROS domain is one of its own, and stays on this machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+
+import numpy as np
+import psutil
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+
+from body_tracking import graph
+from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking.calibration.storage import save
+from body_tracking.cdr import encode_skeletons
+from body_tracking.messages.diagnostics import NodeStatus, statuses
+from body_tracking.nodes.bag_topics import to_profile
+from body_tracking.parameters import SECTION, to_ros
+from body_tracking.pipeline.system import Options
+from body_tracking.recording.qos import RELIABLE
+from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.systems import nodes_for
+
+STAMP = struct.Struct("<iI")
+"""Behind the encapsulation (4 bytes): every message here begins with its header."""
+
+Event = tuple[float, str, bytearray]
+"""Seconds, topic, and message as CDR, whose stamp is set when it is sent: a driver costs little, and so must this."""
+
+# --- processes
+
+
+def calibrated(
+    file: Path,
+    poses: Mapping[str, SensorPose],
+    clocks: Mapping[str, ClockModel] | None = None,
+    drift_ppm: float = np.inf,
+) -> str:
+    """Write the calibration of sensors that stand there, and share a clock unless theirs are given; its path.
+
+    ``drift_ppm``: the standard deviation of the clocks' drifts.
+    """
+    own = {name: ClockModel() for name in poses} | dict(clocks or {})
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_ppm) for name in poses}
+    save(CalibrationResult(next(iter(poses)), dict(poses), own, quality), file)
+    return str(file)
+
+
+def node_commands(folder: Path, options: Options, level: str = "WARN") -> list[list[str]]:
+    """Command lines of the nodes of a graph without its Kinects: the benchmark takes their place.
+
+    Args:
+        folder: where their parameters are written.
+        options: the graph.
+        level: what they log.
+    """
+    lines = []
+    for spec in nodes_for(options):
+        if spec.executable == "kinect_skeleton":
+            continue
+        values = {name: to_ros(value) for name, value in {**spec.defaults, **spec.parameters}.items()}
+        file = parameters_file(folder / f"{spec.name}.parameters.yaml", {spec.full_name: values})
+        line = ["-m", "body_tracking.nodes", spec.executable, "--ros-args", "--log-level", level]
+        lines.append([sys.executable, *line, "--params-file", file])
+    return lines
+
+
+def parameters_file(file: Path, values: Mapping[str, Mapping[str, Any]]) -> str:
+    """Write parameters of nodes, by their names; its path."""
+    sections = {name: {SECTION: dict(each)} for name, each in values.items()}
+    file.write_text(yaml.safe_dump(sections), encoding="utf-8")
+    return str(file)
+
+
+@contextlib.contextmanager
+def processes(
+    lines: Iterable[Sequence[str]], log: Path | None = None, patience: float = 30.0, **options: Any
+) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """A process for each command line, which ends when this process does; in the end all end as Ctrl-C does.
+
+    Args:
+        lines: the commands.
+        log: file for all that they print; None for this process's own output.
+        patience: seconds until those that do not end are killed.
+        options: of ``Popen``.
+    """
+    environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
+    running: list[subprocess.Popen[bytes]] = []
+    with contextlib.ExitStack() as stack:
+        output = {"stdout": stack.enter_context(log.open("wb")), "stderr": subprocess.STDOUT} if log else {}
+        given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "env": environment, "start_new_session": True}
+        try:
+            running.extend(subprocess.Popen(line, **(given | output | options)) for line in lines)
+            yield running
+        finally:
+            for process in running:
+                process.send_signal(signal.SIGINT)
+            for process in running:
+                try:
+                    process.wait(patience)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def up_command(*words: object) -> list[str]:
+    """``body_tracking up``, which ends its nodes itself."""
+    return [sys.executable, "-m", "body_tracking.cli", "up", *(str(word) for word in words)]
+
+
+def wait(
+    what: str,
+    ready: Callable[[], bool],
+    running: Iterable[subprocess.Popen[bytes]] = (),
+    seconds: float = 60.0,
+    log: Path | None = None,
+) -> None:
+    """Until it is ready; ``log``: what to show of it where it is not.
+
+    Raises:
+        SystemExit: it takes too long, or a process ends.
+    """
+    end, running = time.monotonic() + seconds, list(running)
+    while not ready():
+        if time.monotonic() > end or any(process.poll() is not None for process in running):
+            raise SystemExit(f"{what} did not come up\n{log.read_text()[-2000:] if log else ''}")
+        time.sleep(0.1)
+
+
+def nodes_of(pid: int) -> dict[str, psutil.Process]:
+    """The node processes that ``body_tracking up`` has started, by name."""
+    found = {}
+    for process in psutil.Process(pid).children():
+        with contextlib.suppress(psutil.Error):
+            words = process.cmdline()
+            names = [word.removeprefix("__node:=") for word in words if word.startswith("__node:=")]
+            if names:
+                found[names[0]] = process
+    return found
+
+
+def cpu_seconds(process: psutil.Process, children: bool = False) -> FloatArray:
+    """(2,) seconds of user and system time, with those of its children where these are asked for."""
+    times = [each.cpu_times() for each in (process, *(process.children(recursive=True) if children else ()))]
+    return np.array([[each.user, each.system] for each in times]).sum(axis=0)
+
+
+# --- the node of a benchmark
+
+
+class Ear:
+    """Takes the time of what comes, and keeps the latest diagnostics.
+
+    Attributes:
+        node: of this process.
+        received: by name and stamp (ns) the time of receipt (ns) by ``now``.
+        statuses: by node the wall time, s, and what it said last.
+    """
+
+    def __init__(self, name: str, now: Callable[[], int] = time.perf_counter_ns) -> None:
+        rclpy.init()
+        self.node = rclpy.create_node(name)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.received: dict[str, dict[int, int]] = {}
+        self.statuses: dict[str, tuple[float, NodeStatus]] = {}
+        self._now = now
+
+    def time(self, name: str, topic: str, kind: type = JointState, qos: Any = RELIABLE) -> None:
+        """Note when each message of a topic comes first."""
+        received = self.received.setdefault(name, {})
+
+        def on_message(cdr: bytes) -> None:
+            seconds, rest = STAMP.unpack_from(cdr, 4)
+            received.setdefault(seconds * NANOSECONDS + rest, self._now())
+
+        self.node.create_subscription(kind, topic, on_message, to_profile(qos), raw=True)
+
+    def hear_diagnostics(self) -> None:
+        """Keep what nodes say of themselves."""
+        self.node.create_subscription(
+            DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self.on_diagnostics, to_profile(RELIABLE)
+        )
+
+    def on_diagnostics(self, message: DiagnosticArray, _info: Any = None) -> None:
+        """One message."""
+        for status in statuses(message):
+            self.statuses[status.node] = time.time(), status
+
+    def values(self, node: str) -> Mapping[str, str]:
+        """What a node said last."""
+        return dict(self.statuses[node][1].values) if node in self.statuses else {}
+
+    def number(self, node: str, key: str) -> float:
+        """One of these."""
+        return float(self.values(node).get(key, 0.0))
+
+    def spin(self) -> None:
+        """Listen in a thread, until :meth:`close`."""
+
+        def run() -> None:
+            with contextlib.suppress(ExternalShutdownException):
+                self.executor.spin()
+
+        threading.Thread(target=run, daemon=True).start()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        rclpy.try_shutdown()
+
+
+class Bench(Ear):
+    """Sends what sensors say at its time, too.
+
+    Attributes:
+        sent: by name and stamp (ns) the time (ns) just before it was published.
+        start_ns: when second 0 was.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.sent: dict[str, dict[int, int]] = {}
+        self.start_ns = 0
+        self._outputs: dict[str, Any] = {}
+
+    def publisher(self, topic: str, kind: type) -> None:
+        """Prepare to send messages of a topic, best effort."""
+        self._outputs[topic] = self.node.create_publisher(kind, topic, to_profile(graph.SKELETON))
+
+    def connected(self, listeners: Mapping[str, int]) -> bool:
+        """Whether each topic has so many of them."""
+        return all(self.node.count_subscribers(topic) >= count for topic, count in listeners.items())
+
+    def publish(self, events: Iterable[Event], counted: Mapping[str, str], since: float = 0.0) -> list[float]:
+        """Send everything at its time, with its time as the stamp.
+
+        Args:
+            events: in their order.
+            counted: by topic the name under which it is noted when a message was sent.
+            since: seconds before which nothing is noted.
+
+        Returns:
+            By how many milliseconds the sending was late.
+        """
+        self.start_ns, late = time.perf_counter_ns() + NANOSECONDS // 10, []
+        for at, topic, message in events:
+            due = self.start_ns + round(at * NANOSECONDS)
+            STAMP.pack_into(message, 4, *divmod(due, NANOSECONDS))
+            time.sleep(max(0, due - time.perf_counter_ns()) / NANOSECONDS)
+            now = time.perf_counter_ns()
+            late.append((now - due) / 1e6)
+            if at >= since and topic in counted:
+                self.sent.setdefault(counted[topic], {})[due] = now
+            self._outputs[topic].publish(bytes(message))
+        return late
+
+    def delays_ms(self, name: str, begin_ns: float = 0, end_ns: float = np.inf) -> tuple[FloatArray, int]:
+        """(n,) delays of what was sent between two times and came, in the order of sending; how many did not come."""
+        sent = [(stamp, at) for stamp, at in sorted(self.sent.get(name, {}).items()) if begin_ns <= at < end_ns]
+        received = self.received[name]
+        delays = [received[stamp] - at for stamp, at in sent if stamp in received]
+        return np.array(delays) / 1e6, len(sent) - len(delays)
+
+
+def percentiles(delays: FloatArray, what: str, late: int = 99) -> dict[str, float]:
+    """Median and a late percentile, ms.
+
+    Raises:
+        SystemExit: there is nothing.
+    """
+    if not len(delays):
+        raise SystemExit(f"nothing came through {what}")
+    median, last = np.percentile(delays, [50, late])
+    return {"median_ms": round(float(median), 3), f"p{late}_ms": round(float(last), 3), "frames": len(delays)}
+
+
+class Stream:
+    """What one sensor saw, by time: frames that were lost must not put two sensors out of step.
+
+    Args:
+        frames: (n,) the bodies in each frame.
+        clock: of the sensor.
+        back: play it backwards after its end, so that nobody jumps, instead of anew.
+    """
+
+    def __init__(self, frames: Sequence[Sequence[Skeleton]], clock: ClockModel, back: bool = False) -> None:
+        self._messages = [bytearray(encode_skeletons(skeletons)) for skeletons in frames]
+        self._times = np.array([clock.to_reference(skeletons[0].stamp_ns) for skeletons in frames])
+        self._back = back
+
+    def at(self, seconds: float) -> bytearray:
+        """The message of the frame nearest to a time since the start."""
+        first, length = int(self._times[0]), int(self._times[-1] - self._times[0])
+        way = round(seconds * NANOSECONDS) % ((1 + self._back) * length)
+        return self._messages[int(np.abs(self._times - first - min(way, 2 * length - way)).argmin())]

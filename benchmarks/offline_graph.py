@@ -1,0 +1,54 @@
+"""The graph as ``body_tracking replay`` runs it, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.recording.forked import is_second
+from body_tracking.recording.replay import ReplaySettings
+from body_tracking.recording.rosbag2 import BAG_WIRE
+from body_tracking.systems import STAGES, stage_class
+
+
+class OfflineGraph:
+    """Calibration to joint angles, fed with messages.
+
+    Args:
+        settings: with the sensors.
+        sink: gets topic, message and time of all that goes in and comes out.
+        topics: those that go in.
+
+    Attributes:
+        stages: by name.
+    """
+
+    def __init__(
+        self, settings: ReplaySettings, sink: Callable[[str, bytes, int], None], topics: Iterable[str]
+    ) -> None:
+        values = settings.values()
+        self.stages = {name: stage_class(name)(values[name]) for name in STAGES if name in values}
+        self._sink = sink
+        upstream = [stage for name, stage in self.stages.items() if not is_second(name)]
+        downstream = [stage for name, stage in self.stages.items() if is_second(name)]
+        published = {*topics, *(port.topic for stage in upstream for port in stage.outputs)}
+        self._upstream = OfflineRunner(upstream, BAG_WIRE, self._pass)
+        self._downstream = OfflineRunner(downstream, BAG_WIRE, sink, published)
+
+    def _pass(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        self._sink(topic, cdr, at_ns)
+        self._downstream.push(topic, cdr, at_ns)
+
+    def start(self, at_ns: int) -> None:
+        """Before the first message."""
+        self._upstream.start(at_ns)
+
+    def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        """One message of a sensor."""
+        self._pass(topic, cdr, at_ns)
+        self._upstream.push(topic, cdr, at_ns)
+
+    def finish(self, at_ns: int) -> None:
+        """After the last message."""
+        self._upstream.finish(at_ns)
+        self._downstream.finish(at_ns)
