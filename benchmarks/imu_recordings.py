@@ -37,7 +37,8 @@ from body_tracking.inertial.alignment import (
 from body_tracking.inertial.angles import SegmentAngles
 from body_tracking.inertial.clock import Turning, clock_offset
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.upper_body import SEGMENTS, UpperBody
+from body_tracking.kinematics.model import SEGMENTS
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.sensors.imu import ImuSample
 from body_tracking.sensors.imu_csv import ImuCsvRecording
 from body_tracking.sensors.mvnx import MvnxFrame, MvnxRecording

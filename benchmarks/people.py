@@ -37,8 +37,8 @@ from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import decode_skeletons
 from body_tracking.filters.roles import role_of
-from body_tracking.fusion.people import People, PeopleParameters
-from body_tracking.fusion.subject import ALL
+from body_tracking.fusion.people import People
+from body_tracking.fusion.subject import ALL, PeopleParameters
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import sensor_topics

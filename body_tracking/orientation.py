@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.skeleton import FloatArray
 
 SEGMENT_NUMBER: Final = {name: number for number, name in enumerate(SEGMENTS)}
-"""Of each segment its place in ``upper_body.SEGMENTS``."""
+"""Of each segment its place in :data:`~body_tracking.kinematics.model.SEGMENTS`."""
 
 MAX_RATE: Final = 70.0
 """Radians per second: a gyroscope's greatest range is 4000 deg/s; beyond is no measurement but a damaged number."""

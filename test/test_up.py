@@ -34,8 +34,7 @@ from body_tracking.calibration.result import CalibrationResult, SensorQuality  #
 from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.cdr import decode_skeletons  # noqa: E402
 from body_tracking.filters.roles import ROLES  # noqa: E402
-from body_tracking.fusion.people import PeopleParameters  # noqa: E402
-from body_tracking.fusion.subject import ALL  # noqa: E402
+from body_tracking.fusion.subject import ALL, PeopleParameters  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.node_parameters import parameters_for  # noqa: E402

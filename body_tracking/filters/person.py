@@ -18,7 +18,9 @@ from body_tracking.filters.roles import role_of
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
-from body_tracking.fusion.people import People, PeopleParameters
+from body_tracking.fusion.people import People
+from body_tracking.fusion.subject import PeopleParameters
+from body_tracking.kinematics.codecs import Segments
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import LengthChanges
 from body_tracking.orientation import SegmentOrientation
@@ -26,7 +28,6 @@ from body_tracking.pipeline.codecs import (
     ModelCovariance,
     ModelState,
     ModelStddev,
-    Segments,
     Skeletons,
     Text,
 )

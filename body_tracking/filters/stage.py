@@ -17,8 +17,8 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
-from body_tracking.fusion.people import PEOPLE, people_from
 from body_tracking.fusion.stage import calibration_inputs
+from body_tracking.fusion.subject import PEOPLE, people_from
 from body_tracking.orientation import SEGMENT_NUMBER, OrientationError
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.pipeline.codecs import (

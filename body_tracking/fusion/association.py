@@ -19,18 +19,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from body_tracking.fusion.subject import HOLD
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
 
 _MIDLINE = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK], dtype=np.intp)
 _LEFT = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
 TORSO_POINTS = len(_MIDLINE) + len(_LEFT)
-
-GATE = 0.6
-"""Metres between a torso and where a person is expected, from which it is somebody else's; more for one long unseen."""
-
-HOLD = 3.0
-"""Seconds for which a person whom no sensor sees keeps the id."""
 
 _CONFIRM = round(0.3 * NANOSECONDS)
 """A body that is nobody's becomes a person when it is seen for this long, nanoseconds: ghosts last a few frames."""
@@ -67,6 +62,10 @@ _KEPT, _RECENT = 6, round(0.3 * NANOSECONDS)
 
 _LOOK = round(1.0 * NANOSECONDS)
 """One who is alone is looked at this often, nanoseconds."""
+
+GATE = 0.6
+"""Metres between a torso and where a person is expected, from which it is somebody else's; more for one long unseen."""
+
 
 _IMPOSSIBLE = 1e9
 

@@ -6,16 +6,20 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from body_tracking.calibration.result import ClockModel, SensorPose
-from body_tracking.fusion.association import HOLD, Association
+from body_tracking.fusion.association import Association
 from body_tracking.fusion.placement import CLOCK_JUMP, Placement
-from body_tracking.fusion.subject import ALL, FIRST, MAX_PEOPLE, NEAREST, SUBJECTS, SubjectSelector
-from body_tracking.parameters import Value, fields_of, parameters_from
+from body_tracking.fusion.subject import (
+    ALL,
+    FIRST,
+    PeopleParameters,
+    SubjectSelector,
+)
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 _PRESENT = round(0.2 * NANOSECONDS)
@@ -26,37 +30,6 @@ _PENDING = 5
 
 _KEEP = 5 * NANOSECONDS
 """Poses and clocks are kept for frames that are late by no more than this, nanoseconds."""
-
-
-@dataclass(frozen=True, slots=True)
-class PeopleParameters:
-    """Whom to track."""
-
-    subject: str = field(
-        default=NEAREST,
-        metadata={
-            "doc": "whom to track: the person who is nearest to the reference sensor at first, or the one who is seen "
-            "first, for as long as that person is there; or all, each under a number and with topics of their own",
-            "choices": SUBJECTS,
-        },
-    )
-    people: int = field(
-        default=MAX_PEOPLE,
-        metadata={
-            "doc": "subject all: how many people at most; their ids are body1, body2, ...",
-            "min": 1,
-            "max": 16,
-        },
-    )
-    hold: float = field(
-        default=HOLD,
-        metadata={
-            "doc": "a person whom no sensor sees keeps the id for this long; another is chosen, or gets it, then",
-            "unit": "s",
-            "min": 0.5,
-            "max": 60.0,
-        },
-    )
 
 
 class Slots:
@@ -106,21 +79,6 @@ class _Sensor(Placement):
         self.used: SensorPose | None = None
         self.pending: deque[tuple[int, SensorPose, Skeleton]] = deque(maxlen=_PENDING)
         self.selector.reset()
-
-
-PEOPLE = parameters_from(PeopleParameters, only=("subject", "people"))
-"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
-
-
-def people_from(values: Mapping[str, Value]) -> PeopleParameters:
-    """Whom to track, of the values of :data:`PEOPLE`.
-
-    Raises:
-        ParameterError: one of them is out of its range.
-    """
-    table = parameters_from(PeopleParameters)
-    given = {item.name: item.check(values[item.name]) for item in table if item.name in values}
-    return PeopleParameters(**fields_of(PeopleParameters, given))
 
 
 class People:

@@ -9,8 +9,8 @@ from itertools import groupby
 
 from body_tracking.calibration.result import ClockModel, SensorPose
 from body_tracking.fusion.fusion import WORLD, Fusion, FusionParameters
-from body_tracking.fusion.people import People, PeopleParameters
-from body_tracking.fusion.subject import ALL
+from body_tracking.fusion.people import People
+from body_tracking.fusion.subject import ALL, PeopleParameters
 from body_tracking.skeleton import Skeleton
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from body_tracking import graph
 from body_tracking.fusion.fusion import FusionParameters
-from body_tracking.fusion.people import PEOPLE, people_from
 from body_tracking.fusion.people_fusion import PeopleFusion
+from body_tracking.fusion.subject import PEOPLE, people_from
 from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.pipeline.codecs import Clock, Pose, Skeletons
 from body_tracking.pipeline.shared import (

@@ -1,11 +1,13 @@
-"""Which of the bodies that a sensor sees is the one that is tracked."""
+"""Whom to track: parameters that several nodes have, and which of the bodies that a sensor sees is the subject."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from body_tracking.parameters import Value, fields_of, parameters_from
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 SUBJECTS = NEAREST, FIRST, ALL = "nearest", "first", "all"
@@ -13,6 +15,56 @@ SUBJECTS = NEAREST, FIRST, ALL = "nearest", "first", "all"
 
 MAX_PEOPLE = 6
 """As many bodies as a Kinect v2 tracks."""
+
+
+HOLD = 3.0
+"""Seconds for which a person whom no sensor sees keeps the id."""
+
+
+@dataclass(frozen=True, slots=True)
+class PeopleParameters:
+    """Whom to track."""
+
+    subject: str = field(
+        default=NEAREST,
+        metadata={
+            "doc": "whom to track: the person who is nearest to the reference sensor at first, or the one who is seen "
+            "first, for as long as that person is there; or all, each under a number and with topics of their own",
+            "choices": SUBJECTS,
+        },
+    )
+    people: int = field(
+        default=MAX_PEOPLE,
+        metadata={
+            "doc": "subject all: how many people at most; their ids are body1, body2, ...",
+            "min": 1,
+            "max": 16,
+        },
+    )
+    hold: float = field(
+        default=HOLD,
+        metadata={
+            "doc": "a person whom no sensor sees keeps the id for this long; another is chosen, or gets it, then",
+            "unit": "s",
+            "min": 0.5,
+            "max": 60.0,
+        },
+    )
+
+
+PEOPLE = parameters_from(PeopleParameters, only=("subject", "people"))
+"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
+
+
+def people_from(values: Mapping[str, Value]) -> PeopleParameters:
+    """Whom to track, of the values of :data:`PEOPLE`.
+
+    Raises:
+        ParameterError: one of them is out of its range.
+    """
+    table = parameters_from(PeopleParameters)
+    given = {item.name: item.check(values[item.name]) for item in table if item.name in values}
+    return PeopleParameters(**fields_of(PeopleParameters, given))
 
 
 class SubjectSelector:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.skeleton import FloatArray
 
 _USUAL: Final = {

@@ -9,9 +9,7 @@ from typing import Any, Final
 
 from body_tracking import graph
 from body_tracking.errors import BodyTrackingError
-from body_tracking.fusion.association import HOLD
-from body_tracking.fusion.people import PEOPLE
-from body_tracking.fusion.subject import ALL, HeldSubject, SubjectSelector
+from body_tracking.fusion.subject import ALL, HOLD, PEOPLE, HeldSubject, SubjectSelector
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker
 from body_tracking.parameters import Parameter, Value, fields_of, parameters_from

@@ -13,6 +13,22 @@ from typing import Protocol
 from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import FloatArray, IntArray
 
+SEGMENTS: tuple[str, ...] = (
+    "pelvis",
+    "lower_trunk",
+    "upper_trunk",
+    "head",
+    "clavicle_left",
+    "clavicle_right",
+    "upper_arm_left",
+    "upper_arm_right",
+    "forearm_left",
+    "forearm_right",
+    "hand_left",
+    "hand_right",
+)
+"""Names of the segments of a body above the hips, parents before children."""
+
 
 class ModelError(BodyTrackingError):
     """A body model was given something that is no configuration, or no segment lengths, of it."""

@@ -7,8 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Any
 
 from body_tracking import graph
-from body_tracking.fusion.people import PEOPLE, PeopleParameters, people_from
-from body_tracking.fusion.subject import ALL
+from body_tracking.fusion.subject import ALL, PEOPLE, PeopleParameters, people_from
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, state_estimate
 from body_tracking.parameters import Parameter, Value

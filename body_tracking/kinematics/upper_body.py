@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import Linearisation, ModelError, Posture
+from body_tracking.kinematics.model import SEGMENTS, Linearisation, ModelError, Posture
 from body_tracking.skeleton import FloatArray, IntArray, Joint
 
 _EYE3 = np.eye(3)
@@ -38,22 +38,6 @@ _ARM = np.concatenate([so3.SKEW.reshape(3, 3, 3), np.zeros((3, 3, 3))], axis=-1)
 _BESIDE = np.concatenate([np.zeros((3, 3)), _EYE3], axis=-1).reshape(18)
 _CROSS = -so3.SKEW
 _BASE_SCREWS = np.concatenate([np.zeros((3, 3)), -_EYE3])
-
-SEGMENTS: tuple[str, ...] = (
-    "pelvis",
-    "lower_trunk",
-    "upper_trunk",
-    "head",
-    "clavicle_left",
-    "clavicle_right",
-    "upper_arm_left",
-    "upper_arm_right",
-    "forearm_left",
-    "forearm_right",
-    "hand_left",
-    "hand_right",
-)
-"""Parents before children."""
 
 PARENTS: Final = (-1, 0, 1, 2, 2, 2, 4, 5, 6, 7, 8, 9)
 """Index of each segment's parent; -1 for the base."""

@@ -10,19 +10,16 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from body_tracking.calibration.result import ClockModel, SensorPose
-from body_tracking.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
+from body_tracking.cdr import decode_skeletons, encode_angles, encode_skeletons
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel
-from body_tracking.kinematics.tracking import segment_poses
-from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import (
     IMAGE,
     IMU,
     JOINT_STATE,
     MAGNETIC_FIELD,
     POINT_CLOUD,
-    SEGMENTS,
     STRING,
     TF,
     TIME_REFERENCE,
@@ -241,22 +238,6 @@ class ModelCovariance(OfModel):
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[int, FloatArray]:
         return image_to_covariance(wire.deserialize(IMAGE, cdr), self.model)
-
-
-class Segments(Codec):
-    """The poses of the segments.
-
-    Args:
-        model: of the estimates.
-    """
-
-    type_name = SEGMENTS
-
-    def __init__(self, model: UpperBody) -> None:
-        self.model = model
-
-    def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
-        return encode_segments(payload, self.model.segment_names, *segment_poses(payload, self.model))
 
 
 class Text(Codec):

@@ -23,8 +23,7 @@ from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
-from body_tracking.fusion.people import PeopleParameters
-from body_tracking.fusion.subject import SubjectSelector
+from body_tracking.fusion.subject import PeopleParameters, SubjectSelector
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons

@@ -30,7 +30,7 @@ from scipy.signal import cont2discrete, lfilter, lfilter_zi
 from body_tracking.calibration.result import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.parameters import check_fields, number_field
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray

@@ -18,8 +18,9 @@ from body_tracking.filters.ekf import sources as orientation
 from body_tracking.filters.ekf.priors import _HELD_STDDEV, _LIMIT_STDDEV
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics import so3
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import SEGMENTS, UNOBSERVED
+from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.simulation.random_people import (
     MODEL,

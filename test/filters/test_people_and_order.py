@@ -14,9 +14,8 @@ from body_tracking import graph
 from body_tracking.calibration.result import level_pose
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import FilterSettings, PersonFilter
-from body_tracking.fusion.people import PeopleParameters
-from body_tracking.fusion.subject import ALL
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.fusion.subject import ALL, PeopleParameters
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.simulation.random_people import (
     MODEL,

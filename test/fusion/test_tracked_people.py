@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
 from body_tracking.fusion.fusion import Fusion
-from body_tracking.fusion.people import People, PeopleParameters, Slots
+from body_tracking.fusion.people import People, Slots
 from body_tracking.fusion.people_fusion import PeopleFusion
-from body_tracking.fusion.subject import ALL, FIRST, NEAREST
+from body_tracking.fusion.subject import ALL, FIRST, NEAREST, PeopleParameters
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 from walkers import ABOUT_FACE, frame, performed
 

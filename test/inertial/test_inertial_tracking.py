@@ -17,7 +17,7 @@ from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample
 from body_tracking.simulation.imus import Slip, usual_mounting

@@ -10,7 +10,8 @@ import numpy as np
 from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker
-from body_tracking.kinematics.upper_body import SEGMENTS, UpperBody
+from body_tracking.kinematics.model import SEGMENTS
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.measurement import joint_stddev
 from body_tracking.orientation import SegmentOrientation
 from body_tracking.sensors.imu import ImuSample

@@ -18,10 +18,11 @@ from body_tracking.kinematics.conventions import (
     segment_quaternions,
 )
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.kinematics.upper_body import SEGMENTS, SHOULDER_AXES, UpperBody
+from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
 from body_tracking.skeleton import FloatArray
 from draws import draws
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import BodyModel, ModelError
+from body_tracking.kinematics.model import SEGMENTS, BodyModel, ModelError
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import PARENTS, SEGMENTS, SHOULDER_AXES, UNOBSERVED, UpperBody
+from body_tracking.kinematics.upper_body import PARENTS, SHOULDER_AXES, UNOBSERVED, UpperBody
 from body_tracking.skeleton import FloatArray, Joint
 
 MODEL = UpperBody()

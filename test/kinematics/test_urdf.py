@@ -11,8 +11,9 @@ import pytest
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.conventions import angles_of, model_names
 from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.ranges import RANGES, Ranges
-from body_tracking.kinematics.upper_body import SEGMENTS, UpperBody
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.kinematics.urdf import UrdfError, urdf
 from body_tracking.skeleton import FloatArray, Joint
 

@@ -13,7 +13,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from body_tracking.calibration.result import ClockModel
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.upper_body import SEGMENTS
+from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.simulation.imus import (
     CONSUMER,
     GOOD,

@@ -1,0 +1,26 @@
+"""The message of a model's segments."""
+
+from __future__ import annotations
+
+from body_tracking.cdr import encode_segments
+from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.kinematics.tracking import segment_poses
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.messages.types import SEGMENTS
+from body_tracking.pipeline.codecs import Codec, Wire
+
+
+class Segments(Codec):
+    """The poses of the segments.
+
+    Args:
+        model: of the estimates.
+    """
+
+    type_name = SEGMENTS
+
+    def __init__(self, model: UpperBody) -> None:
+        self.model = model
+
+    def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
+        return encode_segments(payload, self.model.segment_names, *segment_poses(payload, self.model))
