@@ -10,12 +10,13 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, IntArray, Joint
 
 
-def _are(*names: str) -> BoolArray:
+def named(*names: str) -> BoolArray:
+    """(25,) which joints are of these kinds, left or right."""
     return np.array([joint.name.removesuffix("_LEFT").removesuffix("_RIGHT") in names for joint in Joint])
 
 
-_SPINE = _are("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK")
-_TRUNK: BoolArray = _SPINE | _are("SHOULDER", "HIP")
+_SPINE = named("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK")
+_TRUNK: BoolArray = _SPINE | named("SHOULDER", "HIP")
 
 
 class OcclusionError(BodyTrackingError):
