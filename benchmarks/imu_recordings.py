@@ -62,7 +62,8 @@ from body_tracking.kinematics.upper_body import PARENTS, SEGMENTS, UpperBody
 from body_tracking.sensors.imu import ImuSample
 from body_tracking.sensors.imu_csv import ImuCsvRecording
 from body_tracking.sensors.mvnx import MvnxFrame, MvnxRecording
-from body_tracking.simulation.imus import CONSUMER, Motion, SimulatedImu, usual_mounting
+from body_tracking.simulation.imu_errors import CONSUMER
+from body_tracking.simulation.imus import Motion, SimulatedImu, usual_mounting
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.repertoire import make_movement
 from body_tracking.simulation.trajectories import minimum_jerk
