@@ -45,7 +45,7 @@ from real_pairs import reversals, skeletons
 from scipy.stats import t as student
 
 from body_tracking.evaluation.metrics import Curve
-from body_tracking.evaluation.summary import nearest, read
+from body_tracking.evaluation.reading import nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion

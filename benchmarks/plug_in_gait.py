@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from time_warp import compare
 
 from body_tracking.errors import BodyTrackingError
-from body_tracking.evaluation.alignment import compare
 from body_tracking.evaluation.plug_in_gait import (
     MarkerTruth,
     Measurements,

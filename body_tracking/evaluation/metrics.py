@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.errors import BodyTrackingError
-from body_tracking.evaluation.alignment import sample
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.skeleton import BONES, BoolArray, FloatArray, IntArray
 
@@ -43,9 +43,6 @@ class MetricsError(BodyTrackingError):
     """An estimate and a truth cannot be compared."""
 
 
-# --- time and space
-
-
 class Curve:
     """Values at any time: cubic splines through samples, a separate one on each side of a gap."""
 
@@ -58,12 +55,10 @@ class Curve:
             max_gap: s; known samples farther apart have nothing in between.
 
         Raises:
-            MetricsError: times that do not increase, or of another number than the values.
+            MetricsError: times that do not increase.
         """
-        if times.shape != values.shape[:1] or not len(times) or not (np.diff(times) > 0.0).all():
-            raise MetricsError(
-                f"curve: {values.shape[0]} values at {len(times)} times, expected as many times, increasing"
-            )
+        if not (np.diff(times) > 0.0).all():
+            raise MetricsError(f"curve: {len(times)} times, which do not increase")
         self._shape = values.shape[1:]
         columns = values.reshape(len(times), -1)
         known = np.isfinite(columns)
@@ -92,6 +87,18 @@ class Curve:
             if len(inside):
                 values[np.ix_(inside, columns)] = spline(times[inside])
         return values.reshape(len(times), *self._shape)
+
+
+def sample(at: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
+    """(n, ...) values at (n,) other times, linearly between (m, ...) values at (m,) increasing times.
+
+    NaN where ``at`` is NaN or outside of the times.
+    """
+    at = np.where((at >= times[0]) & (at <= times[-1]), at, np.nan)
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    share = ((at - times[after - 1]) / (times[after] - times[after - 1])).reshape(-1, *[1] * (values.ndim - 1))
+    between: FloatArray = (1.0 - share) * values[after - 1] + share * values[after]
+    return between
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -469,11 +476,9 @@ def pose_errors(
         place: (3,) metres, where the person is in world.
     """
     turned = rotations @ true_rotation.T
-    sine = np.linalg.norm(turned - np.swapaxes(turned, -1, -2), axis=(-2, -1)) / np.sqrt(8.0)
-    cosine = 0.5 * (np.trace(turned, axis1=-2, axis2=-1) - 1.0)
     seen = true_rotation.T @ (place - true_translation)
     return PoseErrors(
-        np.arctan2(sine, cosine),
+        Rotation.from_matrix(turned).magnitude(),
         np.linalg.norm(translations - true_translation, axis=-1),
         np.linalg.norm(rotations @ seen + translations - place, axis=-1),
     )

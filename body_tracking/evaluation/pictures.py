@@ -12,8 +12,8 @@ import numpy as np
 
 from body_tracking.evaluation.comparison import AngleComparison, Evaluation
 from body_tracking.evaluation.metrics import angle_errors
+from body_tracking.evaluation.reading import Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
-from body_tracking.evaluation.summary import Tracked, nearest, true_at
 from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}

@@ -14,6 +14,7 @@ from io import StringIO
 from typing import Any, Final
 
 import numpy as np
+import trimesh
 import viser
 from viser import uplot
 
@@ -37,14 +38,11 @@ from body_tracking.viewing.curves import AngleHistory, first_choice
 from body_tracking.viewing.same_origin import same_origin
 from body_tracking.viewing.shapes import (
     KINECT_VIEW,
-    Mesh,
-    ball,
     capsules,
     ellipsoids,
     figure,
     floor_height,
     in_world,
-    tube,
 )
 from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
 from body_tracking.viewing.status import table
@@ -54,6 +52,8 @@ PLOTS: Final = 4
 POINTS: Final = 200
 """Points of a plotted curve at most: about one per two pixels."""
 
+_BALL: Final = trimesh.creation.icosphere(subdivisions=2)
+_TUBE: Final = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
 _STALE: Final[Colour] = (190, 190, 190)
 _HEAD_START: Final = np.array([2.2, 0.0, 0.0])
 """Where a person is looked for before one is seen: in front of the reference sensor, metres in world."""
@@ -171,9 +171,9 @@ class Page:
             self._cameras[sensor] = camera
         self._drawn["fused"] = _Drawn(scene, "/fused", FUSED, 0.02, 0.01)
         self._drawn["filtered"] = _Drawn(scene, "/filtered", FILTERED, 0.022, 0.014)
-        self._limbs = _Shapes(scene, "/body/limbs", tube(), BODY, 0.55)
-        self._ends = _Shapes(scene, "/body/ends", ball(), BODY, 0.55)
-        self._clouds = _Shapes(scene, "/uncertainty", ball(), UNCERTAINTY, 0.3)
+        self._limbs = _Shapes(scene, "/body/limbs", _TUBE, BODY, 0.55)
+        self._ends = _Shapes(scene, "/body/ends", _BALL, BODY, 0.55)
+        self._clouds = _Shapes(scene, "/uncertainty", _BALL, UNCERTAINTY, 0.3)
         self._axes = scene.add_batched_axes(
             "/segments",
             np.array([[1.0, 0.0, 0.0, 0.0]]),
@@ -394,7 +394,7 @@ class _Drawn:
     def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
         self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
         self._radius = radius
-        self._joints = _Shapes(scene, f"{name}/joints", ball(), colour)
+        self._joints = _Shapes(scene, f"{name}/joints", _BALL, colour)
         self._lines: Any = None
 
     def hide(self) -> None:
@@ -427,7 +427,7 @@ class _Shapes:
     """Any number of one mesh, turned, stretched and placed."""
 
     def __init__(
-        self, scene: viser.SceneApi, name: str, mesh: Mesh, colour: Colour, opacity: float | None = None
+        self, scene: viser.SceneApi, name: str, mesh: trimesh.Trimesh, colour: Colour, opacity: float | None = None
     ) -> None:
         self._scene, self._name, self._mesh, self._colour, self._opacity = scene, name, mesh, colour, opacity
         self._room = 0

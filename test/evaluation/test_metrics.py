@@ -30,8 +30,8 @@ from body_tracking.evaluation.metrics import (
     position_coverage,
     wrapped,
 )
+from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.evaluation.summary import read_skeletons
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
 

@@ -15,20 +15,18 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
+from body_tracking.evaluation.c3d import MarkerError
 from body_tracking.evaluation.plug_in_gait import (
-    LONGEST_GAP,
     MARKERS,
-    MarkerError,
     MarkerTruth,
     Measurements,
     arm_angles,
     chord,
-    fill_gaps,
     joint_centres,
     read_measurements,
     read_plug_in_gait,
-    smooth,
 )
+from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, smooth
 from body_tracking.skeleton import FloatArray, Joint
 
 RATE = 100.0

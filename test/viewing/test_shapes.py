@@ -133,12 +133,6 @@ def test_a_capsule_lies_along_its_bone() -> None:
     assert drawn.centres - 0.5 * drawn.lengths[:, None] * along == pytest.approx(drawn.ends[:, 0])
 
 
-def test_left_and_right_are_equally_thick() -> None:
-    radii = {child: radius for (_, child), radius in zip(BONES, shapes.BONE_RADII, strict=True)}
-    for joint in radii:
-        assert radii[joint] == radii[Joint[joint.name.replace("LEFT", "RIGHT")]] > 0.0
-
-
 # --- sensors
 
 
@@ -165,7 +159,7 @@ def test_what_a_level_sensor_sees_ahead_is_ahead_in_world() -> None:
     assert (placed.frame_id, placed.stamp_ns) == ("world", 7)
 
 
-# --- the floor and the meshes
+# --- the floor
 
 
 def feet_at(height: float) -> Skeleton:
@@ -185,12 +179,3 @@ def test_the_floor_is_under_the_feet_and_keeps_still() -> None:
     inferred = feet_at(-5.0)
     inferred.states[:] = 1
     assert shapes.floor_height([inferred], floor) == floor
-
-
-@pytest.mark.parametrize("mesh", [shapes.ball(), shapes.tube()])
-def test_meshes_are_seen_from_outside(mesh: shapes.Mesh) -> None:
-    triangles = mesh.vertices[mesh.faces]
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    outward = triangles.mean(axis=1) - [0.0, 0.0, 1.0] * triangles.mean(axis=1) * (len(mesh.vertices) < 40)
-    assert ((normals * outward).sum(axis=1) > -1e-12).all()
-    assert np.linalg.norm(mesh.vertices[:, :2], axis=1).max() == pytest.approx(1.0)
