@@ -79,27 +79,18 @@ def around(
         names: of the sensors; kinect1, kinect2, ... where none are given.
 
     Raises:
-        LayoutError: no sensor, numbers that do not belong together or are not finite, a distance that is not greater
-            than zero, or a name that comes twice.
+        LayoutError: no sensor, azimuths that are not finite, or names that are not as many or come twice.
     """
     count = len(azimuths)
     names = tuple(f"kinect{k + 1}" for k in range(count)) if names is None else tuple(names)
     if count == 0 or len(names) != count or len(set(names)) < count:
         raise LayoutError(f"layout: {count} azimuth(s) for the sensors {', '.join(names) or '(none)'}")
-    try:
-        azimuth, distance, height, pitch = (
-            np.broadcast_to(np.asarray(values, dtype=np.float64), (count,))
-            for values in (azimuths, distances, heights, pitches)
-        )
-    except ValueError as error:
-        raise LayoutError(f"layout: distances, heights or pitches that are not one or {count} ({error})") from error
+    azimuth, distance, height, pitch = (
+        np.broadcast_to(np.asarray(values, dtype=np.float64), (count,))
+        for values in (azimuths, distances, heights, pitches)
+    )
     if not np.isfinite(azimuth).all():
         raise LayoutError(f"layout: azimuths {np.degrees(azimuth).round(3).tolist()} degrees, expected finite numbers")
-    if not np.isfinite([distance, height, pitch]).all() or (distance <= 0.0).any():
-        raise LayoutError(
-            f"layout: distances {distance.tolist()} (expected greater than zero), heights {height.tolist()}, pitches "
-            f"{pitch.tolist()}: expected finite numbers"
-        )
     # the first sensor looks along x at the person, who stands so that the sensor is at its azimuth
     yaw = np.pi - azimuth[0]
     position = np.array([distance[0], 0.0, -height[0]])
