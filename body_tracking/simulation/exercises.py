@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from body_tracking.simulation.postures import HANGING, NAMES, mirrored, posture
 from body_tracking.skeleton import FloatArray
 
-_NOTHING = np.zeros(len(NAMES))
+
+def _nothing() -> FloatArray:
+    return np.zeros(len(NAMES))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,10 +32,10 @@ class Exercise:
     start: FloatArray
     repetitions: int
     period: float = 0.0
-    out: FloatArray = _NOTHING
-    sine: FloatArray = _NOTHING
-    left: FloatArray = _NOTHING
-    right: FloatArray = _NOTHING
+    out: FloatArray = field(default_factory=_nothing)
+    sine: FloatArray = field(default_factory=_nothing)
+    left: FloatArray = field(default_factory=_nothing)
+    right: FloatArray = field(default_factory=_nothing)
     round: tuple[tuple[FloatArray, float, float], ...] = ()
 
     @property

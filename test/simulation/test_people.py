@@ -54,17 +54,6 @@ def test_many_people_are_spread_as_the_tables_say() -> None:
         assert_allclose(np.mean([person.mass for person in some]), mass, rtol=0.02)
 
 
-def test_women_are_shorter_and_narrower_in_the_shoulders_and_broader_in_the_hips() -> None:
-    woman, man = (Person.average(sex) for sex in ("female", "male"))
-    assert woman.stature < man.stature and woman.mass < man.mass
-
-    def share(person: Person, name: str) -> float:
-        return person.length(name) / person.stature
-
-    assert share(woman, "clavicle_left") < share(man, "clavicle_left")
-    assert share(woman, "hip_width_left") > share(man, "hip_width_left")
-
-
 @given(seeds)
 def test_flesh_weighs_what_the_person_does(seed: int) -> None:
     person = Person.draw(np.random.default_rng(seed))
