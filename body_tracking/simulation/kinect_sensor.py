@@ -111,9 +111,6 @@ class Misreading:
         return result
 
 
-# --- the sensor
-
-
 @dataclass(frozen=True, slots=True)
 class SimulatedKinect:
     """A Kinect v2 at its place, with its clock and its errors.
