@@ -437,9 +437,6 @@ def wrapped(angles: FloatArray) -> FloatArray:
     return around
 
 
-# --- calibration
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
     """Of n poses of one sensor.
@@ -480,16 +477,13 @@ def pose_errors(
     )
 
 
-# --- statistics over time of what is known
-
-
 def known(positions: FloatArray) -> BoolArray:
     """(..., ) which of (..., 3) points have all coordinates."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Over the first axis, as the next."""
+    """Over the first axis, of what is known."""
     there = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(there, values, 0.0).sum(axis=0) / there.sum(axis=0)
@@ -497,5 +491,6 @@ def _mean(values: FloatArray) -> FloatArray:
 
 
 def _max(values: FloatArray) -> FloatArray:
+    """Over the first axis, of what is known."""
     largest: FloatArray = np.fmax.reduce(values, axis=0, initial=np.nan)
     return largest

@@ -33,7 +33,8 @@ from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.simulation.bags import SHIPPED, shipped, write_bag
 from body_tracking.simulation.imus import SimulatedImu, usual_mounting
-from body_tracking.simulation.kinect import RATE, KinectErrors, errors_as_yaml, parameters, read_errors
+from body_tracking.simulation.kinect import KinectErrors, errors_as_yaml, parameters, read_errors
+from body_tracking.simulation.kinect_sensor import RATE
 from body_tracking.simulation.layouts import DISTANCE
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import TPOSE_S
