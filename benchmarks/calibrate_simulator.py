@@ -377,8 +377,8 @@ PAIRS = "## Real and simulated pairs"
 _HEAD = """# How like real sensors the simulated ones are
 
 The simulated Kinect v2 (`body_tracking/simulation/kinect_sensor.py`, its parameters in `config/simulator.yaml`) was set
-before any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real pairs,
-the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
+before any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real
+pairs, the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
 
     python benchmarks/calibrate_simulator.py --write
     python benchmarks/simulated_pairs.py --write
