@@ -42,6 +42,10 @@ from body_tracking.skeleton import (
 )
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
+MAX_GAP = 0.15
+"""Seconds: samples farther apart have a gap between them."""
+WINDOW = 0.5
+"""Seconds up to which delays are looked for."""
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
@@ -55,14 +59,10 @@ class EvaluationParameters:
 
     Attributes:
         beyond: a joint farther from the truth is off track, metres.
-        max_gap: samples farther apart have a gap between them, s.
-        window: delays up to this are looked for, s.
         own_clock: the truth's clock has nothing to do with the estimate's, nor its frame: only aligned.
     """
 
     beyond: float = 0.15
-    max_gap: float = 0.15
-    window: float = 0.5
     own_clock: bool = False
 
 
@@ -190,20 +190,20 @@ def evaluate(
         estimate.positions,
         estimate.covariances,
     )
-    curve = Curve(truth.seconds(zero_ns), truth.positions, p.max_gap)
+    curve = Curve(truth.seconds(zero_ns), truth.positions, MAX_GAP)
     if np.isnan(curve.span).any():
-        raise EvaluationError(f"{truth.source}: no joint is known twice within {p.max_gap:g} s")
+        raise EvaluationError(f"{truth.source}: no joint is known twice within {MAX_GAP:g} s")
     around = _own_clock_offset(whole, curve, estimate, truth) if p.own_clock else 0.0
     span = _span(whole.times - around, curve.span, estimate, truth)
     done(0.1)
-    delay = find_delay(whole, curve, p.window, around)
+    delay = find_delay(whole, curve, WINDOW, around)
     if np.isnan(delay) and p.own_clock:
         raise EvaluationError(
             f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
             "of their frames belong together"
         )
     if np.isnan(delay):
-        notes.append(f"no delay within {p.window:g} s could be found (still, or another clock?): aligned in space only")
+        notes.append(f"no delay within {WINDOW:g} s could be found (still, or another clock?): aligned in space only")
     done(0.3)
     alignments = {} if p.own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
     try:
@@ -328,7 +328,7 @@ def _compare(
         moved.positions[inside],
         None if moved.covariances is None else moved.covariances[inside],
     )
-    compared = own if name == AS_IT_IS else moved.at(grid(first, last), p.max_gap)
+    compared = own if name == AS_IT_IS else moved.at(grid(first, last), MAX_GAP)
     true = curve.at(compared.times)
     errors = joint_errors(compared.positions, true, compared.covariances)
     if not errors.frames.any():
@@ -340,9 +340,9 @@ def _compare(
     # From the first estimate on every frame of the truth counts, also those that the estimate has left out; but to its
     # end only where the truth was recorded apart from it.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
-    lost = (all_times > last + p.max_gap) & (not p.own_clock)
+    lost = (all_times > last + MAX_GAP) & (not p.own_clock)
     counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
-    off = off_track(moved.at(counted, p.max_gap).positions, curve.at(counted), p.beyond)
+    off = off_track(moved.at(counted, MAX_GAP).positions, curve.at(counted), p.beyond)
     return Comparison(
         name,
         alignment,
@@ -403,7 +403,7 @@ def _named(
     times = (mine.stamps_ns - estimate.stamps_ns[0]) / NANOSECONDS + whole.times[0] + shift
     found, stddev = (values[:, [mine.names.index(name) for name in names]] for values in (mine.known, mine.stddev))
     position = theirs.known[:, [theirs.names.index(name) for name in names]]
-    true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), p.max_gap).at(times)
+    true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), MAX_GAP).at(times)
     return AngleComparison(names, times, found, true, stddev, angle_errors(found, true, stddev))
 
 

@@ -10,7 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 
 from body_tracking.kinematics import so3
-from body_tracking.simulation.imu_errors import ImuErrors
+from body_tracking.simulation.imu_errors import STANDARD_GRAVITY, ImuErrors
 from body_tracking.simulation.surroundings import Surroundings
 from body_tracking.skeleton import FloatArray
 
@@ -40,13 +40,13 @@ def fuse(
         drift: (n, 3) rad/s, errors of the angular rate in world.
         force: (n, 3) m/s2, the measured specific force, turned to world by the true orientation.
         magnetic: (n, 3) tesla likewise, or None.
-        where: for gravity and the direction of magnetic north.
+        where: for the direction of magnetic north.
         heading: radians, of a driver without magnetometer at the start.
     """
     steps = np.diff(times, prepend=times[:1])
     moved = drift * steps[:, None]
     # what turns the mean force upwards: e x f = g z - f
-    level = np.stack([force[:, 1], -force[:, 0]], axis=-1) / where.gravity
+    level = np.stack([force[:, 1], -force[:, 0]], axis=-1) / STANDARD_GRAVITY
     fades = np.exp(-1.0 / (rate_hz * errors.tilt_time))
     tilt = _low_pass((1.0 - fades) * level + moved[:, :2], fades, level[0])
     tilted = so3.exp(np.concatenate([tilt, np.zeros((len(tilt), 1))], axis=1))

@@ -243,7 +243,7 @@ class SimulatedImu:
             rng: where all chance comes from.
             parent: motion of the segment's parent, against which it twists about its z axis; without it the skin
                 follows every twist.
-            surroundings: gravity and magnetic field.
+            surroundings: the magnetic field.
             received_from_ns: time 0 in the receiver's clock, if it is not the reference clock.
         """
         where = Surroundings() if surroundings is None else surroundings
@@ -251,11 +251,11 @@ class SimulatedImu:
         off_axis = so3.exp(np.radians(errors.misalignment) * rng.normal(size=3))
         mounting_xyzw = so3.quat_multiply(off_axis, self.mounting.quat_xyzw)
         times = self.capture_times(duration, rng)
-        sensor = self._sensor_motion(motion, parent, duration, mounting_xyzw, where.gravity)
+        sensor = self._sensor_motion(motion, parent, duration, mounting_xyzw)
         rotations, positions, rates, accelerations = _kinematics(sensor, times)
 
         to_sensor = rotations.swapaxes(-1, -2)
-        forces = rotate(to_sensor, accelerations + where.gravity * Z)
+        forces = rotate(to_sensor, accelerations + STANDARD_GRAVITY * Z)
         magnetic = rotate(to_sensor, where.field(positions, times))
         session = np.searchsorted(np.sort([end for _, end in self.off]), times, side="right").astype(np.intp)
         of_gyro = _Channel.of(errors, "gyro", np.pi / 180.0)
@@ -308,7 +308,7 @@ class SimulatedImu:
         )
 
     def _sensor_motion(
-        self, motion: Motion, parent: Motion | None, duration: float, mounting_xyzw: FloatArray, gravity: float
+        self, motion: Motion, parent: Motion | None, duration: float, mounting_xyzw: FloatArray
     ) -> Motion:
         """The motion of the sensor itself, from that of the bone under it."""
         place, errors = self.mounting.position, self.errors
@@ -316,7 +316,7 @@ class SimulatedImu:
         flesh = errors.tissue_sag * self.mounting.flesh
         bone = _in_parts(motion)
         beneath = None if parent is None else _in_parts(parent)
-        slid = None if flesh == 0.0 else self._tissue(bone, duration, flesh, gravity)
+        slid = None if flesh == 0.0 else self._tissue(bone, duration, flesh)
         share = errors.twist_share * self.mounting.flesh
         # the skin lies across the line from the segment's axis to the sensor
         outward = place * [1.0, 1.0, 0.0]
@@ -340,9 +340,7 @@ class SimulatedImu:
 
         return of_sensor
 
-    def _tissue(
-        self, motion: Motion, duration: float, sag: float, gravity: float
-    ) -> Callable[[FloatArray], FloatArray]:
+    def _tissue(self, motion: Motion, duration: float, sag: float) -> Callable[[FloatArray], FloatArray]:
         """Times to (n, 3) metres by which the sensor slides in the segment's frame: it swings, damped, after its place.
 
         ``x'' + 2 zeta w x' + w^2 x = -w^2 sag f / g`` with the specific force f of the place; up to what tissue gives.
@@ -354,7 +352,7 @@ class SimulatedImu:
             return rotations, origins + rotations @ self.mounting.position
 
         rotations, _, _, accelerations = _kinematics(at, grid)
-        force = rotate(rotations.swapaxes(-1, -2), accelerations + gravity * Z)
+        force = rotate(rotations.swapaxes(-1, -2), accelerations + STANDARD_GRAVITY * Z)
         w = 2.0 * np.pi * self.errors.tissue_frequency
         system = ([w**2], [1.0, 2.0 * self.errors.tissue_damping * w, w**2])
         numerator, denominator, _ = cont2discrete(system, grid[1] - grid[0], method="foh")

@@ -1,4 +1,4 @@
-"""Gravity and the magnetic field where inertial sensors are worn."""
+"""The magnetic field where inertial sensors are worn."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.simulation.imu_errors import STANDARD_GRAVITY
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import FloatArray
 
@@ -55,14 +54,12 @@ class Surroundings:
     """What the sensors feel of the place.
 
     Attributes:
-        gravity: m/s2.
         strength: tesla, of the earth's magnetic field.
         dip: radians by which it points below the horizon.
         north: radians from world's x, counter-clockwise, to magnetic north; at a quarter turn world is east-north-up.
         iron: what disturbs the field.
     """
 
-    gravity: float = STANDARD_GRAVITY
     strength: float = 48e-6
     dip: float = float(np.radians(64.0))
     north: float = 0.5 * np.pi

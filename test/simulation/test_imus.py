@@ -534,34 +534,6 @@ def test_the_drivers_errors_are_those_of_a_complementary_filter_on_the_same_data
     assert np.all(apart < 0.1 * size)
 
 
-def test_a_bias_of_the_accelerometer_tilts_by_its_share_of_gravity() -> None:
-    samples = measured(still(), replace(IDEAL, acc_bias=0.2), duration=1.0, seed=2, oriented=True)
-    bias = (samples.linear_acceleration - STANDARD_GRAVITY * UP)[0]
-    tilt = orientation_errors(samples)[-1, :2]
-    assert_allclose(tilt, np.array([bias[1], -bias[0]]) / STANDARD_GRAVITY, atol=5e-5)
-
-
-def test_what_the_driver_leaves_of_the_bias_drives_the_heading_away_only_without_magnetometer() -> None:
-    errors = replace(IDEAL, gyro_bias=0.5, driver_bias=0.05)
-    drifts = []
-    for seed in range(60):
-        heading = headings_of(measured(still(), errors, 10.0, seed, oriented=True, magnetometer=False, rate_hz=50.0))
-        drifts.append(np.degrees(heading[-1] - heading[0]) / 10.0)
-        assert_allclose(np.diff(heading), np.diff(heading)[0], atol=1e-9)
-    assert np.std(drifts) == pytest.approx(0.05, rel=0.25)
-
-
-def test_a_magnetometer_holds_the_heading_as_far_off_as_the_bias_drives_it_in_the_time_constant() -> None:
-    errors = replace(IDEAL, driver_bias=0.2)
-    drifting = headings_of(measured(still(), errors, 100.0, seed=1, oriented=True, magnetometer=False, rate_hz=50.0))
-    level = Surroundings(dip=0.0)  # where a field dips, tilt turns the heading, too
-    held = headings_of(measured(still(), errors, 100.0, 1, oriented=True, rate_hz=50.0, surroundings=level))
-    rate = (drifting[-1] - drifting[0]) / 100.0
-    assert abs(rate) > degrees(0.02)
-    assert held[0] == pytest.approx(0.0, abs=1e-6)
-    assert held[-1] == pytest.approx(rate * errors.heading_time, rel=0.02, abs=degrees(0.02))
-
-
 def test_iron_turns_the_heading_to_its_field_while_it_is_there() -> None:
     place = np.array([0.4, 0.2, 0.0])
     iron = Iron(np.zeros(3), np.array([4.0, 3.0, 0.0]), since=20.0, until=110.0)
