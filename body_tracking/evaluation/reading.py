@@ -139,7 +139,7 @@ class Recorded:
     @property
     def joints(self) -> BoolArray:
         """(25,) joints that are ever known."""
-        return np.isfinite(self.positions).all(axis=-1).any(axis=0)
+        return np.asarray(np.isfinite(self.positions).all(axis=-1).any(axis=0))
 
     def seconds(self, zero_ns: int) -> FloatArray:
         """(n,) s since ``zero_ns``."""
