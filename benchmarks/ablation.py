@@ -37,7 +37,7 @@ from accuracy import TEN, Run, run_ours
 from real_pairs import reversals, skeletons
 
 from body_tracking.evaluation.metrics import Curve, wrapped
-from body_tracking.evaluation.summary import AngleSeries, nearest, read
+from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion

@@ -45,7 +45,7 @@ from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.simulation.kinect import KinectErrors, parameters
 from body_tracking.simulation.layouts import NUMBERS, layout
-from body_tracking.simulation.occlusion import cover
+from body_tracking.simulation.occlusion import obstruction
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.repertoire import MOTIONS, make_movement
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
@@ -209,7 +209,7 @@ def _hidden(recording: SimulatedRecording, true: FloatArray) -> BoolArray:
     capsules = recording.truths[0].person.capsules()
     return np.any(
         [
-            cover((true - sensor.pose.translation) @ sensor.pose.rotation, capsules) > _HIDDEN_FROM
+            obstruction((true - sensor.pose.translation) @ sensor.pose.rotation, capsules).cover > _HIDDEN_FROM
             for sensor in recording.sensors
         ],
         axis=0,

@@ -8,7 +8,7 @@ Table 4.4: one sensor, two motions at four yaws of the person; low-pass at 3 Hz 
 between forearm and upper arm, and of the shoulder's elevation. And the 3D error of the joints, which others report as
 50 to 101 mm.
 
-``--fit`` finds the part of the error that is constant in the body, a table of joints (``kinect.ANATOMICAL``), which
+``--fit`` finds the errors that are constant in the body, a table of joints (``kinect_joints.ANATOMICAL``), that
 makes table E.1 what it is: the offset between the joint centre of a Kinect and that of Plug-in Gait is no chance, but
 the same for everybody. Each step adds to every joint's offset what would bring its errors closest to hers, and
 simulates anew. Everything else has been set from recordings of real pairs; our own filters play no part.
@@ -31,7 +31,8 @@ from thesis_pipeline import LKF2, run_thesis
 from body_tracking.calibration.rigid import rigid_registration
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, grid, known
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.simulation.kinect import ANATOMICAL, KinectErrors, read_errors
+from body_tracking.simulation.kinect import KinectErrors, read_errors
+from body_tracking.simulation.kinect_joints import ANATOMICAL
 from body_tracking.simulation.layouts import around, layout
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
@@ -364,9 +365,9 @@ PAGE = common.ROOT / "docs" / "simulator.md"
 PAIRS = "## Real and simulated pairs"
 _HEAD = """# How like real sensors the simulated ones are
 
-The simulated Kinect v2 (`body_tracking/simulation/kinect.py`, its parameters in `config/simulator.yaml`) was set before
-any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real pairs,
-the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
+The simulated Kinect v2 (`body_tracking/simulation/kinect_sensor.py`, its parameters in `config/simulator.yaml`) was set
+before any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real
+pairs, the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
 
     python benchmarks/calibrate_simulator.py --write
     python benchmarks/simulated_pairs.py --write

@@ -44,7 +44,7 @@ from body_tracking.orientation import SegmentOrientation
 from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.layouts import around
-from body_tracking.simulation.occlusion import cover
+from body_tracking.simulation.occlusion import obstruction
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
@@ -192,7 +192,7 @@ def filtered(
     instants = instants[kept]
     positions, q, stddev = (np.stack([each[k] for each in found])[kept] for k in (1, 2, 3))
     true = truth.positions[instants]
-    hidden = cover((true - pose.translation) @ pose.rotation, truth.person.capsules()) > _HIDDEN_FROM
+    hidden = obstruction((true - pose.translation) @ pose.rotation, truth.person.capsules()).cover > _HIDDEN_FROM
     own = np.einsum("njba,njb->nja", segment_frames(true), positions - true)
     own -= own.mean(axis=0)
     return Figures(

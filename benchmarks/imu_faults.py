@@ -36,10 +36,11 @@ from body_tracking.pipeline.codecs import ModelCovariance, ModelState
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.simulation.bags import write_bag
-from body_tracking.simulation.imus import Iron, SimulatedImu, Slip, Surroundings, usual_mounting
+from body_tracking.simulation.imus import SimulatedImu, Slip, usual_mounting
 from body_tracking.simulation.layouts import Layout, around
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, draw_clock, simulate
+from body_tracking.simulation.surroundings import Iron, Surroundings
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SEGMENTS = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")

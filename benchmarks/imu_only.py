@@ -33,12 +33,12 @@ from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker
 from body_tracking.sensors.imu import ImuSample
-from body_tracking.simulation.bags import draw_clock
-from body_tracking.simulation.imus import IDEAL, ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.simulation.imu_errors import IDEAL
+from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import TPOSE_S
-from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, simulate
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, draw_clock, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SEGMENTS = (

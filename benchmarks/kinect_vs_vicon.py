@@ -12,7 +12,7 @@ elbow's width from its lateral marker, at a right angle to the upper arm and tow
 plane of shoulder, elbow marker and wrist (Plug-in Gait's chord function). The wrist is the middle of WRA and WRB.
 
 Time. Neither system left stamps, and the clips were cut separately, so a smooth warp of six parameters is estimated
-(``evaluation.alignment``) from the directions of upper arm and forearm in the thorax's axes. One warp serves all
+(``time_warp``) from the directions of upper arm and forearm in the thorax's axes. One warp serves all
 methods of a clip, estimated from all of them together: all are compared over the same frames, none is favoured, and a
 lag counts as the error that it is. (``--warp own`` aligns each method by itself instead, which forgives its lag, and
 lets the uncertainty of the warps, some 0.2 deg of RMS, into the differences between methods; ``--warp raw`` favours the
@@ -32,8 +32,9 @@ from typing import Any
 
 import common
 import numpy as np
+from time_warp import Agreement, TimeWarp, compare, estimate_warp
 
-from body_tracking.evaluation.alignment import Agreement, TimeWarp, compare, estimate_warp, sample
+from body_tracking.evaluation.metrics import sample
 from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.filters.ekf import ExtendedKalmanFilter
 from body_tracking.filters.smoother import smooth

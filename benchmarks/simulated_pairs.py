@@ -56,7 +56,7 @@ from body_tracking.calibration.result import CalibrationResult, ClockModel
 from body_tracking.measurement import body_heading, left_right_axes, viewing_angle
 from body_tracking.sensors import RecordedFrame
 from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.simulation.kinect import Misreading, SimulatedKinect
+from body_tracking.simulation.kinect_sensor import Misreading, SimulatedKinect
 from body_tracking.simulation.layouts import Layout, around
 from body_tracking.simulation.people import Person, joints
 from body_tracking.simulation.repertoire import make_movement
@@ -236,7 +236,8 @@ def simulated_pair(pair: Pair, seed: int) -> Pair:
             times = sensor.capture_times(movement.duration, rng)
             course = movement.course(times.clip(0.0, movement.duration)).placed(place.position, place.yaw)
             truth = kept_in_front(joints(person, course), place.yaw, turn)
-            frames += sensor.observe(times, truth, person.capsules(), *started, rng, misreading=misreading)
+            seen = sensor.see(times, truth, person.capsules(), rng, misreading)
+            frames += sensor.deliver(times, {0: seen}, *started, rng)
     frames.sort(key=lambda frame: frame.received_ns)
     return calibrated([(frame.sensor, frame.received_ns, all_tracked(frame.skeletons[0])) for frame in frames])
 

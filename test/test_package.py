@@ -35,7 +35,7 @@ LIBRARIES = {
     "zstandard": ("zstandard", None),
     "rosbags": ("rosbags", None),
 }
-EXTRAS = {"viser": "viewer", "websockets": "viewer"}
+EXTRAS = {"viser": "viewer", "trimesh": "viewer", "websockets": "viewer"}
 """Import name -> extra; who imports these says what to install where they are absent."""
 
 

@@ -1,14 +1,12 @@
-"""What a recording says of a person beside the truth: read both, compare them in all ways that ``metrics`` knows."""
+"""Compare a recorded person with the truth in all ways that ``metrics`` knows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking import graph
 from body_tracking.calibration.clock import correlate_clocks
 from body_tracking.evaluation.metrics import (
     Alignment,
@@ -30,35 +28,24 @@ from body_tracking.evaluation.metrics import (
     off_track,
     pose_errors,
 )
-from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
-from body_tracking.evaluation.summary import (
-    AngleSeries,
-    EvaluationError,
-    bodies,
-    most_people,
-    read_angles,
-    read_joint_states,
-    read_skeletons,
-    true_angles,
-)
+from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Recorded, true_angles
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.messages.base import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
-from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
-from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 from body_tracking.skeleton import (
     JOINT_NAMES,
     N_JOINTS,
     NANOSECONDS,
     BoolArray,
     FloatArray,
-    IntArray,
     Joint,
     Skeleton,
     TrackingState,
 )
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
+MAX_GAP = 0.15
+"""Seconds: samples farther apart have a gap between them."""
+WINDOW = 0.5
+"""Seconds up to which delays are looked for."""
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
@@ -72,72 +59,11 @@ class EvaluationParameters:
 
     Attributes:
         beyond: a joint farther from the truth is off track, metres.
-        max_gap: samples farther apart have a gap between them, s.
-        window: delays up to this are looked for, s.
         own_clock: the truth's clock has nothing to do with the estimate's, nor its frame: only aligned.
     """
 
     beyond: float = 0.15
-    max_gap: float = 0.15
-    window: float = 0.5
     own_clock: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SensorClaims:
-    """What is said of one sensor's pose and clock over time; stamps in nanoseconds of the reference clock.
-
-    Attributes:
-        pose_stamps_ns: (n,) from when each pose is used.
-        rotations: (n, 3, 3) sensor to world.
-        translations: (n, 3) metres.
-        clock_stamps_ns: (c,).
-        clock_offsets: (c,) s, sensor clock minus reference clock.
-    """
-
-    pose_stamps_ns: IntArray
-    rotations: FloatArray
-    translations: FloatArray
-    clock_stamps_ns: IntArray
-    clock_offsets: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """Skeletons of one person over time with what belongs to them: an estimate, or the truth.
-
-    Attributes:
-        source: the bag or file.
-        topic: of the skeletons; empty where the file has none.
-        frame_id: of the positions.
-        stamps_ns: (n,) capture times, increasing, nanoseconds.
-        positions: (n, 25, 3) metres, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
-        angles: by name; None where there are none.
-        sensors: calibration by sensor.
-        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
-        warnings: what the file itself lacks, a line each.
-    """
-
-    source: Path
-    topic: str
-    frame_id: str
-    stamps_ns: IntArray
-    positions: FloatArray
-    covariances: FloatArray | None = None
-    angles: AngleSeries | None = None
-    sensors: Mapping[str, SensorClaims] = field(default_factory=dict)
-    coordinates: AngleSeries | None = None
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def joints(self) -> BoolArray:
-        """(25,) joints that are ever known."""
-        return np.asarray(known(self.positions).any(axis=0))
-
-    def seconds(self, zero_ns: int) -> FloatArray:
-        """(n,) s since ``zero_ns``."""
-        return (self.stamps_ns - zero_ns) / NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,162 +162,6 @@ class Evaluation:
     notes: tuple[str, ...]
 
 
-# --- reading
-
-
-def read_estimate(path: Path, topic: str | None = None, body: str | None = None) -> Recorded:
-    """The skeletons, angles and calibration that a bag holds.
-
-    Args:
-        path: a bag folder or an mcap file.
-        topic: of the skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
-        body: whose angles; the first in the bag where None.
-
-    Raises:
-        BagError: no such bag, or nothing of it can be read.
-        EvaluationError: it holds no such topic, of no such type, nothing in it, or no angles of this person.
-    """
-    with RigReader(path) as bag:
-        if topic is None:
-            full = [each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics and bag.topics[each].count]
-            topic = full[0] if full else graph.FILTERED
-        skeletons = _skeletons(bag, topic, "; make some with replay, or choose one with --topic")
-        angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
-        sensors = _sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK)
-        made = _recorded(path, topic, skeletons, angles, sensors)
-        return replace(made, warnings=(*bag.warnings, *_crowd(bag, topic)))
-
-
-def read_truth(path: Path, body: str | None = None) -> Recorded:
-    """The true skeletons, angles and calibration that a bag holds.
-
-    Args:
-        path: a bag folder or an mcap file.
-        body: the id that ends the names of its angles; any where None.
-
-    Raises:
-        BagError: no such bag, or nothing of it can be read.
-        EvaluationError: it holds no true skeletons.
-    """
-    with RigReader(path) as bag:
-        wanted = "; the truth is a bag from a simulation or what replay made of it"
-        skeletons = _skeletons(bag, graph.TRUE_SKELETON, wanted)
-        ids = (body,) if body is not None else bodies(bag)
-        angles = read_joint_states(bag, graph.TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY)
-        sensors = _sensors(bag, graph.TRUE_CALIBRATION, graph.TRUE_CLOCK)
-        made = _recorded(path, graph.TRUE_SKELETON, skeletons, angles, sensors)
-        coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
-        return replace(made, coordinates=coordinates, warnings=(*bag.warnings, *_crowd(bag, graph.TRUE_SKELETON)))
-
-
-def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
-    """Joint centres from markers as the truth; its clock and frame are its own.
-
-    Args:
-        path: a C3D file with the markers of Plug-in Gait.
-        subject: whose; needed where the file holds several.
-        measurements: of the subject, a file of Vicon's; those in the C3D file where None.
-
-    Raises:
-        MarkerError: the files cannot be read, or too few markers are there.
-    """
-    measured = None if measurements is None else read_measurements(measurements)
-    markers = read_plug_in_gait(path, subject=subject, measurements=measured)
-    said = [f"{path}: not seen: {gap}" for gap in markers.gaps]
-    for names, what in ((markers.missing, "has no marker"), (markers.estimated, "estimates the subject's")):
-        if names:
-            said.append(f"{path}: {what} {', '.join(names)}")
-    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(said))
-
-
-def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
-    """Joint centres from markers as the truth; its clock and frame are its own.
-
-    Args:
-        source: the file.
-        stamps: (n,) s, increasing.
-        positions: (n, 25, 3) metres, NaN where unknown.
-    """
-    stamps_ns = np.rint(stamps * NANOSECONDS).astype(np.int64)
-    return Recorded(source, "", "markers", stamps_ns, positions)
-
-
-def _skeletons(bag: BagReader, topic: str, advice: str) -> tuple[Skeleton, ...]:
-    info = bag.topics.get(topic)
-    there = ", ".join(sorted(name for name, each in bag.topics.items() if each.type_name == POINT_CLOUD))
-    if info is None:
-        raise EvaluationError(f"{bag.path}: no topic {topic} (skeletons there: {there or 'none'}){advice}")
-    if info.type_name != POINT_CLOUD:
-        raise EvaluationError(f"{bag.path}: {topic} holds {info.type_name}, expected {POINT_CLOUD}")
-    if not info.count:
-        raise EvaluationError(f"{bag.path}: {topic} is empty")
-    skeletons = read_skeletons(bag, topic)
-    if len(skeletons) < 2:
-        raise EvaluationError(
-            f"{bag.path}: {len(skeletons)} skeleton(s) with a stamp of their own in the {info.count} messages of "
-            f"{topic}, at least 2 are needed"
-        )
-    return skeletons
-
-
-def _crowd(bag: BagReader, topic: str) -> tuple[str, ...]:
-    people = most_people(bag, topic)
-    return (f"{bag.path}: {topic} holds {people} people, only the first is compared",) if people > 1 else ()
-
-
-def _recorded(
-    path: Path,
-    topic: str,
-    skeletons: Sequence[Skeleton],
-    angles: AngleSeries | None,
-    sensors: Mapping[str, SensorClaims],
-) -> Recorded:
-    # infinite ones state as little as none, and would spread when they are turned
-    stated = [
-        np.where(np.isfinite(each.covariances), each.covariances, np.nan)
-        for each in skeletons
-        if each.covariances is not None
-    ]
-    return Recorded(
-        Path(path),
-        topic,
-        skeletons[0].frame_id,
-        np.array([each.stamp_ns for each in skeletons], dtype=np.int64),
-        np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in skeletons]),
-        np.stack(stated) if len(stated) == len(skeletons) else None,
-        angles,
-        sensors,
-    )
-
-
-def _sensors(bag: BagReader, pose_topic: str, clock_topic: str) -> dict[str, SensorClaims]:
-    poses = [transform_to_pose(deserialize(TRANSFORM, raw.cdr)) for raw in _messages(bag, pose_topic, TRANSFORM)]
-    clocks = [
-        time_reference_to_clock(deserialize(TIME_REFERENCE, raw.cdr))
-        for raw in _messages(bag, clock_topic, TIME_REFERENCE)
-    ]
-    claims = {}
-    for sensor in dict.fromkeys(pose.sensor for pose in poses):
-        own = [pose for pose in poses if pose.sensor == sensor]
-        times = sorted((at_ns, clock.offset) for name, at_ns, clock in clocks if name == sensor)
-        claims[sensor] = SensorClaims(
-            np.array([pose.valid_from_ns for pose in own], dtype=np.int64),
-            np.stack([pose.rotation for pose in own]),
-            np.stack([pose.translation for pose in own]),
-            np.array([at_ns for at_ns, _ in times], dtype=np.int64),
-            np.array([offset for _, offset in times]),
-        )
-    return claims
-
-
-def _messages(bag: BagReader, topic: str, kind: str) -> Iterator[RawMessage]:
-    there = topic in bag.topics and bag.topics[topic].type_name == kind
-    return bag.messages([topic]) if there else iter(())
-
-
-# --- comparing
-
-
 def evaluate(
     estimate: Recorded,
     truth: Recorded,
@@ -420,20 +190,20 @@ def evaluate(
         estimate.positions,
         estimate.covariances,
     )
-    curve = Curve(truth.seconds(zero_ns), truth.positions, p.max_gap)
+    curve = Curve(truth.seconds(zero_ns), truth.positions, MAX_GAP)
     if np.isnan(curve.span).any():
-        raise EvaluationError(f"{truth.source}: no joint is known twice within {p.max_gap:g} s")
+        raise EvaluationError(f"{truth.source}: no joint is known twice within {MAX_GAP:g} s")
     around = _own_clock_offset(whole, curve, estimate, truth) if p.own_clock else 0.0
     span = _span(whole.times - around, curve.span, estimate, truth)
     done(0.1)
-    delay = find_delay(whole, curve, p.window, around)
+    delay = find_delay(whole, curve, WINDOW, around)
     if np.isnan(delay) and p.own_clock:
         raise EvaluationError(
             f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
             "of their frames belong together"
         )
     if np.isnan(delay):
-        notes.append(f"no delay within {p.window:g} s could be found (still, or another clock?): aligned in space only")
+        notes.append(f"no delay within {WINDOW:g} s could be found (still, or another clock?): aligned in space only")
     done(0.3)
     alignments = {} if p.own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
     try:
@@ -558,7 +328,7 @@ def _compare(
         moved.positions[inside],
         None if moved.covariances is None else moved.covariances[inside],
     )
-    compared = own if name == AS_IT_IS else moved.at(grid(first, last), p.max_gap)
+    compared = own if name == AS_IT_IS else moved.at(grid(first, last), MAX_GAP)
     true = curve.at(compared.times)
     errors = joint_errors(compared.positions, true, compared.covariances)
     if not errors.frames.any():
@@ -570,9 +340,9 @@ def _compare(
     # From the first estimate on every frame of the truth counts, also those that the estimate has left out; but to its
     # end only where the truth was recorded apart from it.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
-    lost = (all_times > last + p.max_gap) & (not p.own_clock)
+    lost = (all_times > last + MAX_GAP) & (not p.own_clock)
     counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
-    off = off_track(moved.at(counted, p.max_gap).positions, curve.at(counted), p.beyond)
+    off = off_track(moved.at(counted, MAX_GAP).positions, curve.at(counted), p.beyond)
     return Comparison(
         name,
         alignment,
@@ -633,7 +403,7 @@ def _named(
     times = (mine.stamps_ns - estimate.stamps_ns[0]) / NANOSECONDS + whole.times[0] + shift
     found, stddev = (values[:, [mine.names.index(name) for name in names]] for values in (mine.known, mine.stddev))
     position = theirs.known[:, [theirs.names.index(name) for name in names]]
-    true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), p.max_gap).at(times)
+    true = Curve((theirs.stamps_ns - zero_ns) / NANOSECONDS, _unwrapped(position), MAX_GAP).at(times)
     return AngleComparison(names, times, found, true, stddev, angle_errors(found, true, stddev))
 
 

@@ -5,17 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from body_tracking.evaluation.comparison import (
-    EvaluationParameters,
-    Recorded,
-    evaluate,
-    read_estimate,
-    read_markers,
-    read_truth,
-)
+from body_tracking.evaluation.comparison import EvaluationParameters, evaluate
 from body_tracking.evaluation.pictures import pictures
+from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.report import as_csv, as_json, facts, page, text, write
-from body_tracking.evaluation.summary import EvaluationError
 from body_tracking.recording.replay import Progress
 
 _DEFAULTS = EvaluationParameters()

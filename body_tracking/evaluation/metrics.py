@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.errors import BodyTrackingError
-from body_tracking.evaluation.alignment import sample
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.skeleton import BONES, BoolArray, FloatArray, IntArray
 
@@ -43,9 +43,6 @@ class MetricsError(BodyTrackingError):
     """An estimate and a truth cannot be compared."""
 
 
-# --- time and space
-
-
 class Curve:
     """Values at any time: cubic splines through samples, a separate one on each side of a gap."""
 
@@ -58,12 +55,10 @@ class Curve:
             max_gap: s; known samples farther apart have nothing in between.
 
         Raises:
-            MetricsError: times that do not increase, or of another number than the values.
+            MetricsError: times that do not increase.
         """
-        if times.shape != values.shape[:1] or not len(times) or not (np.diff(times) > 0.0).all():
-            raise MetricsError(
-                f"curve: {values.shape[0]} values at {len(times)} times, expected as many times, increasing"
-            )
+        if not (np.diff(times) > 0.0).all():
+            raise MetricsError(f"curve: {len(times)} times, which do not increase")
         self._shape = values.shape[1:]
         columns = values.reshape(len(times), -1)
         known = np.isfinite(columns)
@@ -94,6 +89,18 @@ class Curve:
         return values.reshape(len(times), *self._shape)
 
 
+def sample(at: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
+    """(n, ...) values at (n,) other times, linearly between (m, ...) values at (m,) increasing times.
+
+    NaN where ``at`` is NaN or outside of the times.
+    """
+    at = np.where((at >= times[0]) & (at <= times[-1]), at, np.nan)
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    share = ((at - times[after - 1]) / (times[after] - times[after - 1])).reshape(-1, *[1] * (values.ndim - 1))
+    between: FloatArray = (1.0 - share) * values[after - 1] + share * values[after]
+    return between
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Joints over time.
@@ -110,8 +117,6 @@ class Trajectory:
 
     def at(self, times: FloatArray, max_gap: float) -> Trajectory:
         """Linearly interpolated to (m,) s; unknown between samples more than ``max_gap`` s apart."""
-        if len(self.times) < 2:
-            raise MetricsError(f"trajectory: {len(self.times)} sample(s), expected at least 2 to interpolate")
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         unsure = (self.times[after] - self.times[after - 1] > max_gap) & ~np.isin(times, self.times)
         at = np.where(unsure, np.nan, times)
@@ -182,10 +187,8 @@ def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: 
         spread[2] *= np.sign(np.linalg.det(u @ vt))
         return float(((e**2).sum() + (t**2).sum() - 2.0 * spread.sum()) / max(int(count.sum()), 1))
 
-    def speed(step: float = 0.02) -> float:
-        return _rms((truth.at(times - around + step) - truth.at(times - around - step)).ravel()) * 3**0.5 / (2.0 * step)
-
-    if not speed() > MIN_SPEED:
+    moved = (truth.at(times - around + 0.02) - truth.at(times - around - 0.02)).reshape(-1)
+    if not np.sqrt(3.0 * _mean(moved**2)) / 0.04 > MIN_SPEED:
         return float("nan")
     grid = around + np.linspace(-window, window, 2 * int(np.ceil(window * 30.0)) + 1)
     costs = [cost(float(delay)) for delay in grid]
@@ -434,9 +437,6 @@ def wrapped(angles: FloatArray) -> FloatArray:
     return around
 
 
-# --- calibration
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
     """Of n poses of one sensor.
@@ -469,17 +469,12 @@ def pose_errors(
         place: (3,) metres, where the person is in world.
     """
     turned = rotations @ true_rotation.T
-    sine = np.linalg.norm(turned - np.swapaxes(turned, -1, -2), axis=(-2, -1)) / np.sqrt(8.0)
-    cosine = 0.5 * (np.trace(turned, axis1=-2, axis2=-1) - 1.0)
     seen = true_rotation.T @ (place - true_translation)
     return PoseErrors(
-        np.arctan2(sine, cosine),
+        Rotation.from_matrix(turned).magnitude(),
         np.linalg.norm(translations - true_translation, axis=-1),
         np.linalg.norm(rotations @ seen + translations - place, axis=-1),
     )
-
-
-# --- statistics over time of what is known
 
 
 def known(positions: FloatArray) -> BoolArray:
@@ -488,7 +483,7 @@ def known(positions: FloatArray) -> BoolArray:
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Over the first axis."""
+    """Over the first axis, of what is known."""
     there = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(there, values, 0.0).sum(axis=0) / there.sum(axis=0)
@@ -496,11 +491,6 @@ def _mean(values: FloatArray) -> FloatArray:
 
 
 def _max(values: FloatArray) -> FloatArray:
-    """Over the first axis, of values that are not negative."""
-    there = np.isfinite(values)
-    largest = np.where(there, values, -1.0).max(axis=0, initial=-1.0)
-    return np.where(largest < 0.0, np.nan, largest)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(_mean(values**2)))
+    """Over the first axis, of what is known."""
+    largest: FloatArray = np.fmax.reduce(values, axis=0, initial=np.nan)
+    return largest

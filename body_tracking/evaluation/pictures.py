@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.evaluation.comparison import AngleComparison, Evaluation
+from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evaluation
 from body_tracking.evaluation.metrics import angle_errors
+from body_tracking.evaluation.reading import Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
-from body_tracking.evaluation.summary import Tracked, nearest, true_at
 from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
@@ -181,7 +181,7 @@ def _errors(result: Evaluation) -> str:
     joints, shown = np.flatnonzero(comparison.joints.frames), _thin(len(comparison.times))
     distances = 1e3 * np.linalg.norm(comparison.found - comparison.true, axis=-1)[shown][:, joints]
     times = comparison.times[shown]
-    gap = max(result.parameters.max_gap, 2.0 * float(np.median(np.diff(times))))
+    gap = max(MAX_GAP, 2.0 * float(np.median(np.diff(times))))
     after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # a gap, which its neighbours would fill
     edges = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
     distances, times = np.insert(distances, after, np.nan, axis=0), np.insert(times, after, edges)

@@ -44,26 +44,19 @@ All are 0 for a hanging arm with the forearm forward; at a flexion of 90 degrees
 
 from __future__ import annotations
 
-import importlib
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.linalg import solveh_banded
-from scipy.optimize import minimize_scalar
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.evaluation.c3d import MarkerError, Trial, listed, read_trial
+from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, runs, smooth
 from body_tracking.files import open_regular
-from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, Joint
-
-LONGEST_GAP = 0.2
-"""Seconds from which on a gap is left open (Schlagenhauf 2017, section 5.6.3)."""
+from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")
 ARM_MARKERS = ("SHO", "ELB", "WRA", "WRB")
@@ -102,23 +95,6 @@ _MODELLED: tuple[tuple[tuple[Joint, Joint], str, str], ...] = (
 """Vicon's joint centres, without L and R: points of that name, or the origin of the segment that begins there."""
 _HAND_END = "HNO"
 """Vicon's hand centre is half way from the wrist to here."""
-
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
-"""Axis of the file that points up to the cyclic exchange that makes it z."""
-
-_LEAST_TO_SMOOTH = 5
-_SMOOTHEST = 8.0
-_ROUGHEST = -4.0
-"""Decades of the smoothing parameter, in sample intervals cubed."""
-
-_BLOCK = 512
-_BIG_ENDIAN = 86
-"""C3D's number for processors of this kind."""
-
-
-class MarkerError(BodyTrackingError):
-    """A file does not hold the marker trajectories that are needed; the text says what it holds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -272,7 +248,7 @@ def read_plug_in_gait(
             subjects and none chosen, nothing but gaps, or ezc3d is not installed.
     """
     path = Path(path)
-    trial = _read(path, subject)
+    trial = read_trial(path, subject, MARKERS)
     points = trial.points
     if "SACR" in points:
         points = {"LPSI": points["SACR"], "RPSI": points["SACR"]} | points
@@ -284,7 +260,7 @@ def read_plug_in_gait(
         Gap(name, float(trial.stamps[first]), float(trial.stamps[end - 1]))
         for name in MARKERS
         if name not in missing
-        for first, end in _runs(np.isnan(markers[name][:, 0]))
+        for first, end in runs(np.isnan(markers[name][:, 0]))
     )
     if smoothing:
         markers = {name: smooth(each) for name, each in markers.items()}
@@ -459,192 +435,7 @@ def arm_angles(positions: FloatArray, thorax: FloatArray) -> ArmAngles:
     return ArmAngles(elbow, shoulder)
 
 
-def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> FloatArray:
-    """A trajectory with its gaps shorter than ``longest`` filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
-
-    A spline goes through all that is known between two longer gaps. What precedes the first known sample and follows
-    the last one stays unknown.
-
-    Args:
-        values: (n, 3), NaN where unknown.
-        rate: samples per second.
-        longest: s; a gap of as many missing samples as this holds, or more, is left open.
-    """
-    filled = values.copy()
-    known = np.flatnonzero(np.isfinite(values).all(axis=1))
-    missing = np.diff(known) - 1
-    breaks = np.flatnonzero(missing >= rate * longest - 1e-6) + 1  # 20 frames at 100 Hz are 0.2 s in spite of rounding
-    for each in np.split(known, breaks):
-        if len(each) > 1 and each[-1] - each[0] >= len(each):
-            inside = np.arange(each[0], each[-1] + 1)
-            unknown = np.setdiff1d(inside, each, assume_unique=True)
-            filled[unknown] = CubicSpline(each, values[each])(unknown)
-    return filled
-
-
-def smooth(values: FloatArray) -> FloatArray:
-    """Every stretch of known samples replaced by its smoothing spline under generalised cross-validation.
-
-    As Schlagenhauf 2017, section 5.6.3, but for the order of the spline. The cubic spline minimises the squared
-    residuals plus ``lambda`` times the integral of the squared second derivative. One ``lambda`` serves the coordinates
-    of a stretch together and minimises (Craven and Wahba 1979; Woltring, Adv. Eng. Softw. 8, 1986)::
-
-        GCV = mean squared residual / (1 - trace of the influence matrix / n)^2
-
-    It is the spline of ``scipy.interpolate.make_smoothing_spline``, whose search takes seconds for each coordinate of a
-    minute: here the samples are equidistant, so that the residuals come from one banded system (Reinsch 1967) and the
-    trace from the eigenvalues, known in closed form (within 0.5 % from 20 samples on).
-
-    Args:
-        values: (n, k), equidistant in time, NaN where unknown. Stretches of fewer than 5 samples are left as they are.
-    """
-    smoothed = values.copy()
-    for first, end in _runs(np.isfinite(values.sum(axis=1))):
-        if end - first >= _LEAST_TO_SMOOTH:
-            smoothed[first:end] -= _gcv_residual(values[first:end])
-    return smoothed
-
-
-def _gcv_residual(values: FloatArray) -> FloatArray:
-    """(n, k) what the smoothing spline takes away."""
-    n = len(values)
-    curvature = np.diff(values, 2, axis=0)
-    roughness = np.repeat([[1.0], [-4.0], [6.0]], n - 2, axis=1)  # of Q'Q and R in Reinsch's names
-    spread = np.repeat([[0.0], [1.0 / 6.0], [2.0 / 3.0]], n - 2, axis=1)
-    frequency = (np.arange(1, n - 1) + 0.5) * np.pi / n
-    eigenvalues = 3.0 * (2.0 - 2.0 * np.cos(frequency)) ** 2 / (2.0 + np.cos(frequency))
-
-    def residual(decade: float) -> FloatArray:
-        weight = 10.0**decade
-        solved = solveh_banded(spread + weight * roughness, curvature)
-        taken: FloatArray = weight * np.diff(np.pad(solved, ((2, 2), (0, 0))), 2, axis=0)
-        return taken
-
-    def gcv(decade: float) -> float:
-        trace = 2.0 + (1.0 / (1.0 + 10.0**decade * eigenvalues)).sum()
-        return float((residual(decade) ** 2).mean() / (1.0 - trace / n) ** 2)
-
-    decades = np.linspace(_ROUGHEST, _SMOOTHEST, 25)
-    best = decades[np.argmin([gcv(decade) for decade in decades])]
-    step = decades[1] - decades[0]
-    bounds = (max(best - step, _ROUGHEST), min(best + step, _SMOOTHEST))
-    found = minimize_scalar(gcv, bounds=bounds, method="bounded", options={"xatol": 0.01})
-    return residual(found.x if found.fun < gcv(best) else best)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """One subject of a file: (n, 3) of each point in the file's units and axes, NaN where it is not seen."""
-
-    points: dict[str, FloatArray]
-    rate: float
-    stamps: FloatArray
-    angle_unit: float
-    processing: dict[str, float]
-
-    @property
-    def frames(self) -> int:
-        return len(self.stamps)
-
-
-def _read(path: Path, subject: str | None) -> _Trial:
-    frames = _announced_frames(path)
-    try:
-        ezc3d: Any = importlib.import_module("ezc3d")
-    except ImportError as error:
-        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
-    try:
-        file = ezc3d.c3d(str(path))
-        parameters = file["parameters"]
-        header = file["header"]["points"]
-        data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(1, 2, 0)
-        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0]
-    # what it raises for a damaged file depends on where the damage is
-    except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
-        raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
-
-    def values(group: str, name: str) -> list[Any]:
-        return list(parameters[group][name]["value"]) if group in parameters and name in parameters[group] else []
-
-    def value(group: str, name: str, default: Any) -> Any:
-        return next(iter(values(group, name)), default)
-
-    labels = values("POINT", "LABELS")
-    for number in range(2, 100):  # a parameter holds at most 255 names
-        labels += values("POINT", f"LABELS{number}")
-    labels = [label.strip() for label in labels[: len(data)]]
-    if not labels or not data.shape[1]:
-        raise MarkerError(f"{path}: {len(labels)} points in {data.shape[1]} frames: there are no trajectories in it")
-    if data.shape[1] < frames:
-        raise MarkerError(f"{path}: cut off after {data.shape[1]} of {frames} frames")
-    rate = float(value("POINT", "RATE", header["frame_rate"]))
-    unit, up = value("POINT", "UNITS", "mm").strip(), value("POINT", "Y_SCREEN", "+Z").strip().upper()
-    if not rate > 0.0:
-        raise MarkerError(f"{path}: {rate} frames per second")
-    if unit not in _UNITS:
-        raise MarkerError(f"{path}: unit of length {unit!r}, expected one of {', '.join(_UNITS)}")
-    if up not in _UP_FIRST:
-        raise MarkerError(f"{path}: the axis that points up (POINT:Y_SCREEN) is {up!r}, expected +X, +Y or +Z")
-    seen = np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1) & (residuals >= 0.0)
-    data = np.where(seen[..., None], data, np.nan)
-    chosen = _of_subject(path, labels, subject)
-    angles = set(values("POINT", "ANGLES")) | {label for label in labels if label.endswith("Angles")}
-    points = {
-        name: data[index] if labels[index] in angles else _UNITS[unit] * data[index][:, _UP_FIRST[up]]
-        for name, index in chosen.items()
-    }
-    numbers = {name: value("PROCESSING", name, None) for name in parameters.get("PROCESSING", {}) if name[0] != "_"}
-    return _Trial(
-        points,
-        rate,
-        (int(header["first_frame"]) + np.arange(data.shape[1])) / rate,
-        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
-        {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
-    )
-
-
-def _announced_frames(path: Path) -> int:
-    """Frames by the file's header; also finds what ezc3d does not survive: folders, cut off parameters."""
-    try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise MarkerError(f"{path}: not a file")
-        with open_regular(path) as stream:
-            head = stream.read(256 * _BLOCK)
-    except OSError as error:
-        raise MarkerError(f"{path}: {error.strerror or error}") from error
-    if not size:
-        raise MarkerError(f"{path}: the file is empty")
-    if size < _BLOCK or head[1] != 0x50 or head[0] < 2:
-        raise MarkerError(f"{path}: not a C3D file ({size} bytes that do not begin as one)")
-    start = (head[0] - 1) * _BLOCK
-    if size < start + 4 or size < start + head[start + 2] * _BLOCK:
-        raise MarkerError(f"{path}: cut off after {size} bytes, before the end of its parameters")
-    order = ">u2" if head[start + 3] == _BIG_ENDIAN else "<u2"
-    first, last = np.frombuffer(head[6:10], dtype=order)
-    return int(last) - int(first) + 1
-
-
-def _of_subject(path: Path, labels: list[str], subject: str | None) -> dict[str, int]:
-    """Names without prefix, and the places of their points."""
-    split = [tuple(label.rpartition(":")[::2]) for label in labels]
-    named = {prefix for prefix, name in split if name in MARKERS}
-    if subject is not None and subject not in named:
-        raise MarkerError(f"{path}: no subject {subject!r}; found {_listed(sorted(named))}")
-    if subject is None and len(named) > 1:
-        raise MarkerError(f"{path}: {len(named)} subjects, choose one of {_listed(sorted(named))}")
-    if not named:
-        return {name: index for index, (_, name) in enumerate(split)}
-    chosen = subject if subject is not None else next(iter(named))
-    places = {name: index for index, (prefix, name) in enumerate(split) if prefix == chosen}
-    counts = Counter(name for prefix, name in split if prefix == chosen)
-    twice = [name for name in MARKERS if counts[name] > 1]
-    if twice:
-        raise MarkerError(f"{path}: more than one point is called {_listed(sorted(twice))}")
-    return places
-
-
-def _require(path: Path, trial: _Trial, missing: tuple[str, ...]) -> None:
+def _require(path: Path, trial: Trial, missing: tuple[str, ...]) -> None:
     lacking = [name for name in THORAX_MARKERS if name in missing]
     arms = [[side + name for name in ARM_MARKERS if side + name in missing] for side in "LR"]
     if all(arms):
@@ -654,16 +445,16 @@ def _require(path: Path, trial: _Trial, missing: tuple[str, ...]) -> None:
     never = [name for name in lacking if name in trial.points]
     found = [name for name in MARKERS if name not in missing]
     others = [name for name in trial.points if name not in MARKERS and not name.startswith("*")]
-    text = f"{path}: without the markers {_listed(lacking)}"
+    text = f"{path}: without the markers {listed(lacking)}"
     if never:
-        text += f" ({_listed(never)}: named but never seen)"
+        text += f" ({listed(never)}: named but never seen)"
     raise MarkerError(
-        f"{text}; needed are {_listed(THORAX_MARKERS)} and of one side {_listed(ARM_MARKERS)}; found "
-        f"{_listed(found)} of Plug-in Gait's and {len(others)} other points ({_listed(others, 10)})"
+        f"{text}; needed are {listed(THORAX_MARKERS)} and of one side {listed(ARM_MARKERS)}; found "
+        f"{listed(found)} of Plug-in Gait's and {len(others)} other points ({listed(others, 10)})"
     )
 
 
-def _vicon(trial: _Trial) -> tuple[FloatArray, ArmAngles]:
+def _vicon(trial: Trial) -> tuple[FloatArray, ArmAngles]:
     """What Vicon computed itself."""
     unknown = np.full((trial.frames, 3), np.nan)
     positions = np.full((trial.frames, N_JOINTS, 3), np.nan)
@@ -680,12 +471,6 @@ def _vicon(trial: _Trial) -> tuple[FloatArray, ArmAngles]:
     return positions, ArmAngles(angles("Elbow")[..., 0], angles("Shoulder"))
 
 
-def _runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """(first, end) of every run of true flags; the end is not in it."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
-
-
 def _unit(vectors: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         unit: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
@@ -695,8 +480,3 @@ def _unit(vectors: FloatArray) -> FloatArray:
 def _rejected(vectors: FloatArray, axis: FloatArray) -> FloatArray:
     """Unit vectors of what is at a right angle to a unit axis."""
     return _unit(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
-
-
-def _listed(names: Iterable[str], most: int = 100) -> str:
-    listed = [name or "(no prefix)" for name in names]
-    return (", ".join(listed[:most]) + (", ..." if len(listed) > most else "")) or "none"

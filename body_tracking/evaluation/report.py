@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from body_tracking.evaluation.comparison import AngleComparison, Comparison, Evaluation
-from body_tracking.evaluation.summary import EvaluationError
+from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, IntArray, Joint
 
 THESIS_JOINTS = (
@@ -62,6 +62,22 @@ class Table:
     names: tuple[str, ...]
     columns: tuple[Column, ...]
     note: str = ""
+
+    def row(self, name: str) -> dict[str, float]:
+        """The numbers of a row by the keys of their columns."""
+        return {column.key: float(column.values[self.names.index(name)]) for column in self.columns}
+
+    def text(self) -> str:
+        """For people: titles, units, a line and the rows."""
+        titles = [self.title, *(column.title for column in self.columns)]
+        rows = [titles, ["", *(column.unit for column in self.columns)]]
+        rows += [[name, *(column.text(row) for column in self.columns)] for row, name in enumerate(self.names)]
+        first, *widths = max(len(row[0]) for row in rows), *(max(len(each), 6) for each in titles[1:])
+        header, units, *others = (
+            " ".join([f"{name:<{first}}", *(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))])
+            for name, *cells in rows
+        )
+        return "\n".join([header, units, "-" * len(header), *others])
 
     def pooled(self, groups: dict[str, IntArray], rows: IntArray) -> Table:
         """The given rows, and one more for each group of rows."""
@@ -186,20 +202,8 @@ def facts(result: Evaluation) -> str:
 
 def text(result: Evaluation) -> str:
     """The tables for people: without angles by name that are those of the skeletons once more."""
-    lines: list[str] = []
-    for table in tables(result):
-        if table.key.startswith("named") and named_are_positional(result):
-            continue
-        titles = [table.title, *(column.title for column in table.columns)]
-        rows = [titles, ["", *(column.unit for column in table.columns)]]
-        rows += [[name, *(column.text(row) for column in table.columns)] for row, name in enumerate(table.names)]
-        first, *widths = max(len(row[0]) for row in rows), *(max(len(each), 6) for each in titles[1:])
-        header, units, *others = (
-            " ".join([f"{name:<{first}}", *(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))])
-            for name, *cells in rows
-        )
-        lines += ["", header, units, "-" * len(header), *others, table.note]
-    return "\n".join(lines)
+    shown = [each for each in tables(result) if not (each.key.startswith("named") and named_are_positional(result))]
+    return "\n".join(f"\n{each.text()}\n{each.note}" for each in shown)
 
 
 def as_csv(result: Evaluation) -> str:

@@ -5,23 +5,64 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
+from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.pictures import draw
-from body_tracking.evaluation.summary import AngleSummary, read, summaries, table
+from body_tracking.evaluation.reading import AngleSeries, read, true_at
+from body_tracking.evaluation.report import Column, Table
+from body_tracking.skeleton import FloatArray
 
 
-def summarise(
-    bag_path: Path, png_path: Path | None = None, body: str | None = None, truth: Path | None = None
-) -> tuple[AngleSummary, ...]:
+def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
+    """A row per angle, degrees.
+
+    Args:
+        angles: what was measured.
+        truth: what was true, at any stamps within 20 ms of the measured ones; its columns are left out without it.
+    """
+    known, true = angles.known, true_at(angles, truth)
+    final = np.array([next(iter(column[np.isfinite(column)][::-1]), np.nan) for column in known.T])
+    columns = [
+        *_range("", known),
+        Column("final", "final", "deg", np.degrees(final)),
+        Column("stddev", "stddev", "deg", np.degrees(np.median(angles.stddev, axis=0))),
+        Column("known", "known", "%", 1e2 * np.isfinite(known).mean(axis=0)),
+    ]
+    error = wrapped(known - true)
+    if np.isfinite(error).any():
+        errors = angle_errors(known, true)
+        within = np.where(np.isfinite(error), np.abs(error) <= 2.0 * angles.stddev, np.nan)
+        share = np.nansum(within, axis=0) / np.maximum(errors.frames, 1)
+        columns += [
+            *_range("true ", np.where(np.isfinite(error), true, np.nan)),
+            Column("rms_error", "rms err", "deg", np.degrees(errors.rmse)),
+            Column("max_error", "max err", "deg", np.degrees(errors.largest)),
+            Column("within_2_stddev", "in 2 sd", "%", np.where(errors.frames > 0, 1e2 * share, np.nan)),
+        ]
+    return Table("angles", "angle", angles.names, tuple(columns))
+
+
+def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
+    """The least and the greatest of (n, m) angles, NaN where unknown."""
+    known = np.isfinite(values)
+    least, most = np.where(known, values, np.inf).min(axis=0), np.where(known, values, -np.inf).max(axis=0)
+    least, most = (np.degrees(np.where(known.any(axis=0), each, np.nan)) for each in (least, most))
+    key = whose.replace(" ", "_")
+    return Column(f"{key}min", f"{whose}min", "deg", least), Column(f"{key}max", f"{whose}max", "deg", most)
+
+
+def summarise(bag: Path, png: Path | None = None, body: str | None = None, truth: Path | None = None) -> Table:
     """A summary of every joint angle in a bag; the picture too where a path for it is given.
 
     Raises:
         BagError: no such bag, or nothing of it can be read.
         EvaluationError: it holds no joint angles, or the picture cannot be written.
     """
-    tracked = read(bag_path, body, truth)
-    if png_path is not None:
-        draw(tracked, png_path)
-    return summaries(tracked.angles, tracked.true_angles)
+    tracked = read(bag, body, truth)
+    if png is not None:
+        draw(tracked, png)
+    return summary(tracked.angles, tracked.true_angles)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -40,7 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Print, and draw."""
-    print(table(summarise(args.bag, args.output, args.body, args.truth)))
+    print(summarise(args.bag, args.output, args.body, args.truth).text())
     if args.output is not None:
         print(f"\npicture: {args.output}")
     return 0

@@ -18,20 +18,20 @@ Not modelled: the earth's rotation (0.004 deg/s), the sensor's own low-pass filt
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from body_tracking.calibration.result import ClockModel
-from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import SEGMENTS
-from body_tracking.parameters import check_fields, number_field
+from body_tracking.simulation.imu_driver import Z, fuse, rotate, stated_covariance
+from body_tracking.simulation.imu_errors import CONSUMER, STANDARD_GRAVITY, ImuErrors, ImuSimulationError
+from body_tracking.simulation.surroundings import Surroundings
 from body_tracking.simulation.trajectories import minimum_jerk
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
@@ -40,9 +40,6 @@ StampArray = NDArray[np.int64]
 Motion = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """(n,) seconds to rotations (n, 3, 3), segment to world, and origins (n, 3) of the segment, metres in world."""
 
-STANDARD_GRAVITY: Final = 9.80665
-_DIPOLE = 1e-7
-"""T m / A: mu0 / (4 pi)."""
 _MICRO = 1e-6
 _STEP = 1e-4
 """Seconds h of the central differences, whose errors are h^2 (w''/6 + w x w'/3) of the angular rate, h^2 a''/12 of the
@@ -55,224 +52,10 @@ _GRID = 0.01
 _TISSUE_LIMIT = 0.012
 """Metres that tissue gives at most; less and less before."""
 _SLIP_S = 0.2
-_LEAST_DURATION = 0.1
 _MOST_JITTER = 0.2
 """Share of the sampling period: later samples stay later."""
 _TWIST_FADES = 0.25
 """Square of the cosine of half the swing (120 degrees) beyond which the twist, undefined at 180 degrees, fades."""
-_Z: Final = np.array([0.0, 0.0, 1.0])
-
-
-class ImuSimulationError(BodyTrackingError):
-    """An inertial sensor was described, or moved, as none can be."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImuErrors:
-    """How much an inertial sensor errs; each field's metadata says what it is, its unit and its range.
-
-    Noise densities are those of IEEE Std 952 (Allan deviation N / sqrt(tau), N sqrt(rate) per sample). Deviations of
-    what stays are per axis, and drawn anew for each recording; biases anew at each switching on. The defaults are
-    :data:`CONSUMER`.
-
-    Raises:
-        ImuSimulationError: a value out of its range.
-    """
-
-    gyro_noise: float = number_field(0.01, "noise density of the angular rate", "deg/s/sqrt(Hz)", 0.0, 1.0)
-    gyro_bias: float = number_field(0.3, "stddev of the turn-on bias of the angular rate", "deg/s", 0.0, 20.0)
-    gyro_instability: float = number_field(
-        0.006, "stddev of the in-run bias of the angular rate, beside the turn-on bias", "deg/s", 0.0, 5.0
-    )
-    gyro_scale: float = number_field(0.01, "stddev of the scale of the angular rate", "1", 0.0, 0.2)
-    gyro_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the angular rate", "1", 0.0, 0.2)
-    gyro_range: float = number_field(
-        2000.0, "greatest angular rate, of 16 bits; inf: any, exactly", "deg/s", 1.0, np.inf
-    )
-    acc_noise: float = number_field(0.003, "noise density of the acceleration", "m/s2/sqrt(Hz)", 0.0, 1.0)
-    acc_bias: float = number_field(0.1, "stddev of the turn-on bias of the acceleration", "m/s2", 0.0, 5.0)
-    acc_instability: float = number_field(0.003, "stddev of the in-run bias of the acceleration", "m/s2", 0.0, 1.0)
-    acc_scale: float = number_field(0.005, "stddev of the scale of the acceleration", "1", 0.0, 0.2)
-    acc_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the acceleration", "1", 0.0, 0.2)
-    acc_range: float = number_field(
-        16.0 * STANDARD_GRAVITY, "greatest acceleration, of 16 bits; inf: any, exactly", "m/s2", 1.0, np.inf
-    )
-    mag_noise: float = number_field(0.05, "noise density of the magnetic field", "uT/sqrt(Hz)", 0.0, 10.0)
-    mag_bias: float = number_field(1.0, "stddev of what calibration leaves of hard iron", "uT", 0.0, 100.0)
-    mag_scale: float = number_field(
-        0.01, "stddev of what calibration leaves of soft iron: of scale and each cross-axis sensitivity", "1", 0.0, 0.5
-    )
-    mag_range: float = number_field(4912.0, "greatest field, of 16 bits; inf: any, exactly", "uT", 50.0, np.inf)
-    instability_time: float = number_field(300.0, "correlation time of the in-run biases", "s", 1.0, 1e5)
-
-    tilt_time: float = number_field(
-        3.0, "time constant with which the driver levels by the acceleration", "s", 0.01, 1e3
-    )
-    heading_time: float = number_field(
-        9.0, "time constant with which the driver turns to the magnetic field", "s", 0.01, 1e4
-    )
-    driver_bias: float = number_field(
-        0.03, "stddev of the turn-on bias of the angular rate that the driver's own estimate leaves", "deg/s", 0.0, 5.0
-    )
-    stated_tilt: float = number_field(1.5, "stddev of the tilt that the driver states", "deg", 0.0, 90.0)
-    stated_heading: float = number_field(
-        4.0, "stddev of the heading that the driver states, without magnetometer besides the drift", "deg", 0.0, 180.0
-    )
-
-    misalignment: float = number_field(5.0, "stddev of the mounting's rotation per axis", "deg", 0.0, 90.0)
-    tissue_sag: float = number_field(
-        0.003, "how far the sensor sags on the flesh in its own weight; 0: tissue as stiff as bone", "m", 0.0, 0.02
-    )
-    tissue_frequency: float = number_field(8.0, "natural frequency of the sensor on the flesh", "Hz", 1.0, 12.0)
-    tissue_damping: float = number_field(0.25, "damping ratio of it", "1", 0.01, 2.0)
-    tissue_turn: float = number_field(
-        15.0, "by how much the sensor turns as it slides over the flesh: one over its radius", "rad/m", 0.0, 100.0
-    )
-    twist_share: float = number_field(
-        0.2, "share of a segment's twist against its parent that the skin does not follow", "1", 0.0, 1.0
-    )
-
-    jitter: float = number_field(0.0002, "stddev of the instants of sampling", "s", 0.0, 0.1)
-    stamp_jitter: float = number_field(0.0005, "stddev of the stamps about these instants", "s", 0.0, 0.1)
-    packet: int = field(
-        default=2, metadata={"doc": "samples sent together, lost together", "unit": "1", "min": 1, "max": 100}
-    )
-    lost: float = number_field(0.005, "probability that a packet is lost", "1", 0.0, 1.0)
-    outages: float = number_field(0.2, "outages of the radio", "1/min", 0.0, 60.0)
-    outage_time: float = number_field(0.5, "mean duration of an outage", "s", 0.0, 60.0)
-    delay: float = number_field(0.015, "time from sampling to receipt, at least", "s", 0.0, 10.0)
-    delay_jitter: float = number_field(0.005, "what is added to it on average", "s", 0.0, 10.0)
-
-    def __post_init__(self) -> None:
-        check_fields(self, "IMU errors", ImuSimulationError)
-
-
-CONSUMER: Final = ImuErrors()
-"""A chip like the MPU-9250 on a strap, over Bluetooth.
-
-Data sheet PS-MPU-9250A-01: 0.01 deg/s and 300 ug per root hertz, ranges; 3 % scale and 2 % cross-axis tolerance are
-taken for three standard deviations and less, as of a sensor that was calibrated once. Turn-on biases are what a change
-of temperature by 1 to 7 K leaves of such a calibration (0.24 deg/s and 1.5 mg per kelvin).
-"""
-
-GOOD: Final = ImuErrors(
-    gyro_noise=0.007,
-    gyro_bias=0.05,
-    gyro_instability=10.0 / 3600.0,
-    gyro_scale=0.001,
-    gyro_axes=0.001,
-    acc_noise=120e-6 * STANDARD_GRAVITY,
-    acc_bias=0.02,
-    acc_instability=30e-6 * STANDARD_GRAVITY,
-    acc_scale=0.001,
-    acc_axes=0.0005,
-    mag_noise=0.02,
-    mag_bias=0.3,
-    mag_scale=0.003,
-    mag_range=190.0,
-    tilt_time=6.0,
-    heading_time=20.0,
-    driver_bias=0.003,
-    stated_tilt=0.75,
-    stated_heading=1.5,
-    misalignment=3.0,
-    tissue_sag=0.002,
-    tissue_frequency=10.0,
-    twist_share=0.1,
-    jitter=1e-5,
-    stamp_jitter=1e-5,
-    packet=1,
-    lost=0.0005,
-    outages=0.02,
-    delay=0.03,
-    delay_jitter=0.001,
-)
-"""A motion tracker like those of Xsens, calibrated one by one, with tight straps.
-
-Data sheet of the MTi-1: 0.007 deg/s and 120 ug per root hertz, bias stability 10 deg/h and 0.03 mg. Radio as of its
-wireless kin, the MTw.
-"""
-
-IDEAL: Final = replace(
-    CONSUMER,
-    **{
-        item.name: np.inf if item.name.endswith("_range") else 0.0
-        for item in fields(ImuErrors)
-        if item.name.startswith(("gyro", "acc", "mag", "driver", "stated"))
-        or item.name in ("misalignment", "tissue_sag", "twist_share", "jitter", "stamp_jitter")
-        or item.name in ("lost", "outages", "delay", "delay_jitter")
-    },
-    packet=1,
-)
-"""No errors at all; a driver's fusion is still tilted by acceleration and turned by iron."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Iron:
-    """A body of iron, as a magnetic dipole.
-
-    Attributes:
-        position: (3,) metres in world.
-        moment: (3,) A m2 in world.
-        radius: metres; inside, the field is as on the surface.
-        since, until: seconds between which it is there; it comes and goes in half a second before and after.
-    """
-
-    position: FloatArray
-    moment: FloatArray
-    radius: float = 0.05
-    since: float = -np.inf
-    until: float = np.inf
-
-    @classmethod
-    def sphere(
-        cls, position: FloatArray, radius: float, earth: FloatArray, since: float = -np.inf, until: float = np.inf
-    ) -> Iron:
-        """A ball of soft iron in the earth's field (3,), tesla: ``m = 4 pi a^3 B / mu0`` (Jackson, section 5.11)."""
-        return cls(np.asarray(position, float), radius**3 * np.asarray(earth, float) / _DIPOLE, radius, since, until)
-
-    def field(self, points: FloatArray, times: FloatArray) -> FloatArray:
-        """(n, 3) tesla in world at points (n, 3) and times (n,): Jackson eq. 5.56, without the field inside."""
-        away = points - self.position
-        distance = np.linalg.norm(away, axis=-1, keepdims=True)
-        direction = away / np.maximum(distance, 1e-9)
-        along = direction @ self.moment
-        there = minimum_jerk((times - self.since) / 0.5 + 1.0) * minimum_jerk((self.until - times) / 0.5 + 1.0)
-        strength = _DIPOLE * there[:, None] / np.maximum(distance, self.radius) ** 3
-        result: FloatArray = strength * (3.0 * along[:, None] * direction - self.moment)
-        return result
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
-    """What the sensors feel of the place.
-
-    Attributes:
-        gravity: m/s2.
-        strength: tesla, of the earth's magnetic field.
-        dip: radians by which it points below the horizon.
-        north: radians from world's x, counter-clockwise, to magnetic north; at a quarter turn world is east-north-up.
-        iron: what disturbs the field.
-    """
-
-    gravity: float = STANDARD_GRAVITY
-    strength: float = 48e-6
-    dip: float = float(np.radians(64.0))
-    north: float = 0.5 * np.pi
-    iron: tuple[Iron, ...] = ()
-
-    @property
-    def earth(self) -> FloatArray:
-        """(3,) tesla in world: the earth's field."""
-        level, down = np.cos(self.dip), np.sin(self.dip)
-        return self.strength * np.array([level * np.cos(self.north), level * np.sin(self.north), -down])
-
-    def field(self, points: FloatArray, times: FloatArray) -> FloatArray:
-        """(n, 3) tesla in world at points (n, 3) and times (n,)."""
-        result: FloatArray = np.tile(self.earth, (len(points), 1))
-        for iron in self.iron:
-            result += iron.field(points, times)
-        return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -409,8 +192,7 @@ class SimulatedImu:
         off: (begin, end) seconds during which it is switched off; then it starts with other biases and another heading.
 
     Raises:
-        ImuSimulationError: a rate that is none, a segment that the body does not have, a time that ends before it
-            begins.
+        ImuSimulationError: a rate that is none, a segment that the body does not have.
     """
 
     name: str
@@ -430,11 +212,6 @@ class SimulatedImu:
             raise ImuSimulationError(f"{self.name}: segment {self.segment!r}, expected one of {', '.join(SEGMENTS)}")
         if not 1.0 <= self.rate_hz <= 1000.0:
             raise ImuSimulationError(f"{self.name}: a rate of {self.rate_hz} Hz, expected 1 to 1000")
-        if not 0.0 <= self.phase < np.inf:
-            raise ImuSimulationError(f"{self.name}: a phase of {self.phase} s")
-        for begin, end in self.off:
-            if not begin <= end:
-                raise ImuSimulationError(f"{self.name}: switched off from {begin} to {end} s")
 
     def capture_times(self, duration: float, rng: np.random.Generator) -> FloatArray:
         """(n,) seconds at which it samples: its rate by its own clock, with jitter, while it is switched on."""
@@ -466,27 +243,23 @@ class SimulatedImu:
             rng: where all chance comes from.
             parent: motion of the segment's parent, against which it twists about its z axis; without it the skin
                 follows every twist.
-            surroundings: gravity and magnetic field.
+            surroundings: the magnetic field.
             received_from_ns: time 0 in the receiver's clock, if it is not the reference clock.
-
-        Raises:
-            ImuSimulationError: the duration is too short for anything, or the motion answers in other shapes.
         """
-        if not _LEAST_DURATION <= duration < np.inf:
-            raise ImuSimulationError(f"{self.name}: {duration} s of motion, expected at least {_LEAST_DURATION} s")
         where = Surroundings() if surroundings is None else surroundings
         errors = self.errors
         off_axis = so3.exp(np.radians(errors.misalignment) * rng.normal(size=3))
         mounting_xyzw = so3.quat_multiply(off_axis, self.mounting.quat_xyzw)
         times = self.capture_times(duration, rng)
-        sensor = self._sensor_motion(motion, parent, duration, mounting_xyzw, where.gravity)
+        sensor = self._sensor_motion(motion, parent, duration, mounting_xyzw)
         rotations, positions, rates, accelerations = _kinematics(sensor, times)
 
         to_sensor = rotations.swapaxes(-1, -2)
-        forces = _rotate(to_sensor, accelerations + where.gravity * _Z)
-        magnetic = _rotate(to_sensor, where.field(positions, times))
+        forces = rotate(to_sensor, accelerations + STANDARD_GRAVITY * Z)
+        magnetic = rotate(to_sensor, where.field(positions, times))
         session = np.searchsorted(np.sort([end for _, end in self.off]), times, side="right").astype(np.intp)
-        of_gyro, of_acc, of_mag = _channels(errors)
+        of_gyro = _Channel.of(errors, "gyro", np.pi / 180.0)
+        of_acc, of_mag = _Channel.of(errors, "acc", 1.0), _Channel.of(errors, "mag", _MICRO)
         gyro, turn_on, in_run = self._measure(rates, of_gyro, session, rng)
         acc, _, _ = self._measure(forces, of_acc, session, rng)
         mag, _, _ = self._measure(magnetic, of_mag, np.zeros_like(session), rng)  # iron does not switch off
@@ -498,20 +271,24 @@ class SimulatedImu:
         covariance[:, 0, 0] = -1.0
         quats = so3.matrix_to_quat(rotations)
         if self.oriented:
-            drift = _rotate(rotations, gyro - rates - turn_on + left[session])
+            drift = rotate(rotations, gyro - rates - turn_on + left[session])
             orientation = np.empty((len(times), 4))
             for number in np.unique(session):
                 these = session == number
-                error = self._fuse(
+                error = fuse(
+                    errors,
+                    self.rate_hz,
                     times[these],
                     drift[these],
-                    _rotate(rotations[these], acc[these]),
-                    _rotate(rotations[these], mag[these]) if self.magnetometer else None,
+                    rotate(rotations[these], acc[these]),
+                    rotate(rotations[these], mag[these]) if self.magnetometer else None,
                     where,
                     headings[number],
                 )
                 orientation[these] = so3.quat_multiply(error, quats[these])
-                covariance[these] = self._stated_covariance(times[these], rotations[these], gyro[these])
+                covariance[these] = stated_covariance(
+                    errors, self.magnetometer, times[these], rotations[these], gyro[these]
+                )
 
         stamps, received, arrived = self._transmit(times, session, start_ns, received_from_ns, rng)
         truth = ImuTruth(times[arrived], quats[arrived], positions[arrived], mounting_xyzw, (turn_on + in_run)[arrived])
@@ -531,15 +308,15 @@ class SimulatedImu:
         )
 
     def _sensor_motion(
-        self, motion: Motion, parent: Motion | None, duration: float, mounting_xyzw: FloatArray, gravity: float
+        self, motion: Motion, parent: Motion | None, duration: float, mounting_xyzw: FloatArray
     ) -> Motion:
         """The motion of the sensor itself, from that of the bone under it."""
         place, errors = self.mounting.position, self.errors
         mounted = so3.quat_to_matrix(mounting_xyzw)
         flesh = errors.tissue_sag * self.mounting.flesh
-        bone = _checked(motion, self.name)
-        beneath = None if parent is None else _checked(parent, self.name)
-        slid = None if flesh == 0.0 else self._tissue(bone, duration, flesh, gravity)
+        bone = _in_parts(motion)
+        beneath = None if parent is None else _in_parts(parent)
+        slid = None if flesh == 0.0 else self._tissue(bone, duration, flesh)
         share = errors.twist_share * self.mounting.flesh
         # the skin lies across the line from the segment's axis to the sensor
         outward = place * [1.0, 1.0, 0.0]
@@ -557,15 +334,13 @@ class SimulatedImu:
                 local = local + way
             if beneath is not None and share > 0.0:
                 between = beneath(times)[0].swapaxes(-1, -2) @ rotations
-                back = so3.quat_to_matrix(so3.exp(-share * _twist(between)[:, None] * _Z))
-                turned, local = back @ turned, _rotate(back, local)
-            return rotations @ turned, origins + _rotate(rotations, local)
+                back = so3.quat_to_matrix(so3.exp(-share * _twist(between)[:, None] * Z))
+                turned, local = back @ turned, rotate(back, local)
+            return rotations @ turned, origins + rotate(rotations, local)
 
         return of_sensor
 
-    def _tissue(
-        self, motion: Motion, duration: float, sag: float, gravity: float
-    ) -> Callable[[FloatArray], FloatArray]:
+    def _tissue(self, motion: Motion, duration: float, sag: float) -> Callable[[FloatArray], FloatArray]:
         """Times to (n, 3) metres by which the sensor slides in the segment's frame: it swings, damped, after its place.
 
         ``x'' + 2 zeta w x' + w^2 x = -w^2 sag f / g`` with the specific force f of the place; up to what tissue gives.
@@ -577,7 +352,7 @@ class SimulatedImu:
             return rotations, origins + rotations @ self.mounting.position
 
         rotations, _, _, accelerations = _kinematics(at, grid)
-        force = _rotate(rotations.swapaxes(-1, -2), accelerations + gravity * _Z)
+        force = rotate(rotations.swapaxes(-1, -2), accelerations + STANDARD_GRAVITY * Z)
         w = 2.0 * np.pi * self.errors.tissue_frequency
         system = ([w**2], [1.0, 2.0 * self.errors.tissue_damping * w, w**2])
         numerator, denominator, _ = cont2discrete(system, grid[1] - grid[0], method="foh")
@@ -606,74 +381,6 @@ class SimulatedImu:
             step = channel.range / 2.0**15
             measured = step * np.clip(np.round(measured / step), -(2.0**15), 2.0**15 - 1.0)
         return measured, turn_on, in_run
-
-    def _fuse(
-        self,
-        times: FloatArray,
-        drift: FloatArray,
-        force: FloatArray,
-        magnetic: FloatArray | None,
-        where: Surroundings,
-        heading: float,
-    ) -> FloatArray:
-        """(n, 4) what turns the true orientation in world into the reported one.
-
-        To first order the error e, a rotation vector in world, of a complementary filter (Mahony 2008) is
-        ``e' = u - (e - e_ref) / tau``: driven by the errors u of the angular rate, drawn to what acceleration and
-        magnetic field say.
-
-        Args:
-            times: (n,) seconds.
-            drift: (n, 3) rad/s, errors of the angular rate in world.
-            force: (n, 3) m/s2, the measured specific force, turned to world by the true orientation.
-            magnetic: (n, 3) tesla likewise, or None.
-            where: for gravity and the direction of magnetic north.
-            heading: radians, of a driver without magnetometer at the start.
-        """
-        steps = np.diff(times, prepend=times[:1])
-        moved = drift * steps[:, None]
-        # what turns the mean force upwards: e x f = g z - f
-        level = np.stack([force[:, 1], -force[:, 0]], axis=-1) / where.gravity
-        fades = np.exp(-1.0 / (self.rate_hz * self.errors.tilt_time))
-        tilt = _low_pass((1.0 - fades) * level + moved[:, :2], fades, level[0])
-        tilted = so3.exp(np.concatenate([tilt, np.zeros((len(tilt), 1))], axis=1))
-        turned = np.cumsum(moved[:, 2])
-        if magnetic is None:
-            turned += heading
-        else:
-            # as unit complex numbers, which have no jump at half a turn, beside the heading by the gyroscope alone
-            seen = _rotate(so3.quat_to_matrix(tilted), magnetic)
-            north = (seen[:, 0] + 1j * seen[:, 1]) * np.exp(-1j * where.north)
-            to_north = np.exp(-1j * (np.angle(north) + turned))
-            fades = np.exp(-1.0 / (self.rate_hz * self.errors.heading_time))
-            turned = turned + np.angle(_low_pass((1.0 - fades) * to_north, fades, to_north[0]))
-        # world to east-north-up
-        turned = turned + 0.5 * np.pi - where.north
-        return so3.quat_multiply(so3.exp(turned[:, None] * _Z), tilted)
-
-    def _stated_covariance(self, times: FloatArray, rotations: FloatArray, rates: FloatArray) -> FloatArray:
-        """(n, 3, 3) rad2: what the driver states of its orientation.
-
-        Constants of the data sheet; without magnetometer, besides, the variance of the heading's drift by noise,
-        biases and scales (each of known deviation) over the very motion since the start.
-        """
-        errors = self.errors
-        tilt, heading = np.radians([errors.stated_tilt, errors.stated_heading]) ** 2
-        variance = np.full(len(times), heading)
-        if not self.magnetometer:
-            since, correlated = times - times[0], errors.instability_time
-            up = rotations[:, 2]
-            noise, left, in_run = np.radians([errors.gyro_noise, errors.driver_bias, errors.gyro_instability]) ** 2
-            variance += noise * since
-            variance += left * (cumulative_trapezoid(up, times, axis=0, initial=0.0) ** 2).sum(axis=1)
-            variance += 2.0 * in_run * correlated * (since + correlated * np.expm1(-since / correlated))
-            swept = cumulative_trapezoid(up[:, :, None] * rates[:, None, :], times, axis=0, initial=0.0)
-            scales = np.where(np.eye(3, dtype=bool), errors.gyro_scale, errors.gyro_axes) ** 2
-            variance += (scales * swept**2).sum(axis=(1, 2))
-        covariance = np.zeros((len(times), 3, 3))
-        covariance[:, 0, 0] = covariance[:, 1, 1] = tilt
-        covariance[:, 2, 2] = variance
-        return covariance
 
     def _transmit(
         self,
@@ -706,8 +413,7 @@ class SimulatedImu:
         return np.array(stamps, dtype=np.int64), received, ~lost[packet]
 
 
-@dataclass(frozen=True, slots=True)
-class _Channel:
+class _Channel(NamedTuple):
     """The errors of one of the three sensors, in SI units; ``density`` is the square of the noise density."""
 
     density: float
@@ -717,49 +423,24 @@ class _Channel:
     axes: float
     range: float
 
-
-def _channels(errors: ImuErrors) -> tuple[_Channel, _Channel, _Channel]:
-    """Gyroscope, accelerometer, magnetometer."""
-    e, rad = errors, np.pi / 180.0
-    return (
-        _Channel(
-            (e.gyro_noise * rad) ** 2,
-            e.gyro_bias * rad,
-            e.gyro_instability * rad,
-            e.gyro_scale,
-            e.gyro_axes,
-            e.gyro_range * rad,
-        ),
-        _Channel(e.acc_noise**2, e.acc_bias, e.acc_instability, e.acc_scale, e.acc_axes, e.acc_range),
-        _Channel((e.mag_noise * _MICRO) ** 2, e.mag_bias * _MICRO, 0.0, e.mag_scale, e.mag_scale, e.mag_range * _MICRO),
-    )
+    @classmethod
+    def of(cls, errors: ImuErrors, name: str, unit: float) -> _Channel:
+        """Of ``gyro``, ``acc`` or ``mag``, whose errors have this unit."""
+        noise, bias, in_run, most = (
+            unit * getattr(errors, f"{name}_{kind}", 0.0) for kind in ("noise", "bias", "instability", "range")
+        )
+        scale = getattr(errors, f"{name}_scale")
+        return cls(noise**2, bias, in_run, scale, getattr(errors, f"{name}_axes", scale), most)
 
 
-def swapped(first: SimulatedImu, second: SimulatedImu) -> tuple[SimulatedImu, SimulatedImu]:
-    """The same two sensors, each on the other's place."""
-    return (
-        replace(first, segment=second.segment, mounting=second.mounting),
-        replace(second, segment=first.segment, mounting=first.mounting),
-    )
+def _in_parts(motion: Motion) -> Motion:
+    """The motion, asked for not too many times at once."""
 
+    def parts(times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        answers = [motion(part) for part in np.array_split(times, max(-(-len(times) // _AT_ONCE), 1))]
+        return np.concatenate([each[0] for each in answers]), np.concatenate([each[1] for each in answers])
 
-def _checked(motion: Motion, name: str) -> Motion:
-    """The motion, asked for not too many times at once, and its answers looked at."""
-
-    def answer(times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rotations, origins = motion(times)
-        if rotations.shape != (len(times), 3, 3) or origins.shape != (len(times), 3):
-            raise ImuSimulationError(
-                f"{name}: motion of shapes {rotations.shape} and {origins.shape} at {len(times)} times, "
-                "expected (n, 3, 3) and (n, 3)"
-            )
-        return rotations, origins
-
-    def checked(times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = [answer(part) for part in np.array_split(times, max(-(-len(times) // _AT_ONCE), 1))]
-        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-
-    return checked
+    return parts
 
 
 def _kinematics(motion: Motion, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -773,12 +454,6 @@ def _kinematics(motion: Motion, times: FloatArray) -> tuple[FloatArray, FloatArr
     rates = so3.log(so3.quat_multiply(so3.quat_inverse(before), after)) / (2.0 * _STEP)
     accelerations = (positions[2 * n :] - 2.0 * positions[n : 2 * n] + positions[:n]) / _STEP**2
     return rotations[n : 2 * n], positions[n : 2 * n], rates, accelerations
-
-
-def _rotate(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n, 3) vectors turned by (n, 3, 3) rotations."""
-    result: FloatArray = (rotations @ vectors[..., None])[..., 0]
-    return result
 
 
 def _twist(rotations: FloatArray) -> FloatArray:
@@ -799,11 +474,4 @@ def _gauss_markov(n: int, correlated: float, rng: np.random.Generator) -> FloatA
     drive = rng.normal(size=(n, 3))
     drive[1:] *= np.sqrt(1.0 - keep**2)
     result: FloatArray = lfilter([1.0], [1.0, -keep], drive, axis=0)
-    return result
-
-
-def _low_pass(values: NDArray[Any], fades: float, first: Any) -> NDArray[Any]:
-    """x[k] = fades x[k-1] + values[k] along the first axis, real or complex, from x[0] = first on."""
-    driven = np.concatenate([np.asarray(first)[None], values[1:]])
-    result: NDArray[Any] = lfilter([1.0], [1.0, -fades], driven, axis=0)
     return result

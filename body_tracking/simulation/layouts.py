@@ -66,8 +66,6 @@ def around(
     azimuths: Sequence[float],
     distances: float | Sequence[float] = DISTANCE,
     heights: float | Sequence[float] = HEIGHT,
-    pitches: float | Sequence[float] = 0.0,
-    names: Sequence[str] | None = None,
 ) -> Layout:
     """Sensors anywhere round a person, each turned towards that person.
 
@@ -75,31 +73,18 @@ def around(
         azimuths: radians from the person's front to each sensor, positive to the person's left.
         distances: metres over the floor, one for all or one each, greater than zero.
         heights: metres above the floor.
-        pitches: radians by which they look down; the first, which tells where ``world`` is, does so in ``world`` too.
-        names: of the sensors; kinect1, kinect2, ... where none are given.
 
     Raises:
-        LayoutError: no sensor, numbers that do not belong together or are not finite, a distance that is not greater
-            than zero, or a name that comes twice.
+        LayoutError: no sensor, or azimuths that are not finite.
     """
     count = len(azimuths)
-    names = tuple(f"kinect{k + 1}" for k in range(count)) if names is None else tuple(names)
-    if count == 0 or len(names) != count or len(set(names)) < count:
-        raise LayoutError(f"layout: {count} azimuth(s) for the sensors {', '.join(names) or '(none)'}")
-    try:
-        azimuth, distance, height, pitch = (
-            np.broadcast_to(np.asarray(values, dtype=np.float64), (count,))
-            for values in (azimuths, distances, heights, pitches)
-        )
-    except ValueError as error:
-        raise LayoutError(f"layout: distances, heights or pitches that are not one or {count} ({error})") from error
+    if count == 0:
+        raise LayoutError("layout: no sensor")
+    azimuth, distance, height = (
+        np.broadcast_to(np.asarray(values, dtype=np.float64), (count,)) for values in (azimuths, distances, heights)
+    )
     if not np.isfinite(azimuth).all():
         raise LayoutError(f"layout: azimuths {np.degrees(azimuth).round(3).tolist()} degrees, expected finite numbers")
-    if not np.isfinite([distance, height, pitch]).all() or (distance <= 0.0).any():
-        raise LayoutError(
-            f"layout: distances {distance.tolist()} (expected greater than zero), heights {height.tolist()}, pitches "
-            f"{pitch.tolist()}: expected finite numbers"
-        )
     # the first sensor looks along x at the person, who stands so that the sensor is at its azimuth
     yaw = np.pi - azimuth[0]
     position = np.array([distance[0], 0.0, -height[0]])
@@ -107,7 +92,7 @@ def around(
     offsets = np.stack([distance * np.cos(directions), distance * np.sin(directions), height], axis=1)
     level = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     poses = []
-    for name, offset, direction, down in zip(names, offsets, directions, pitch, strict=True):
-        turn = Rotation.from_euler("ZY", [direction + np.pi, down]) * level
-        poses.append(SensorPose(name, position + offset, turn.as_quat()))
+    for number, (offset, direction) in enumerate(zip(offsets, directions, strict=True)):
+        turn = Rotation.from_euler("Z", direction + np.pi) * level
+        poses.append(SensorPose(f"kinect{number + 1}", position + offset, turn.as_quat()))
     return Layout(tuple(poses), position, float((yaw + np.pi) % (2.0 * np.pi) - np.pi))

@@ -6,20 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
 from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, IntArray, Joint
 
 
-def _are(*names: str) -> BoolArray:
+def named(*names: str) -> BoolArray:
+    """(25,) which joints are of these kinds, left or right."""
     return np.array([joint.name.removesuffix("_LEFT").removesuffix("_RIGHT") in names for joint in Joint])
 
 
-_SPINE = _are("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK")
-_TRUNK: BoolArray = _SPINE | _are("SHOULDER", "HIP")
-
-
-class OcclusionError(BodyTrackingError):
-    """Capsules that are no body."""
+_SPINE = named("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK")
+_TRUNK: BoolArray = _SPINE | named("SHOULDER", "HIP")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,24 +26,11 @@ class Capsules:
         starts: (k,) :class:`~body_tracking.skeleton.Joint` indices.
         ends: (k,) the same.
         radii: (k,) metres, greater than zero.
-
-    Raises:
-        OcclusionError: shapes that differ, indices that are no joint's, or a radius that is not greater than zero.
     """
 
     starts: IntArray
     ends: IntArray
     radii: FloatArray
-
-    def __post_init__(self) -> None:
-        shapes = self.starts.shape, self.ends.shape, self.radii.shape
-        if len(shapes[0]) != 1 or len(set(shapes)) > 1:
-            raise OcclusionError(f"capsules: starts, ends and radii of shapes {shapes}, expected (k,) each")
-        for name, joints in (("starts", self.starts), ("ends", self.ends)):
-            if ((joints < 0) | (joints >= N_JOINTS)).any():
-                raise OcclusionError(f"capsules {name}: {joints.tolist()}, expected joints 0 to {N_JOINTS - 1}")
-        if not (np.isfinite(self.radii) & (self.radii > 0.0)).all():
-            raise OcclusionError(f"capsule radii: {self.radii.tolist()}, expected metres greater than zero")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +44,6 @@ class Obstruction:
 
     cover: FloatArray
     nearer: FloatArray
-
-
-def cover(sight: FloatArray, capsules: Capsules) -> FloatArray:
-    """(n, 25) how deep each joint lies behind the body; see :func:`obstruction`."""
-    return obstruction(sight, capsules).cover
 
 
 def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
@@ -82,8 +60,7 @@ def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
         capsules: the flesh.
     """
     distance = np.linalg.norm(sight, axis=2, keepdims=True)
-    own = _own_radii(capsules)
-    reach = sight * (1.0 - np.minimum(own[:, None] / np.maximum(distance, 1e-9), 1.0))
+    own, reach = _skin(sight, capsules)
     covered, nearer = np.zeros(sight.shape[:2]), np.zeros(sight.shape[:2])
     joints = np.arange(N_JOINTS)
     for start, end, radius in zip(capsules.starts, capsules.ends, capsules.radii, strict=True):
@@ -112,8 +89,7 @@ def veil(sight: FloatArray, capsules: Capsules, other: FloatArray, flesh: Capsul
         other: (n, 25, 3) metres, the other's joints.
         flesh: round those.
     """
-    distance = np.linalg.norm(sight, axis=2, keepdims=True)
-    reach = sight * (1.0 - np.minimum(_own_radii(capsules)[:, None] / np.maximum(distance, 1e-9), 1.0))
+    _, reach = _skin(sight, capsules)
     covered = np.zeros(sight.shape[:2])
     for start, end, radius in zip(flesh.starts, flesh.ends, flesh.radii, strict=True):
         miss, _ = _nearest_of_rays(reach, other[:, None, start], other[:, None, end])
@@ -121,12 +97,13 @@ def veil(sight: FloatArray, capsules: Capsules, other: FloatArray, flesh: Capsul
     return covered
 
 
-def _own_radii(capsules: Capsules) -> FloatArray:
-    """(25,) metres: the widest capsule that ends in each joint, 0 where none does."""
+def _skin(sight: FloatArray, capsules: Capsules) -> tuple[FloatArray, FloatArray]:
+    """(25,) metres, the widest capsule that ends in each joint, and (n, 25, 3) the skin there that faces the sensor."""
     radii = np.zeros(N_JOINTS)
     np.maximum.at(radii, capsules.starts, capsules.radii)
     np.maximum.at(radii, capsules.ends, capsules.radii)
-    return radii
+    distance = np.linalg.norm(sight, axis=2, keepdims=True)
+    return radii, sight * (1.0 - np.minimum(radii[:, None] / np.maximum(distance, 1e-9), 1.0))
 
 
 def _distance_to_segment(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:

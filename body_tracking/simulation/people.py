@@ -25,7 +25,7 @@ MODEL: Final = UpperBody()
 
 
 class PeopleError(BodyTrackingError):
-    """A person who cannot be, or who is asked to stand where no leg reaches."""
+    """A person is asked to stand where no leg reaches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +115,8 @@ class Person:
 
     @classmethod
     def average(cls, sex: str) -> Person:
-        """The average person of a sex, left and right alike.
-
-        Raises:
-            PeopleError: a sex of which there is no table.
-        """
-        table = _table(sex)
+        """The average person of a sex, left and right alike."""
+        table = _TABLES[sex]
         stature = table.stature[0]
         return cls._of(sex, stature, table.body_mass_index * stature**2, {}, {})
 
@@ -130,12 +126,9 @@ class Person:
 
         The body mass index is lognormal; nothing is further off than 2.5 standard deviations. The lengths that stand
         one upon the other keep their sum, so that the stature is the person's.
-
-        Raises:
-            PeopleError: a sex of which there is no table.
         """
         chosen = sex if sex is not None else SEXES[rng.integers(len(SEXES))]
-        table = _table(chosen)
+        table = _TABLES[chosen]
 
         def normal() -> float:
             return float(np.clip(rng.normal(), -_TAIL, _TAIL))
@@ -304,12 +297,6 @@ def _knees(person: Person, hips: FloatArray, ankles: FloatArray, forward: FloatA
     bend /= np.linalg.norm(bend, axis=-1, keepdims=True)
     result: FloatArray = hips + along[..., None] * direction + aside[..., None] * bend
     return result
-
-
-def _table(sex: str) -> _Table:
-    if sex not in _TABLES:
-        raise PeopleError(f"unknown sex {sex!r}, expected one of {', '.join(SEXES)}")
-    return _TABLES[sex]
 
 
 def _kind(name: str) -> str:

@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.postures import FROM_CENTRE, PELVIS_QUATERNION, SHOULDER_QUATERNIONS
 from body_tracking.simulation.trajectories import WAVE_BAND, Moves, Waves
 from body_tracking.skeleton import (
     N_JOINTS,
@@ -31,10 +31,11 @@ from body_tracking.skeleton import (
     TrackingState,
 )
 
-MODEL: Final = UpperBody()
-"""The body that all random people have."""
 _RANGES: Final = Ranges(MODEL)
 _NAMES: Final = MODEL.coordinate_names[6:]
+_CENTRE: Final = _RANGES.centre
+_HALF: Final = 0.5 * (_RANGES.high - _RANGES.low)
+"""(26,) centres and half widths of the ranges; postures are drawn as shares u, coordinate = centre + half u."""
 
 START_NS = 1_000 * NANOSECONDS
 """Stamp of time 0."""
@@ -63,27 +64,14 @@ _SWAY = np.array([0.006, 0.006, 0.002, *np.radians([1.0, 1.0, 1.5])])
 _PELVIS = np.radians([4.0, 6.0, 0.0])
 """Amplitude by which an active person's pelvis tilts besides."""
 
-POSTURES = ("arms_up", "arms_down", "arms_forward", "t_pose")
-"""Special postures: straight arms, upright trunk."""
 _DIRECTIONS = {
     "arms_up": (0.0, 0.0, 1.0),
     "arms_down": (0.0, 0.0, -1.0),
     "arms_forward": (1.0, 0.0, 0.0),
     "t_pose": (0.0, 1.0, 0.0),
 }
-"""Of the left arm; the right one mirrored."""
-
-
-class RandomPeopleError(BodyTrackingError):
-    """Something was asked for that no random person can do."""
-
-
-def _half_ranges() -> tuple[FloatArray, FloatArray]:
-    """(26,) centres and half widths of the ranges; postures are drawn as shares u, coordinate = centre + half u."""
-    return _RANGES.centre, 0.5 * (_RANGES.high - _RANGES.low)
-
-
-_CENTRE, _HALF = _half_ranges()
+"""Of the left arm, the right one mirrored, in special postures: straight arms, upright trunk."""
+POSTURES: Final = tuple(_DIRECTIONS)
 
 
 def _indices(*starts: str, end: str = "") -> IntArray:
@@ -98,15 +86,8 @@ _NECK = _indices("neck")
 _ARMS = tuple(_indices("clavicle", "shoulder", "elbow", "forearm", "wrist", end=side) for side in ("_left", "_right"))
 """Per side: clavicle (2), shoulder (3), elbow, forearm, wrist (2)."""
 _SHOULDERS = np.stack([_indices("shoulder", end=side) for side in ("_left", "_right")])
-_SHOULDER_QUATERNIONS = np.array(
-    [[MODEL.quaternion_of(f"upper_arm_{side}").start + k for k in range(4)] for side in ("left", "right")],
-    dtype=np.intp,
-)
-_PELVIS_QUATERNION = MODEL.quaternion_of("pelvis")
 _HANGING: Final = _RANGES.soft_coordinates(MODEL.neutral()).values[_SHOULDERS]
 """(2, 3) rotation vectors of hanging arms from the centres of their reach."""
-_FROM_CENTRE: Final = so3.quat_inverse(so3.exp(_HANGING))
-"""(2, 4) the upper arms at the centres of their reach, in the clavicles' frames."""
 _MIRROR_ARM = np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
 """A left arm's shares to the right arm's: only the rotation vector of the shoulder changes signs."""
 
@@ -178,12 +159,10 @@ def _draw_arm(rng: np.random.Generator) -> FloatArray:
 
 def _draw_posture(rng: np.random.Generator, name: str) -> FloatArray:
     """(26,) shares of a special posture: upright to 2 degrees, elbows straight to 3."""
-    if name not in POSTURES:
-        raise RandomPeopleError(f"unknown posture {name!r}, expected one of {', '.join(POSTURES)}")
     shares = _share(rng.normal(scale=2.0, size=len(_NAMES)), np.arange(len(_NAMES), dtype=np.intp))
     for side, arm in enumerate(_ARMS):
         direction = np.array(_DIRECTIONS[name]) * [1.0, 1.0 if side == 0 else -1.0, 1.0]
-        centre = so3.quat_to_matrix(_FROM_CENTRE[side])
+        centre = so3.quat_to_matrix(FROM_CENTRE[side])
         # the shortest way from the centre of the reach, as a rotation vector in the upper arm's frame there
         wanted = centre.T @ direction
         axis = np.cross([0.0, 0.0, -1.0], wanted)
@@ -202,12 +181,6 @@ class RandomMotion:
         tempo: 0.4 calm to 1.6 brisk; drawn (log-uniformly) where it is None.
         postures: special postures (:data:`POSTURES`) to take, in this order, each held for 1 to 2 s.
         full_turns: how many full turns of the body to make at least.
-
-    Attributes:
-        tempo: see above.
-
-    Raises:
-        RandomPeopleError: an unknown posture, a duration that is not positive.
     """
 
     def __init__(
@@ -218,8 +191,6 @@ class RandomMotion:
         postures: Sequence[str] = (),
         full_turns: int = 0,
     ) -> None:
-        if not duration > 0.0:
-            raise RandomPeopleError(f"a motion of {duration} s")
         low, high = TEMPI
         self.tempo = low * (high / low) ** rng.random() if tempo is None else tempo
         fastest = WAVE_BAND[1] * min(self.tempo, 1.0)
@@ -253,21 +224,15 @@ class RandomMotion:
 
         q = np.tile(MODEL.neutral(), (len(times), 1))
         q[:, MODEL.scalar_q] = soft[:, MODEL.scalar_v - 6]
-        q[:, _SHOULDER_QUATERNIONS] = so3.quat_multiply(_FROM_CENTRE, so3.exp(soft[:, _SHOULDERS]))
+        for where, centre, shoulder in zip(SHOULDER_QUATERNIONS, FROM_CENTRE, _SHOULDERS, strict=True):
+            q[:, where] = so3.quat_multiply(centre, so3.exp(soft[:, shoulder]))
         base, sway = self._base.at(times), _SWAY * self._sway.at(times)
         q[:, :3] = base[:, :3] + sway[:, :3]
         yaw = np.zeros((len(times), 3))
         yaw[:, 2] = base[:, 3]
         tilt = sway[:, 3:] + _PELVIS * activity * self._pelvis.at(times)
-        q[:, _PELVIS_QUATERNION] = so3.quat_multiply(so3.exp(yaw), so3.exp(tilt))
+        q[:, PELVIS_QUATERNION] = so3.quat_multiply(so3.exp(yaw), so3.exp(tilt))
         return q
-
-    def velocity(self, times: FloatArray) -> FloatArray:
-        """(n, 32) tangent velocities at (n,) seconds; central differences of the closed form, good to 1e-5."""
-        step = 1e-4
-        after, before = self.configuration(times + step), self.configuration(times - step)
-        result: FloatArray = MODEL.difference(before, after) / (2.0 * step)
-        return result
 
     @staticmethod
     def _draw_place(rng: np.random.Generator) -> FloatArray:
@@ -382,7 +347,9 @@ def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0,
 
 def truth_of(person: RandomPerson, motion: RandomMotion, times: FloatArray) -> Truth:
     """What is true of a person who moves like this, at (n,) seconds."""
-    q, velocity = motion.configuration(times), motion.velocity(times)
+    # central differences of the closed form, good to 1e-5
+    before, q, after = (motion.configuration(times + step) for step in (-1e-4, 0.0, 1e-4))
+    velocity = MODEL.difference(before, after) / 2e-4
     linear = MODEL.linearise(q, person.lengths)
     speeds = np.linalg.norm((linear.jacobian @ velocity[:, None, :, None])[..., 0], axis=-1)
     return Truth(times, q, velocity, person.lengths, linear.posture.positions, speeds)
@@ -465,9 +432,6 @@ class MeasurementErrors:
         outliers: share of the joint samples that are displaced in a random direction.
         outlier_size: metres, greatest displacement; uniform from 0.
         outliers_between: seconds within which there are outliers.
-
-    Raises:
-        RandomPeopleError: a negative noise, a share that is none.
     """
 
     noise: float
@@ -477,14 +441,6 @@ class MeasurementErrors:
     outliers: float = 0.0
     outlier_size: float = 1.0
     outliers_between: tuple[float, float] = (-np.inf, np.inf)
-
-    def __post_init__(self) -> None:
-        if not self.noise >= 0.0:
-            raise RandomPeopleError(f"measurement noise of {self.noise} m")
-        if not 0.0 <= self.outliers <= 1.0:
-            raise RandomPeopleError(f"a share of outliers of {self.outliers}")
-        if self.factors is not None and self.factors.shape != (N_JOINTS,):
-            raise RandomPeopleError(f"noise factors: shape {self.factors.shape}, expected {(N_JOINTS,)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,11 +17,13 @@ from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import Posture
 from body_tracking.kinematics.upper_body import PARENTS
 from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu, Surroundings
-from body_tracking.simulation.kinect import KinectErrors, Misreading, SimulatedKinect
+from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu
+from body_tracking.simulation.kinect import KinectErrors
+from body_tracking.simulation.kinect_sensor import Misreading, SimulatedKinect
 from body_tracking.simulation.layouts import Layout, layout
 from body_tracking.simulation.people import MODEL, Course, Person, joints
 from body_tracking.simulation.repertoire import Movement, make_movement
+from body_tracking.simulation.surroundings import Surroundings
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, IntArray, Skeleton, TrackingState
 
 WORLD: Final = "world"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -48,17 +49,14 @@ class AngleHistory:
     def __init__(self, window: float, capacity: int = 4096) -> None:
         self.window = window
         self.names: tuple[str, ...] = ()
-        self._capacity = capacity
-        self.clear()
+        self._rows: deque[tuple[int, FloatArray]] = deque(maxlen=capacity)
 
     def clear(self) -> None:
         """Forget everything."""
-        self._stamps = np.empty(self._capacity, np.int64)
-        self._rows = np.empty((self._capacity, 2, len(self.names)))
-        self._begin = self._end = 0  # of what is kept; numbers of messages, which grow
+        self._rows.clear()
 
     def __len__(self) -> int:
-        return self._end - self._begin
+        return len(self._rows)
 
     def add(self, stamp_ns: int, names: Sequence[str], positions: FloatArray, stddevs: FloatArray) -> None:
         """Take one message; late ones are left out, and other names or a jump back in time start anew.
@@ -69,28 +67,24 @@ class AngleHistory:
             positions: (n,) radians.
             stddevs: (n,) radians, infinity where not known.
         """
-        last = self._stamps[(self._end - 1) % self._capacity] if len(self) else None
+        last = self._rows[-1][0] if self._rows else None
         if tuple(names) != self.names or (last is not None and stamp_ns < last - _JUMP_BACK_NS):
             self.names = tuple(names)
             self.clear()
         elif last is not None and stamp_ns <= last:
             return
-        place = self._end % self._capacity
-        self._stamps[place] = stamp_ns
-        self._rows[place] = np.degrees(positions), np.degrees(stddevs)
-        self._end += 1
-        oldest = max(self._begin, self._end - self._capacity)
-        limit = stamp_ns - round(self.window * NANOSECONDS)
-        while self._stamps[oldest % self._capacity] < limit:
-            oldest += 1
-        self._begin = oldest
+        self._rows.append((stamp_ns, np.degrees([positions, stddevs])))
+        while self._rows[0][0] < stamp_ns - round(self.window * NANOSECONDS):
+            self._rows.popleft()
 
     def curve(self, name: str, count: int) -> Curve | None:
         """The curve of one angle, with at most ``count`` points; None where there is none."""
         if name not in self.names or not len(self):
             return None
-        places = np.arange(self._begin, self._end) % self._capacity
-        values, stddevs = self._rows[places, :, self.names.index(name)].T
+        index = self.names.index(name)
+        rows = list(self._rows)  # at once: others append meanwhile
+        stamps = np.array([stamp_ns for stamp_ns, _ in rows])
+        values, stddevs = np.array([row[:, index] for _, row in rows]).T
         known = np.isfinite(values)
         if not known.any():
             return None
@@ -99,7 +93,7 @@ class AngleHistory:
         reach = np.minimum(np.where(known & np.isfinite(stddevs), BAND * stddevs, np.inf), WIDEST)
         low, high = values - reach, values + reach
         kept = extremes(np.stack([values, low, high]), count)
-        times = (self._stamps[places[kept]] - self._stamps[places[-1]]) / NANOSECONDS
+        times = (stamps[kept] - stamps[-1]) / NANOSECONDS
         latest_stddev = float(stddevs[-1]) if known[-1] else float("inf")
         return Curve(times, values[kept], low[kept], high[kept], latest_stddev)
 

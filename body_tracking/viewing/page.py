@@ -21,7 +21,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.node_status import NodeStatus
 from body_tracking.pipeline.system import Layer, load
-from body_tracking.skeleton import FloatArray, Skeleton
+from body_tracking.skeleton import Skeleton
 from body_tracking.viewing.colours import (
     BODY,
     FILTERED,
@@ -29,23 +29,17 @@ from body_tracking.viewing.colours import (
     INFERRED,
     PALETTE,
     UNCERTAINTY,
-    Colour,
-    ColourArray,
-    linear,
     sensor_colours,
 )
 from body_tracking.viewing.curves import AngleHistory, first_choice
+from body_tracking.viewing.handles import BALL, STALE, TUBE, Drawn, Shapes, show
 from body_tracking.viewing.same_origin import same_origin
 from body_tracking.viewing.shapes import (
     KINECT_VIEW,
-    Mesh,
-    ball,
     capsules,
     ellipsoids,
-    figure,
     floor_height,
     in_world,
-    tube,
 )
 from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
 from body_tracking.viewing.status import table
@@ -55,7 +49,6 @@ PLOTS: Final = 4
 POINTS: Final = 200
 """Points of a plotted curve at most: about one per two pixels."""
 
-_STALE: Final[Colour] = (190, 190, 190)
 _HEAD_START: Final = np.array([2.2, 0.0, 0.0])
 """Where a person is looked for before one is seen: in front of the reference sensor, metres in world."""
 _BEHIND: Final = np.array([-3.3, 1.5, 0.9])
@@ -157,11 +150,11 @@ class Page:
             position=(2.0, 0.0, -1.0),
         )
         scene.add_frame("/world", axes_length=0.2, axes_radius=0.006)
-        self._drawn: dict[str, _Drawn] = {}
+        self._drawn: dict[str, Drawn] = {}
         self._cameras: dict[str, Any] = {}
         self._colours = sensor_colours(sensors)
         for sensor, colour in self._colours.items():
-            self._drawn[sensor] = _Drawn(scene, f"/sensors/{sensor}/skeleton", colour, 0.018, 0.009)
+            self._drawn[sensor] = Drawn(scene, f"/sensors/{sensor}/skeleton", colour, 0.018, 0.009)
             camera = scene.add_camera_frustum(
                 f"/sensors/{sensor}/view",
                 fov=float(KINECT_VIEW[1]),
@@ -174,11 +167,11 @@ class Page:
             )
             scene.add_label(f"/sensors/{sensor}/view/name", sensor, position=(0.0, -0.1, 0.0), anchor="bottom-center")
             self._cameras[sensor] = camera
-        self._drawn["fused"] = _Drawn(scene, "/fused", FUSED, 0.02, 0.01)
-        self._drawn["filtered"] = _Drawn(scene, "/filtered", FILTERED, 0.022, 0.014)
-        self._limbs = _Shapes(scene, "/body/limbs", tube(), BODY, 0.55)
-        self._ends = _Shapes(scene, "/body/ends", ball(), BODY, 0.55)
-        self._clouds = _Shapes(scene, "/uncertainty", ball(), UNCERTAINTY, 0.3)
+        self._drawn["fused"] = Drawn(scene, "/fused", FUSED, 0.02, 0.01)
+        self._drawn["filtered"] = Drawn(scene, "/filtered", FILTERED, 0.022, 0.014)
+        self._limbs = Shapes(scene, "/body/limbs", TUBE, BODY, 0.55)
+        self._ends = Shapes(scene, "/body/ends", BALL, BODY, 0.55)
+        self._clouds = Shapes(scene, "/uncertainty", BALL, UNCERTAINTY, 0.3)
         self._axes = scene.add_batched_axes(
             "/segments",
             np.array([[1.0, 0.0, 0.0, 0.0]]),
@@ -196,7 +189,7 @@ class Page:
             for sensor, seen in snapshot.sensors.items():
                 pose = snapshot.poses.get(sensor)
                 camera, drawn = self._cameras[sensor], self._drawn[sensor]
-                _show(camera, self._visible["frustums"] and pose is not None)
+                show(camera, self._visible["frustums"] and pose is not None)
                 if pose is None:
                     drawn.hide()
                     continue
@@ -211,7 +204,7 @@ class Page:
             self._draw_frames(snapshot)
             self._floor = floor_height([*standing, *snapshot.filtered.skeletons], self._floor)
             self._grid.position = (2.0, 0.0, -1.0 if self._floor is None else self._floor)
-            _show(self._grid, self._visible["floor"])
+            show(self._grid, self._visible["floor"])
             for name, draw_layer in self._layers:
                 draw_layer(scene, f"/layers/{name}", snapshot.layers.get(name) if self._visible[name] else None)
         bodies = snapshot.filtered.skeletons or tuple(standing)
@@ -222,7 +215,7 @@ class Page:
 
     def _draw_body(self, seen: Seen) -> None:
         shapes = capsules(seen.skeletons if self._visible["body"] else ())
-        colour = _STALE if seen.stale else BODY
+        colour = STALE if seen.stale else BODY
         radii = shapes.radii
         self._limbs.draw(
             shapes.centres, shapes.quats_xyzw, np.stack([radii, radii, shapes.lengths], axis=1), colour=colour
@@ -243,7 +236,7 @@ class Page:
         if there:
             self._axes.batched_wxyzs = np.roll(snapshot.quats_xyzw, 1, axis=1).astype(np.float32)
             self._axes.batched_positions = snapshot.origins.astype(np.float32)
-        _show(self._axes, bool(there))
+        show(self._axes, bool(there))
 
     def _look_at_person(self, client: viser.ClientHandle) -> None:
         target = self._looked_at
@@ -396,112 +389,7 @@ class _Plot:
             self._choice.label = f"{now} ± {1.96 * curve.latest_stddev:.1f}°" if known else f"{now} ± ?"
 
 
-class _Drawn:
-    """Skeletons of one source: joints as balls, bones as lines."""
-
-    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
-        self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
-        self._radius = radius
-        self._joints = _Shapes(scene, f"{name}/joints", ball(), colour)
-        self._lines: Any = None
-
-    def hide(self) -> None:
-        """Show nothing."""
-        self.draw(Seen(), False)
-
-    def draw(self, seen: Seen, visible: bool) -> None:
-        """Show what is seen."""
-        drawn = figure(seen.skeletons if visible else (), self._colour)
-        colours: Any = _STALE if seen.stale else drawn.joint_colours
-        count = len(drawn.joints)
-        self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius), colour=colours)
-        colour = _STALE if seen.stale else self._colour
-        if self._lines is None or len(drawn.bones) > len(self._lines.points):
-            room = max(24, len(drawn.bones))
-            self._lines = self._scene.add_line_segments(
-                f"{self._name}/bones", np.zeros((room, 2, 3)), colour, thickness=self._thickness
-            )
-        # what is not there has no length
-        points = np.zeros_like(self._lines.points)
-        points[: len(drawn.bones)] = drawn.bones
-        if len(drawn.bones):
-            points[len(drawn.bones) :] = drawn.bones[0, 0]
-            self._lines.points = points
-            self._lines.colors = np.array(colour, np.uint8)
-        _show(self._lines, bool(len(drawn.bones)))
-
-
-class _Shapes:
-    """Any number of one mesh, turned, stretched and placed."""
-
-    def __init__(
-        self, scene: viser.SceneApi, name: str, mesh: Mesh, colour: Colour, opacity: float | None = None
-    ) -> None:
-        self._scene, self._name, self._mesh, self._colour, self._opacity = scene, name, mesh, colour, opacity
-        self._room = 0
-        self._handle: Any = None
-
-    def draw(
-        self,
-        positions: FloatArray,
-        quats_xyzw: FloatArray | None,
-        scales: FloatArray,
-        colour: Colour | ColourArray | None = None,
-    ) -> None:
-        """Show these.
-
-        Args:
-            positions: (n, 3) metres.
-            quats_xyzw: (n, 4) unit quaternions; None for all upright.
-            scales: (n, 3) along the mesh's own axes.
-            colour: of all, or (n, 3) of each.
-        """
-        count = len(positions)
-        if count == 0:
-            if self._handle is not None:
-                _show(self._handle, False)
-            return
-        if count > self._room:
-            self._make(max(25, count))
-        room = self._room
-        # those that are not there have no size
-        batch, wxyz, sizes = (np.zeros((room, size), np.float32) for size in (3, 4, 3))
-        wxyz[:, 0] = 1.0
-        batch[:count], sizes[:count] = positions, scales
-        batch[count:] = positions[0]
-        if quats_xyzw is not None:
-            wxyz[:count] = np.roll(quats_xyzw, 1, axis=1)
-        colours = np.zeros((room, 3), np.uint8)
-        colours[:count] = linear(self._colour if colour is None else colour)
-        handle = self._handle
-        handle.batched_positions, handle.batched_scales, handle.batched_colors = batch, sizes, colours
-        if quats_xyzw is not None:
-            handle.batched_wxyzs = wxyz
-        _show(handle, True)
-
-    def _make(self, room: int) -> None:
-        self._room = room
-        self._handle = self._scene.add_batched_meshes_simple(
-            self._name,
-            self._mesh.vertices,
-            self._mesh.faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (room, 1)),
-            np.zeros((room, 3)),
-            batched_scales=np.zeros((room, 3)),
-            batched_colors=np.tile(np.array(self._colour, np.uint8), (room, 1)),
-            opacity=self._opacity,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-
-
 _NONE: Final = "none yet"
-
-
-def _show(handle: Any, visible: bool) -> None:
-    if handle.visible != visible:
-        handle.visible = visible
 
 
 def _check_address(host: str) -> None:

@@ -28,31 +28,25 @@ _PARENTS: Final[IntArray] = np.array([parent for parent, _ in BONES], dtype=np.i
 _CHILDREN: Final[IntArray] = np.array([child for _, child in BONES], dtype=np.intp)
 
 _RADII: Final = {
-    Joint.SPINE_MID: 0.085,
-    Joint.SPINE_SHOULDER: 0.085,
-    Joint.NECK: 0.045,
-    Joint.HEAD: 0.075,
-    Joint.SHOULDER_LEFT: 0.05,
-    Joint.ELBOW_LEFT: 0.042,
-    Joint.WRIST_LEFT: 0.033,
-    Joint.HAND_LEFT: 0.028,
-    Joint.HAND_TIP_LEFT: 0.018,
-    Joint.THUMB_LEFT: 0.012,
-    Joint.HIP_LEFT: 0.07,
-    Joint.KNEE_LEFT: 0.06,
-    Joint.ANKLE_LEFT: 0.045,
-    Joint.FOOT_LEFT: 0.035,
+    "SPINE_MID": 0.085,
+    "SPINE_SHOULDER": 0.085,
+    "NECK": 0.045,
+    "HEAD": 0.075,
+    "SHOULDER": 0.05,
+    "ELBOW": 0.042,
+    "WRIST": 0.033,
+    "HAND": 0.028,
+    "HAND_TIP": 0.018,
+    "THUMB": 0.012,
+    "HIP": 0.07,
+    "KNEE": 0.06,
+    "ANKLE": 0.045,
+    "FOOT": 0.035,
 }
-"""Metres, by the joint at the far end of the segment, of the left half."""
-
-
-def _bone_radii() -> FloatArray:
-    """(24,) of each bone; the right half is as the left."""
-    by_name = {joint.name: radius for joint, radius in _RADII.items()}
-    return np.array([by_name[child.name.replace("RIGHT", "LEFT")] for _, child in BONES])
-
-
-BONE_RADII: Final[FloatArray] = _bone_radii()
+"""Metres, by the joint at the far end of the segment."""
+BONE_RADII: Final[FloatArray] = np.array(
+    [_RADII[child.name.removesuffix("_LEFT").removesuffix("_RIGHT")] for _, child in BONES]
+)
 """(24,) metres: how thick a person's segments are drawn, in the order of ``BONES``."""
 
 
@@ -202,44 +196,6 @@ def frustum(depth: float, view: tuple[float, float] = KINECT_VIEW) -> FloatArray
     rays = np.stack([np.zeros((4, 3)), corners], axis=1)
     around = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
     return np.concatenate([rays, around])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
-    """A surface of triangles, seen from outside.
-
-    Attributes:
-        vertices: (v, 3).
-        faces: (f, 3) vertices of each triangle, counterclockwise from outside.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
-
-
-def ball(around: int = 16) -> Mesh:
-    """A sphere of radius 1."""
-    heights = np.linspace(-0.5 * np.pi, 0.5 * np.pi, around // 2 + 1)
-    return _turned(np.cos(heights), np.sin(heights), around)
-
-
-def tube(around: int = 16) -> Mesh:
-    """An open cylinder of radius 1 and length 1 along z, about its middle."""
-    return _turned(np.ones(2), np.array([-0.5, 0.5]), around)
-
-
-def _turned(radii: FloatArray, heights: FloatArray, around: int) -> Mesh:
-    """The surface that a line of (n,) points beside the z axis makes when it is turned about that, upwards."""
-    angles = np.arange(around) * (2.0 * np.pi / around)
-    rings = [np.multiply.outer(radii, np.cos(angles)), np.multiply.outer(radii, np.sin(angles))]
-    vertices = np.stack([*rings, np.repeat(heights[:, None], around, axis=1)], axis=-1).reshape(-1, 3)
-    ring, place = np.divmod(np.arange((len(radii) - 1) * around), around)
-    lower, next_lower = ring * around + place, ring * around + (place + 1) % around
-    upper, next_upper = lower + around, next_lower + around
-    faces = np.concatenate(
-        [np.stack([lower, next_lower, next_upper], axis=1), np.stack([lower, next_upper, upper], axis=1)]
-    )
-    return Mesh(vertices, faces.astype(np.intp))
 
 
 _FEET: Final[IntArray] = np.array(

@@ -15,14 +15,17 @@ from body_tracking.evaluation.comparison import (
     ALIGNED,
     AS_IT_IS,
     EvaluationParameters,
+    evaluate,
+)
+from body_tracking.evaluation.metrics import Curve
+from body_tracking.evaluation.reading import (
+    AngleSeries,
+    EvaluationError,
     Recorded,
     SensorClaims,
-    evaluate,
     read_truth,
     truth_of_markers,
 )
-from body_tracking.evaluation.metrics import Curve
-from body_tracking.evaluation.summary import AngleSeries, EvaluationError
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of
 from body_tracking.kinematics.estimate import ModelEstimate

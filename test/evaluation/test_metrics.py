@@ -30,8 +30,8 @@ from body_tracking.evaluation.metrics import (
     position_coverage,
     wrapped,
 )
+from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.evaluation.summary import read_skeletons
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
 
@@ -82,9 +82,9 @@ def test_a_curve_invents_nothing_in_gaps() -> None:
     assert_allclose(curve.at(np.array([1.5]))[0], [np.sin(1.5), np.cos(1.5)], atol=1e-4)
 
 
-@pytest.mark.parametrize("times", [[0.0, 1.0], [0.0, 1.0, 1.0], [2.0, 1.0, 0.0]])
+@pytest.mark.parametrize("times", [[0.0, 1.0, 1.0], [2.0, 1.0, 0.0]])
 def test_times_that_make_no_curve_are_refused(times: list[float]) -> None:
-    with pytest.raises(MetricsError, match="curve: 3 values"):
+    with pytest.raises(MetricsError, match="do not increase"):
         Curve(np.array(times), np.zeros((3, 2)))
 
 
@@ -194,17 +194,6 @@ def test_ellipsoids_and_bands_that_are_right_cover_95_percent() -> None:
     stddev = rng.uniform(0.01, 0.1, (20_000, 3))
     angles = wrapped(3.0 + stddev * rng.standard_normal((20_000, 3)))
     assert_allclose(angle_errors(angles, np.full((20_000, 3), 3.0), stddev).covered, 0.95, atol=0.006)
-
-
-def test_what_states_no_covariance_is_not_counted() -> None:
-    error = np.zeros((4, 2, 3))
-    covariances = np.broadcast_to(np.eye(3), (4, 2, 3, 3)).copy()
-    covariances[:, 0] = np.inf
-    covariances[:2, 1] = 0.0
-    covariances[2, 1] = np.nan
-    error[3, 1] = 10.0
-    covered = position_coverage(error, covariances)
-    assert np.isnan(covered[0]) and covered[1] == 0.0
 
 
 def test_jitter_is_the_white_noise_that_was_added_and_nothing_else() -> None:

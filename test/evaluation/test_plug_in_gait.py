@@ -15,20 +15,18 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
+from body_tracking.evaluation.c3d import MarkerError
 from body_tracking.evaluation.plug_in_gait import (
-    LONGEST_GAP,
     MARKERS,
-    MarkerError,
     MarkerTruth,
     Measurements,
     arm_angles,
     chord,
-    fill_gaps,
     joint_centres,
     read_measurements,
     read_plug_in_gait,
-    smooth,
 )
+from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, smooth
 from body_tracking.skeleton import FloatArray, Joint
 
 RATE = 100.0
@@ -349,10 +347,6 @@ def test_gaps_of_a_fifth_of_a_second_stay_open() -> None:
             assert np.array_equal(filled[known], gapped[known])
 
 
-def test_what_is_never_seen_is_not_made_up() -> None:
-    assert np.isnan(fill_gaps(np.full((30, 3), np.nan), RATE)).all()
-
-
 @pytest.mark.parametrize("frames", [60, 400])
 def test_smoothing_is_the_spline_of_generalised_cross_validation(frames: int) -> None:
     times = np.arange(frames) / RATE
@@ -371,19 +365,6 @@ def test_smoothing_keeps_a_smooth_curve_and_its_gaps() -> None:
     smoothed = smooth(curve)
     assert np.array_equal(np.isnan(smoothed), np.isnan(curve))
     assert np.nanmax(np.abs(smoothed - curve)) < 0.01
-
-
-@pytest.mark.parametrize("size", [0.5, 1.0, 5.0])
-def test_smoothing_takes_most_of_the_noise_whatever_its_size(size: float) -> None:
-    times = np.arange(600)[:, None] / RATE
-    curve = 300.0 * np.sin(times * [3.0, 5.0, 7.0])
-    noise = size * np.random.default_rng(11).standard_normal(curve.shape)
-    assert (smooth(curve + noise) - curve).std() < 0.5 * size
-
-
-def test_too_few_samples_are_not_smoothed() -> None:
-    values = np.random.default_rng(2).standard_normal((4, 3))
-    assert np.array_equal(smooth(values), values)
 
 
 PARAMETERS = {
@@ -604,20 +585,3 @@ def test_the_stamps_are_those_of_the_trial_that_the_file_is_cut_from(shared_data
     truth = of_vicon(shared_data, FILES[2], smoothing=False)
     assert truth.rate == 120.0
     assert truth.stamps[[0, -1]] == pytest.approx([694 / 120.0, 1016 / 120.0])
-
-
-def test_a_real_body_has_real_proportions(shared_data: Path) -> None:
-    for name in FILES:
-        p = of_vicon(shared_data, name, smoothing=True).positions
-        for shoulder, elbow, wrist, hand in ARMS:
-            for a, b, least, most in (
-                (shoulder, elbow, 0.24, 0.34),
-                (elbow, wrist, 0.19, 0.28),
-                (wrist, hand, 0.06, 0.12),
-            ):
-                length = np.linalg.norm(p[:, a] - p[:, b], axis=1)
-                assert least < length.mean() < most
-                assert length.std() < 0.012
-        assert (p[:, Joint.SPINE_BASE, 2] < p[:, Joint.SPINE_MID, 2]).all()
-        assert (p[:, Joint.SPINE_MID, 2] < p[:, Joint.SPINE_SHOULDER, 2]).all()
-        assert (p[:, Joint.SPINE_SHOULDER, 2] < p[:, Joint.HEAD, 2]).all()

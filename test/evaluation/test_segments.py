@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking import graph
+from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.evaluation.summary import read_skeletons
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from body_tracking.evaluation.summary import Tracked, nearest, read
+from body_tracking.evaluation.reading import Tracked, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import SHIPPED

@@ -18,16 +18,9 @@ from body_tracking.sensors.imu_orientation import (
     InertialErrors,
     OrientationEstimator,
 )
-from body_tracking.simulation.imus import (
-    CONSUMER,
-    IDEAL,
-    ImuErrors,
-    ImuSamples,
-    Iron,
-    Mounting,
-    SimulatedImu,
-    Surroundings,
-)
+from body_tracking.simulation.imu_errors import CONSUMER, IDEAL, ImuErrors
+from body_tracking.simulation.imus import ImuSamples, Mounting, SimulatedImu
+from body_tracking.simulation.surroundings import Iron, Surroundings
 from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 START_NS = 1_700_000_000 * NANOSECONDS

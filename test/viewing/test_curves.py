@@ -39,25 +39,6 @@ def test_of_many_samples_the_extremes_and_the_ends_are_kept(seed: int, k: int, n
         assert len(kept) == n
 
 
-@given(st.integers(100, 2000), st.integers(8, 100))
-@settings(max_examples=40)
-def test_no_gap_between_kept_samples_is_longer_than_two_stretches(n: int, count: int) -> None:
-    series = np.random.default_rng(n).normal(size=(1, n))
-    kept = extremes(series, count)
-    stretch = -(-n // max(1, (count - 2) // 2))
-    assert np.diff(kept).max(initial=0) <= 2 * stretch
-
-
-def test_a_single_peak_among_thousands_is_drawn() -> None:
-    history = AngleHistory(1000.0)
-    for k in range(4000):
-        history.add(k * STEP_NS, NAMES, np.array([1.0 if k == 1777 else 0.0, 0.0]), np.full(2, 0.01))
-    curve = history.curve(NAMES[0], 200)
-    assert curve is not None
-    assert len(curve.times) <= 200
-    assert curve.values.max() == pytest.approx(np.degrees(1.0))
-
-
 # --- the band
 
 

@@ -1,9 +1,9 @@
-"""The joint angles in a recording: read, compared with the truth where it is there, and put into a table."""
+"""What a recording holds of a person: skeletons, joint angles and calibration, estimated and true."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +11,25 @@ import numpy as np
 from body_tracking import graph
 from body_tracking.cdr import decode_skeletons
 from body_tracking.errors import BodyTrackingError
+from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, MessageError, to_nanoseconds
+from body_tracking.messages.base import (
+    JOINT_STATE,
+    POINT_CLOUD,
+    TIME_REFERENCE,
+    TRANSFORM,
+    MessageError,
+    to_nanoseconds,
+)
+from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
+from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
+from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Skeleton
 
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
@@ -80,35 +89,61 @@ class Tracked:
         return float(self.angles.stamps_ns[-1] - self.angles.stamps_ns[0]) / NANOSECONDS
 
 
-@dataclass(frozen=True, slots=True)
-class AngleSummary:
-    """One angle over a recording; degrees, NaN where there is nothing to say.
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorClaims:
+    """What is said of one sensor's pose and clock over time; stamps in nanoseconds of the reference clock.
 
     Attributes:
-        name: of the angle.
-        min: over the frames in which it is known.
-        max: likewise.
-        last: in the last frame in which it is known.
-        stddev: median stated standard deviation over all frames; infinity where it is mostly unknown.
-        known: share of the frames in which it is known.
-        true_min: of the truth in the same frames.
-        true_max: likewise.
-        rms_error: against the truth, over the frames in which it is known.
-        max_error: likewise, the largest.
-        within_2_stddev: share of these frames in which the truth lies within two stated standard deviations.
+        pose_stamps_ns: (n,) from when each pose is used.
+        rotations: (n, 3, 3) sensor to world.
+        translations: (n, 3) metres.
+        clock_stamps_ns: (c,).
+        clock_offsets: (c,) s, sensor clock minus reference clock.
     """
 
-    name: str
-    min: float
-    max: float
-    last: float
-    stddev: float
-    known: float
-    true_min: float
-    true_max: float
-    rms_error: float
-    max_error: float
-    within_2_stddev: float
+    pose_stamps_ns: IntArray
+    rotations: FloatArray
+    translations: FloatArray
+    clock_stamps_ns: IntArray
+    clock_offsets: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Skeletons of one person over time with what belongs to them: an estimate, or the truth.
+
+    Attributes:
+        source: the bag or file.
+        topic: of the skeletons; empty where the file has none.
+        frame_id: of the positions.
+        stamps_ns: (n,) capture times, increasing, nanoseconds.
+        positions: (n, 25, 3) metres, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
+        angles: by name; None where there are none.
+        sensors: calibration by sensor.
+        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
+        warnings: what the file itself lacks, a line each.
+    """
+
+    source: Path
+    topic: str
+    frame_id: str
+    stamps_ns: IntArray
+    positions: FloatArray
+    covariances: FloatArray | None = None
+    angles: AngleSeries | None = None
+    sensors: Mapping[str, SensorClaims] = field(default_factory=dict)
+    coordinates: AngleSeries | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> BoolArray:
+        """(25,) joints that are ever known."""
+        return np.asarray(np.isfinite(self.positions).all(axis=-1).any(axis=0))
+
+    def seconds(self, zero_ns: int) -> FloatArray:
+        """(n,) s since ``zero_ns``."""
+        return (self.stamps_ns - zero_ns) / NANOSECONDS
 
 
 def read(path: Path, body: str | None = None, truth: Path | None = None) -> Tracked:
@@ -242,26 +277,23 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
     return AngleSeries(values.stamps_ns, values.names, values.position, stddev)
 
 
-def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
-    """The first body of each of a topic's messages in time order; none where the topic is missing or holds others."""
-    skeletons = {everybody[0].stamp_ns: everybody[0] for everybody in _read_frames(bag, topic)}
-    return tuple(skeletons[stamp] for stamp in sorted(skeletons))
-
-
-def most_people(bag: BagReader, topic: str) -> int:
-    """The largest number of bodies in one of a topic's messages."""
-    return max((len(everybody) for everybody in _read_frames(bag, topic)), default=0)
-
-
-def _read_frames(bag: BagReader, topic: str) -> Iterator[tuple[Skeleton, ...]]:
-    """The bodies of each message, at least one; none where the topic is missing or holds others."""
+def read_frames(bag: BagReader, topic: str) -> dict[int, tuple[Skeleton, ...]]:
+    """The bodies of each of a topic's messages, at least one, by stamp and in time order; damaged ones are left out."""
     if topic not in bag.topics or bag.topics[topic].type_name != POINT_CLOUD:
-        return
+        return {}
+    frames = {}
     for raw in bag.messages([topic]):
         try:
-            yield decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
+            everybody = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except MessageError:
-            continue  # a damaged frame is not shown
+            continue
+        frames[everybody[0].stamp_ns] = everybody
+    return dict(sorted(frames.items()))
+
+
+def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
+    """The first body of each of a topic's messages in time order; none where the topic is missing or holds others."""
+    return tuple(everybody[0] for everybody in read_frames(bag, topic).values())
 
 
 def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS) -> IntArray:
@@ -286,62 +318,140 @@ def true_at(angles: AngleSeries, truth: AngleSeries | None) -> FloatArray:
     return true
 
 
-def summaries(angles: AngleSeries, truth: AngleSeries | None = None) -> tuple[AngleSummary, ...]:
-    """A summary per angle.
+# --- estimate and truth
+
+
+def read_estimate(path: Path, topic: str | None = None, body: str | None = None) -> Recorded:
+    """The skeletons, angles and calibration that a bag holds.
 
     Args:
-        angles: what was measured.
-        truth: what was true, at any stamps within 20 ms of the measured ones.
+        path: a bag folder or an mcap file.
+        topic: of the skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
+        body: whose angles; the first in the bag where None.
+
+    Raises:
+        BagError: no such bag, or nothing of it can be read.
+        EvaluationError: it holds no such topic, of no such type, nothing in it, or no angles of this person.
     """
-    true = true_at(angles, truth)
-    errors = (angles.known - true + np.pi) % (2.0 * np.pi) - np.pi
-    result = []
-    for column, name in enumerate(angles.names):
-        values, stddev = np.degrees(angles.known[:, column]), np.degrees(angles.stddev[:, column])
-        known, error = np.isfinite(values), np.degrees(errors[:, column])
-        values, compared = values[known], np.isfinite(error)
-        right = np.degrees(true[compared, column])
-        nothing = float("nan")
-        result.append(
-            AngleSummary(
-                name=name,
-                min=float(values.min()) if len(values) else nothing,
-                max=float(values.max()) if len(values) else nothing,
-                last=float(values[-1]) if len(values) else nothing,
-                stddev=float(np.median(stddev)),
-                known=float(known.mean()),
-                true_min=float(right.min()) if len(right) else nothing,
-                true_max=float(right.max()) if len(right) else nothing,
-                rms_error=float(np.sqrt(np.mean(error[compared] ** 2))) if compared.any() else nothing,
-                max_error=float(np.abs(error[compared]).max()) if compared.any() else nothing,
-                within_2_stddev=(
-                    float((np.abs(error) <= 2.0 * stddev)[compared].mean()) if compared.any() else nothing
-                ),
-            )
+    with RigReader(path) as bag:
+        if topic is None:
+            full = [each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics and bag.topics[each].count]
+            topic = full[0] if full else graph.FILTERED
+        made = _recorded(bag, topic, "; make some with replay, or choose one with --topic")
+        angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
+        return replace(made, angles=angles, sensors=_sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK))
+
+
+def read_truth(path: Path, body: str | None = None) -> Recorded:
+    """The true skeletons, angles and calibration that a bag holds.
+
+    Args:
+        path: a bag folder or an mcap file.
+        body: the id that ends the names of its angles; any where None.
+
+    Raises:
+        BagError: no such bag, or nothing of it can be read.
+        EvaluationError: it holds no true skeletons.
+    """
+    with RigReader(path) as bag:
+        advice = "; the truth is a bag from a simulation or what replay made of it"
+        ids = (body,) if body is not None else bodies(bag)
+        return replace(
+            _recorded(bag, graph.TRUE_SKELETON, advice),
+            angles=read_joint_states(bag, graph.TRUE_ANGLES, ids[0] if ids else graph.DEFAULT_BODY),
+            sensors=_sensors(bag, graph.TRUE_CALIBRATION, graph.TRUE_CLOCK),
+            coordinates=read_joint_states(bag, graph.TRUE_MODEL_STATE, ""),
         )
-    return tuple(result)
 
 
-def table(rows: tuple[AngleSummary, ...]) -> str:
-    """The summaries for a terminal, in degrees; the columns of the truth only where there is one."""
-    with_truth = any(np.isfinite(row.rms_error) for row in rows)
-    width = max(len(row.name) for row in rows)
-    header = f"{'angle (deg)':<{width}} {'min':>8} {'max':>8} {'final':>8} {'stddev':>8} {'known':>7}"
-    if with_truth:
-        header += f" {'true min':>9} {'true max':>8} {'rms err':>8} {'max err':>8} {'in 2 sd':>8}"
-    lines = [header, "-" * len(header)]
-    for row in rows:
-        line = f"{row.name:<{width}}" + "".join(
-            f" {_number(value):>8}" for value in (row.min, row.max, row.last, row.stddev)
+def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
+    """Joint centres from markers as the truth; its clock and frame are its own.
+
+    Args:
+        path: a C3D file with the markers of Plug-in Gait.
+        subject: whose; needed where the file holds several.
+        measurements: of the subject, a file of Vicon's; those in the C3D file where None.
+
+    Raises:
+        MarkerError: the files cannot be read, or too few markers are there.
+    """
+    measured = None if measurements is None else read_measurements(measurements)
+    markers = read_plug_in_gait(path, subject=subject, measurements=measured)
+    said = [f"{path}: not seen: {gap}" for gap in markers.gaps]
+    for names, what in ((markers.missing, "has no marker"), (markers.estimated, "estimates the subject's")):
+        if names:
+            said.append(f"{path}: {what} {', '.join(names)}")
+    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(said))
+
+
+def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
+    """Joint centres from markers as the truth; its clock and frame are its own.
+
+    Args:
+        source: the file.
+        stamps: (n,) s, increasing.
+        positions: (n, 25, 3) metres, NaN where unknown.
+    """
+    stamps_ns = np.rint(stamps * NANOSECONDS).astype(np.int64)
+    return Recorded(source, "", "markers", stamps_ns, positions)
+
+
+def _recorded(bag: BagReader, topic: str, advice: str) -> Recorded:
+    """The first body of a topic's skeletons."""
+    info = bag.topics.get(topic)
+    there = ", ".join(sorted(name for name, each in bag.topics.items() if each.type_name == POINT_CLOUD))
+    if info is None:
+        raise EvaluationError(f"{bag.path}: no topic {topic} (skeletons there: {there or 'none'}){advice}")
+    if info.type_name != POINT_CLOUD:
+        raise EvaluationError(f"{bag.path}: {topic} holds {info.type_name}, expected {POINT_CLOUD}")
+    if not info.count:
+        raise EvaluationError(f"{bag.path}: {topic} is empty")
+    frames = read_frames(bag, topic)
+    if len(frames) < 2:
+        raise EvaluationError(
+            f"{bag.path}: {len(frames)} skeleton(s) with a stamp of their own in the {info.count} messages of "
+            f"{topic}, at least 2 are needed"
         )
-        line += f" {row.known:>7.0%}"
-        if with_truth:
-            share = "-" if np.isnan(row.within_2_stddev) else f"{row.within_2_stddev:.0%}"
-            line += f" {_number(row.true_min):>9} {_number(row.true_max):>8}"
-            line += f" {_number(row.rms_error):>8} {_number(row.max_error):>8} {share:>8}"
-        lines.append(line)
-    return "\n".join(lines)
+    skeletons = [everybody[0] for everybody in frames.values()]
+    people = max(map(len, frames.values()))
+    crowd = (f"{bag.path}: {topic} holds {people} people, only the first is compared",) if people > 1 else ()
+    # infinite ones state as little as none, and would spread when they are turned
+    stated = [
+        np.where(np.isfinite(each.covariances), each.covariances, np.nan)
+        for each in skeletons
+        if each.covariances is not None
+    ]
+    return Recorded(
+        bag.path,
+        topic,
+        skeletons[0].frame_id,
+        np.array(list(frames), dtype=np.int64),
+        np.stack([np.where(each.valid[:, None], each.positions, np.nan) for each in skeletons]),
+        np.stack(stated) if len(stated) == len(skeletons) else None,
+        warnings=(*bag.warnings, *crowd),
+    )
 
 
-def _number(value: float) -> str:
-    return "-" if np.isnan(value) else "inf" if np.isinf(value) else f"{value:.1f}"
+def _sensors(bag: BagReader, pose_topic: str, clock_topic: str) -> dict[str, SensorClaims]:
+    poses = [transform_to_pose(deserialize(TRANSFORM, raw.cdr)) for raw in _messages(bag, pose_topic, TRANSFORM)]
+    clocks = [
+        time_reference_to_clock(deserialize(TIME_REFERENCE, raw.cdr))
+        for raw in _messages(bag, clock_topic, TIME_REFERENCE)
+    ]
+    claims = {}
+    for sensor in dict.fromkeys(pose.sensor for pose in poses):
+        own = [pose for pose in poses if pose.sensor == sensor]
+        times = sorted((at_ns, clock.offset) for name, at_ns, clock in clocks if name == sensor)
+        claims[sensor] = SensorClaims(
+            np.array([pose.valid_from_ns for pose in own], dtype=np.int64),
+            np.stack([pose.rotation for pose in own]),
+            np.stack([pose.translation for pose in own]),
+            np.array([at_ns for at_ns, _ in times], dtype=np.int64),
+            np.array([offset for _, offset in times]),
+        )
+    return claims
+
+
+def _messages(bag: BagReader, topic: str, kind: str) -> Iterator[RawMessage]:
+    there = topic in bag.topics and bag.topics[topic].type_name == kind
+    return bag.messages([topic]) if there else iter(())

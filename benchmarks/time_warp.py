@@ -1,0 +1,172 @@
+"""Compare two recordings of one movement that share no clock.
+
+Sensors that were not synchronised, and recordings that were cut separately, differ in where they start and, a little,
+in how fast their clocks ran. Classical dynamic time warping (Sakoe and Chiba 1978) is the wrong cure where errors are
+to be measured afterwards: it moves every single sample to where the values agree best, and so takes noise, lag and
+differences of amplitude for differences of time (its "singularities": Keogh and Pazzani 2001). The warp here is smooth
+and has few degrees of freedom, as in curve registration (Ramsay and Li 1998), and its criterion is the share of
+variance left over after each feature was given an offset and a gain of its own. Hence it is blind to bias and scale,
+which are what the comparison is to measure, and it has too few parameters to follow noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import minimize
+
+from body_tracking.evaluation.metrics import sample
+from body_tracking.skeleton import FloatArray
+
+INTERVALS = 4
+"""Of linearly changing rate; one more than this are the degrees of freedom besides the offset."""
+RATES = (0.6, 1.7)
+"""Least and most overall rate (reference seconds per second) that the search tries."""
+LEAST_OVERLAP = 0.6
+"""Share of the samples that must fall into the reference."""
+BEND, DRIFT = 0.02, 0.02
+"""Cost of a change of the log rate by 1 over one interval, and of a mean log rate of 1 (clocks
+are nominally right), in shares of the variance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeWarp:
+    """A smooth, strictly increasing map from the times of one recording to those of another.
+
+    Attributes:
+        knots: (k,) s, in the recording's own time.
+        values: (k,) s, the reference's time at the knots; beyond its end in a later period where ``period`` is given.
+        rates: (k,) > 0, derivative at the knots, linear in between.
+        span: (first, last) time of the reference, s.
+        period: s by which the reference repeats itself, or None.
+        explained: share of the features' variance that the aligned reference explains, 0 to 1.
+    """
+
+    knots: FloatArray
+    values: FloatArray
+    rates: FloatArray
+    span: tuple[float, float]
+    period: float | None
+    explained: float = float("nan")
+
+    def __call__(self, times: FloatArray) -> FloatArray:
+        """(n,) times of the recording, s, to (n,) times of the reference; NaN where it has none."""
+        # a cubic with the values and slopes of a parabola is that parabola
+        at: FloatArray = CubicHermiteSpline(self.knots, self.values, self.rates)(times)
+        first, last = self.span
+        if self.period is not None:
+            # where the cycle is a little longer than what was recorded of it, its end stands for the rest
+            return np.minimum(first + np.mod(at - first, self.period), last)
+        return np.where((at >= first) & (at <= last), at, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How one series agrees with another.
+
+    Attributes:
+        samples: how many were compared.
+        correlation: Pearson's, NaN where one of the series is constant.
+        bias: mean of estimate minus reference, in the series' unit.
+        rms: root mean square of the difference.
+        debiased_rms: the same after the bias was taken off.
+        gain: slope of the estimate over the reference (least squares), NaN where the reference is constant.
+    """
+
+    samples: int
+    correlation: float
+    bias: float
+    rms: float
+    debiased_rms: float
+    gain: float
+
+
+def compare(estimate: FloatArray, reference: FloatArray) -> Agreement:
+    """Statistics of ``estimate - reference``, (n,) each, over the samples where both are finite; at least two."""
+    known = np.isfinite(estimate) & np.isfinite(reference)
+    a, b = estimate[known], reference[known]
+    difference = a - b
+    covariance = np.cov(a, b, bias=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
+        gain = covariance[0, 1] / covariance[1, 1]
+    return Agreement(
+        samples=int(known.sum()),
+        correlation=float(correlation),
+        bias=float(difference.mean()),
+        rms=float(np.sqrt((difference**2).mean())),
+        debiased_rms=float(difference.std()),
+        gain=float(gain),
+    )
+
+
+def estimate_warp(
+    times: FloatArray,
+    features: FloatArray,
+    reference_times: FloatArray,
+    reference_features: FloatArray,
+    *,
+    period: float | None = None,
+) -> TimeWarp:
+    """The warp under which the reference explains most of the features' variance.
+
+    Minimises ``1 - R^2 + BEND * sum (change of log rate)^2 + DRIFT * (mean log rate)^2``, with ``R^2`` pooled over the
+    features after a regression of each on its aligned reference (offset free, gain not negative), first over a grid of
+    straight lines, then from the best of these over all parameters (Nelder and Mead 1965).
+
+    Args:
+        times: (n,) increasing, s.
+        features: (n, f), in units that make the f comparable, such as the components of unit vectors.
+        reference_times: (m,) increasing, s.
+        reference_features: (m, f).
+        period: where the reference is one cycle of a movement that repeats, its length in s: it is continued
+            periodically, and all samples overlap.
+
+    Raises:
+        ValueError: no overlap that is long enough.
+    """
+    span = (float(reference_times[0]), float(reference_times[-1]))
+    knots = np.linspace(times[0], times[-1], INTERVALS + 1)
+    width = knots[1] - knots[0]
+
+    def warp(x: FloatArray) -> TimeWarp:
+        rates = np.exp(x[1:])
+        steps = 0.5 * width * (rates[1:] + rates[:-1])
+        return TimeWarp(knots, x[0] + np.concatenate([[0.0], np.cumsum(steps)]), rates, span, period)
+
+    def unexplained(x: FloatArray) -> float:
+        at = warp(x)(times)
+        inside = np.isfinite(at)
+        if inside.sum() < max(3.0, LEAST_OVERLAP * len(times)):
+            return np.inf
+        return _unexplained(features[inside], sample(at[inside], reference_times, reference_features))
+
+    def cost(x: FloatArray) -> float:
+        return unexplained(x) + BEND * float((np.diff(x[1:]) ** 2).sum()) + DRIFT * float(x[1:].mean() ** 2)
+
+    length, reference_length = float(times[-1] - times[0]), span[1] - span[0]
+    step = max(0.02 * max(length, reference_length), 1e-3)
+    first, last = (0.0, period) if period is not None else (None, reference_length)
+    starts = [
+        np.concatenate([[offset], np.full(INTERVALS + 1, np.log(rate))])
+        for rate in np.geomspace(*RATES, 27)
+        for offset in np.arange(span[0] + (-rate * length if first is None else first), span[0] + last, step)
+    ]
+    start = min(starts, key=cost)
+    if not np.isfinite(cost(start)):
+        raise ValueError(f"warp: no shift lets {LEAST_OVERLAP:.0%} of the samples overlap")
+    simplex = np.vstack([start, start + np.diag([5.0 * step, *[0.15] * (INTERVALS + 1)])])
+    options = {"initial_simplex": simplex, "maxfev": 4000, "xatol": 1e-4, "fatol": 1e-7}
+    best = minimize(cost, start, method="Nelder-Mead", options=options).x
+    found = warp(best)
+    return TimeWarp(found.knots, found.values, found.rates, span, period, 1.0 - unexplained(best))
+
+
+def _unexplained(features: FloatArray, reference: FloatArray) -> float:
+    """1 - R^2, pooled over the features, of regressions with free offsets and gains that are not negative."""
+    y, x = features - features.mean(axis=0), reference - reference.mean(axis=0)
+    total, xx, xy = float((y**2).sum()), (x**2).sum(axis=0), np.maximum((x * y).sum(axis=0), 0.0)
+    explained = np.divide(xy**2, xx, out=np.zeros_like(xx), where=xx > 0.0)
+    return 1.0 - float(explained.sum()) / total

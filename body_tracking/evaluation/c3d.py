@@ -1,0 +1,155 @@
+"""One subject's points in a C3D file, read with ezc3d, in metres and z up."""
+
+from __future__ import annotations
+
+import importlib
+from collections import Counter
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from body_tracking.errors import BodyTrackingError
+from body_tracking.files import open_regular
+from body_tracking.skeleton import FloatArray
+
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
+"""Axis of the file that points up to the cyclic exchange that makes it z."""
+
+_BLOCK = 512
+_BIG_ENDIAN = 86
+"""C3D's number for processors of this kind."""
+
+
+class MarkerError(BodyTrackingError):
+    """A file does not hold the marker trajectories that are needed; the text says what it holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One subject of a file: (n, 3) of each point in the file's units and axes, NaN where it is not seen."""
+
+    points: dict[str, FloatArray]
+    rate: float
+    stamps: FloatArray
+    angle_unit: float
+    processing: dict[str, float]
+
+    @property
+    def frames(self) -> int:
+        return len(self.stamps)
+
+
+def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Trial:
+    """One subject of a C3D file.
+
+    Args:
+        path: of the file.
+        subject: the prefix of the points' names; needed where several have points that are wanted.
+        wanted: names of points, without prefix.
+
+    Raises:
+        MarkerError: the file cannot be read, or the subject is not there.
+    """
+    frames = _announced_frames(path)
+    try:
+        ezc3d: Any = importlib.import_module("ezc3d")
+    except ImportError as error:
+        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
+    try:
+        file = ezc3d.c3d(str(path))
+        parameters = file["parameters"]
+        header = file["header"]["points"]
+        data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(1, 2, 0)
+        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0]
+    # what it raises for a damaged file depends on where the damage is
+    except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
+        raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
+
+    def values(group: str, name: str) -> list[Any]:
+        return list(parameters[group][name]["value"]) if group in parameters and name in parameters[group] else []
+
+    def value(group: str, name: str, default: Any) -> Any:
+        return next(iter(values(group, name)), default)
+
+    labels = values("POINT", "LABELS")
+    for number in range(2, 100):  # a parameter holds at most 255 names
+        labels += values("POINT", f"LABELS{number}")
+    labels = [label.strip() for label in labels[: len(data)]]
+    if not labels or not data.shape[1]:
+        raise MarkerError(f"{path}: {len(labels)} points in {data.shape[1]} frames: there are no trajectories in it")
+    if data.shape[1] < frames:
+        raise MarkerError(f"{path}: cut off after {data.shape[1]} of {frames} frames")
+    rate = float(value("POINT", "RATE", header["frame_rate"]))
+    unit, up = value("POINT", "UNITS", "mm").strip(), value("POINT", "Y_SCREEN", "+Z").strip().upper()
+    if not rate > 0.0:
+        raise MarkerError(f"{path}: {rate} frames per second")
+    if unit not in _UNITS:
+        raise MarkerError(f"{path}: unit of length {unit!r}, expected one of {', '.join(_UNITS)}")
+    if up not in _UP_FIRST:
+        raise MarkerError(f"{path}: the axis that points up (POINT:Y_SCREEN) is {up!r}, expected +X, +Y or +Z")
+    seen = np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1) & (residuals >= 0.0)
+    data = np.where(seen[..., None], data, np.nan)
+    chosen = _of_subject(path, labels, subject, wanted)
+    angles = set(values("POINT", "ANGLES")) | {label for label in labels if label.endswith("Angles")}
+    points = {
+        name: data[index] if labels[index] in angles else _UNITS[unit] * data[index][:, _UP_FIRST[up]]
+        for name, index in chosen.items()
+    }
+    numbers = {name: value("PROCESSING", name, None) for name in parameters.get("PROCESSING", {}) if name[0] != "_"}
+    return Trial(
+        points,
+        rate,
+        (int(header["first_frame"]) + np.arange(data.shape[1])) / rate,
+        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
+        {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
+    )
+
+
+def _announced_frames(path: Path) -> int:
+    """Frames by the file's header; also finds what ezc3d does not survive: folders, cut off parameters."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise MarkerError(f"{path}: not a file")
+        with open_regular(path) as stream:
+            head = stream.read(256 * _BLOCK)
+    except OSError as error:
+        raise MarkerError(f"{path}: {error.strerror or error}") from error
+    if not size:
+        raise MarkerError(f"{path}: the file is empty")
+    if size < _BLOCK or head[1] != 0x50 or head[0] < 2:
+        raise MarkerError(f"{path}: not a C3D file ({size} bytes that do not begin as one)")
+    start = (head[0] - 1) * _BLOCK
+    if size < start + 4 or size < start + head[start + 2] * _BLOCK:
+        raise MarkerError(f"{path}: cut off after {size} bytes, before the end of its parameters")
+    order = ">u2" if head[start + 3] == _BIG_ENDIAN else "<u2"
+    first, last = np.frombuffer(head[6:10], dtype=order)
+    return int(last) - int(first) + 1
+
+
+def _of_subject(path: Path, labels: list[str], subject: str | None, wanted: Collection[str]) -> dict[str, int]:
+    """Names without prefix, and the places of their points."""
+    split = [tuple(label.rpartition(":")[::2]) for label in labels]
+    named = {prefix for prefix, name in split if name in wanted}
+    if subject is not None and subject not in named:
+        raise MarkerError(f"{path}: no subject {subject!r}; found {listed(sorted(named))}")
+    if subject is None and len(named) > 1:
+        raise MarkerError(f"{path}: {len(named)} subjects, choose one of {listed(sorted(named))}")
+    if not named:
+        return {name: index for index, (_, name) in enumerate(split)}
+    chosen = subject if subject is not None else next(iter(named))
+    places = {name: index for index, (prefix, name) in enumerate(split) if prefix == chosen}
+    counts = Counter(name for prefix, name in split if prefix == chosen)
+    twice = [name for name in wanted if counts[name] > 1]
+    if twice:
+        raise MarkerError(f"{path}: more than one point is called {listed(sorted(twice))}")
+    return places
+
+
+def listed(names: Iterable[str], most: int = 100) -> str:
+    listed = [name or "(no prefix)" for name in names]
+    return (", ".join(listed[:most]) + (", ..." if len(listed) > most else "")) or "none"

@@ -1,0 +1,123 @@
+"""Skeletons and many equal meshes in a viser scene, which are drawn anew in place."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import trimesh
+import viser
+
+from body_tracking.skeleton import FloatArray
+from body_tracking.viewing.colours import Colour, ColourArray, linear
+from body_tracking.viewing.shapes import figure
+from body_tracking.viewing.snapshot import Seen
+
+BALL: Final = trimesh.creation.icosphere(subdivisions=2)
+TUBE: Final = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
+STALE: Final[Colour] = (190, 190, 190)
+
+
+class Drawn:
+    """Skeletons of one source: joints as balls, bones as lines."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
+        self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
+        self._radius = radius
+        self._joints = Shapes(scene, f"{name}/joints", BALL, colour)
+        self._lines: Any = None
+
+    def hide(self) -> None:
+        """Show nothing."""
+        self.draw(Seen(), False)
+
+    def draw(self, seen: Seen, visible: bool) -> None:
+        """Show what is seen."""
+        drawn = figure(seen.skeletons if visible else (), self._colour)
+        colours: Any = STALE if seen.stale else drawn.joint_colours
+        count = len(drawn.joints)
+        self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius), colour=colours)
+        colour = STALE if seen.stale else self._colour
+        if self._lines is None or len(drawn.bones) > len(self._lines.points):
+            room = max(24, len(drawn.bones))
+            self._lines = self._scene.add_line_segments(
+                f"{self._name}/bones", np.zeros((room, 2, 3)), colour, thickness=self._thickness
+            )
+        # what is not there has no length
+        points = np.zeros_like(self._lines.points)
+        points[: len(drawn.bones)] = drawn.bones
+        if len(drawn.bones):
+            points[len(drawn.bones) :] = drawn.bones[0, 0]
+            self._lines.points = points
+            self._lines.colors = np.array(colour, np.uint8)
+        show(self._lines, bool(len(drawn.bones)))
+
+
+class Shapes:
+    """Any number of one mesh, turned, stretched and placed."""
+
+    def __init__(
+        self, scene: viser.SceneApi, name: str, mesh: trimesh.Trimesh, colour: Colour, opacity: float | None = None
+    ) -> None:
+        self._scene, self._name, self._mesh, self._colour, self._opacity = scene, name, mesh, colour, opacity
+        self._room = 0
+        self._handle: Any = None
+
+    def draw(
+        self,
+        positions: FloatArray,
+        quats_xyzw: FloatArray | None,
+        scales: FloatArray,
+        colour: Colour | ColourArray | None = None,
+    ) -> None:
+        """Show these.
+
+        Args:
+            positions: (n, 3) metres.
+            quats_xyzw: (n, 4) unit quaternions; None for all upright.
+            scales: (n, 3) along the mesh's own axes.
+            colour: of all, or (n, 3) of each.
+        """
+        count = len(positions)
+        if count == 0:
+            if self._handle is not None:
+                show(self._handle, False)
+            return
+        if count > self._room:
+            self._make(max(25, count))
+        room = self._room
+        # those that are not there have no size
+        batch, wxyz, sizes = (np.zeros((room, size), np.float32) for size in (3, 4, 3))
+        wxyz[:, 0] = 1.0
+        batch[:count], sizes[:count] = positions, scales
+        batch[count:] = positions[0]
+        if quats_xyzw is not None:
+            wxyz[:count] = np.roll(quats_xyzw, 1, axis=1)
+        colours = np.zeros((room, 3), np.uint8)
+        colours[:count] = linear(self._colour if colour is None else colour)
+        handle = self._handle
+        handle.batched_positions, handle.batched_scales, handle.batched_colors = batch, sizes, colours
+        if quats_xyzw is not None:
+            handle.batched_wxyzs = wxyz
+        show(handle, True)
+
+    def _make(self, room: int) -> None:
+        self._room = room
+        self._handle = self._scene.add_batched_meshes_simple(
+            self._name,
+            self._mesh.vertices,
+            self._mesh.faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (room, 1)),
+            np.zeros((room, 3)),
+            batched_scales=np.zeros((room, 3)),
+            batched_colors=np.tile(np.array(self._colour, np.uint8), (room, 1)),
+            opacity=self._opacity,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def show(handle: Any, visible: bool) -> None:
+    if handle.visible != visible:
+        handle.visible = visible
