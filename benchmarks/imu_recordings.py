@@ -54,7 +54,7 @@ from body_tracking.inertial.alignment import (
     wrapped,
 )
 from body_tracking.inertial.angles import SegmentAngles
-from body_tracking.inertial.clock import Turning, clock_offset
+from body_tracking.inertial.clock import clock_offset, turning_of_bone, turning_of_sensor
 from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by_motion
 from body_tracking.inertial.heading import HeadingTracker, bone_of
 from body_tracking.kinematics import so3
@@ -101,20 +101,19 @@ def read_two_arm(path: Path) -> tuple[Stream, Stream]:
 def two_arm(path: Path) -> dict[str, Any]:
     """Clock and return to the T-pose."""
     upper, lower = read_two_arm(path)
-    found = clock_offset(Turning.of_sensor(upper.stamps, upper.rates), Turning.of_sensor(lower.stamps, lower.rates))
+    found = clock_offset(turning_of_sensor(upper.stamps, upper.rates), turning_of_sensor(lower.stamps, lower.rates))
     figures: dict[str, Any] = {"clock_found": found is not None}
     if found is None:
         return figures
     figures |= {
         "offset_s": found.offset,
         "offset_error_s": found.offset - TRUE_OFFSET_S,
-        "offset_stddev_s": found.offset_stddev,
-        "drift_ppm": 1e6 * found.drift,
-        "drift_stddev_ppm": 1e6 * found.drift_stddev,
-        "correlation": found.correlation,
-        "next_best": found.rival,
+        "offset_stddev_s": found.stddev,
+        "drift_ppm": found.drift_ppm,
+        "drift_stddev_ppm": found.drift_stddev_ppm,
     }
-    streams = (upper, Stream(lower.segment, found.to_reference(lower.stamps), lower.rotations, lower.rates))
+    stamps = [found.to_reference(round(stamp * NANOSECONDS)) / NANOSECONDS for stamp in lower.stamps.tolist()]
+    streams = (upper, Stream(lower.segment, np.array(stamps), lower.rotations, lower.rates))
     figures["still_periods"] = len(still_periods(streams))
     segments = [stream.segment for stream in streams]
     begin = max(stream.stamps[0] for stream in streams)
@@ -340,17 +339,17 @@ def check(streams: list[Stream], times: FloatArray, positions: FloatArray, align
     bones = [bone_of(name) for name in WORN]
     # a camera does not see a bone turn about itself
     axes = [None if bone is None else a @ bone.axis for bone, a in zip(bones, alignment.rotations, strict=True)]
-    felt = [Turning.of_sensor(stream.stamps, stream.rates, axis) for stream, axis in zip(streams, axes, strict=True)]
+    felt = [turning_of_sensor(stream.stamps, stream.rates, axis) for stream, axis in zip(streams, axes, strict=True)]
     seen = [
-        None if bone is None else Turning.of_bone(times, positions[:, bone.end] - positions[:, bone.start])
+        None if bone is None else turning_of_bone(times, positions[:, bone.end] - positions[:, bone.start])
         for bone in bones
     ]
     offsets = []
     for number in (2, 3, 4, 5):
         bone, stream = seen[number], streams[number]
         assert bone is not None
-        found = clock_offset(bone, Turning.of_sensor(stream.stamps + 7.3, stream.rates, axes[number]))
-        offsets.append(None if found is None else (1e3 * (found.offset - 7.3), 1e3 * found.offset_stddev))
+        found = clock_offset(bone, turning_of_sensor(stream.stamps + 7.3, stream.rates, axes[number]))
+        offsets.append(None if found is None else (1e3 * (found.offset - 7.3), 1e3 * found.stddev))
     wrists = (WORN[3], WORN[5])
     straight = assign(wrists, likelihood_by_motion([felt[3], felt[5]], [seen[3], seen[5]]))
     crossed = assign(wrists, likelihood_by_motion([felt[5], felt[3]], [seen[3], seen[5]]))
@@ -476,8 +475,7 @@ def show_two_arm(figures: dict[str, Any]) -> list[str]:
     print(
         f"  clock offset {figures['offset_s']:.4f} +- {figures['offset_stddev_s']:.4f} s, "
         f"{1e3 * figures['offset_error_s']:+.1f} ms off (bar {1e3 * CLOCK_BAR_S:.0f}); "
-        f"drift {figures['drift_ppm']:+.0f} +- {figures['drift_stddev_ppm']:.0f} ppm; "
-        f"correlation {figures['correlation']:.3f}, next best {figures['next_best']:.3f}"
+        f"drift {figures['drift_ppm']:+.0f} +- {figures['drift_stddev_ppm']:.0f} ppm"
     )
     print(f"  still periods: {figures['still_periods']}, so the T-pose is taken at the first 0.1 s")
     for segment in ("upper_arm_right", "forearm_right"):

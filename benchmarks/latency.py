@@ -33,7 +33,8 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState, PointCloud2
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.graph import GraphOptions
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.angles import angles_to_joint_states

@@ -12,8 +12,9 @@ from pathlib import Path
 import yaml
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality
 from body_tracking.calibration.storage import save
+from body_tracking.clocks import ClockModel
 from body_tracking.graph import GraphOptions, nodes_for
 from body_tracking.parameters import SECTION, to_ros
 

@@ -43,8 +43,9 @@ import numpy as np
 import yaml
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
+from body_tracking.calibration.result import CalibrationResult, SensorQuality
 from body_tracking.calibration.storage import save
+from body_tracking.clocks import ClockModel
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds

@@ -12,7 +12,8 @@ from itertools import groupby
 from typing import Any
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.fusion.fusion import WORLD, FusionError
-from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.sides import Sides
 from body_tracking.measurement import joint_stddev, viewing_angle
 from body_tracking.sides import agree, heading_weights, headings_of, put_right
@@ -146,7 +147,7 @@ class SensorAlignment:
 
     def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
         """Start anew when a sensor's clock jumped back: the reference's takes the others with it."""
-        if source.last_ns is not None and stamp_ns < source.last_ns - CLOCK_JUMP * NANOSECONDS:
+        if jumped_back(stamp_ns, source.last_ns):
             if sensor == self.reference:
                 self.reset()
             else:
@@ -163,17 +164,16 @@ class SensorAlignment:
         A sensor that was started again may count from another beginning, and its frames would throw a filter from one
         time to another until the calibration has found its clock again.
         """
-        jump = CLOCK_JUMP * NANOSECONDS
         if sensor == self.reference:
             for other in self._sensors.values():
-                if other.newest is not None and other.newest.stamp_ns > stamp + jump:
+                if other.newest is not None and other.newest.stamp_ns > stamp + JUMP_BACK_NS:
                     other.ahead, other.newest = True, None
             return True
         reference = self._sensors[self.reference].newest
         if reference is None:
             return True
-        source.ahead &= stamp > reference.stamp_ns + jump
-        return not source.ahead and stamp >= reference.stamp_ns - jump
+        source.ahead &= stamp > reference.stamp_ns + JUMP_BACK_NS
+        return not source.ahead and not jumped_back(stamp, reference.stamp_ns)
 
     def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
         """The frame with left and right as they are believed from what all sensors see at that time."""

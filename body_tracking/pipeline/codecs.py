@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
 from body_tracking.cdr import (
     decode_covariance,
     decode_model_state,
@@ -23,6 +23,7 @@ from body_tracking.cdr import (
     encode_skeletons,
     encode_string,
 )
+from body_tracking.clocks import ClockModel
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import BodyModel

@@ -27,7 +27,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
-from body_tracking.calibration.result import ClockModel
+from body_tracking.clocks import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import SEGMENTS

@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.special import ndtri
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.motion import EXTREMITY, JOINT_CLASSES, LIMB
 from body_tracking.measurement import body_heading

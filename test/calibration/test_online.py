@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.offline import WHOLE, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
+from body_tracking.calibration.result import CalibrationResult, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.clocks import ClockModel
 from body_tracking.sensors.csv_recording import CsvRecording
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
