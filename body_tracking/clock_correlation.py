@@ -131,7 +131,7 @@ def correlate(reference: Series, sensor: Series, window: float, least_overlap: f
     var_b = np.maximum(cross(mask_a, b * b) / n - mean_b**2, 0.0).sum(axis=1)
     covariance = (cross(a, b) / n - mean_a * mean_b).sum(axis=1)
     rho = covariance / np.sqrt(np.maximum(var_a * var_b, 1e-12))
-    lag = STEP * (np.arange(len(rho)) - lags)
+    lag = STEP * np.arange(-lags, len(rho) - lags, dtype=np.float64)
     variance: FloatArray = np.minimum(var_a, var_b)
     return Correlation(lag, n[:, 0] * STEP, rho, variance, (a, known_a), (b, known_b))
 
@@ -239,7 +239,8 @@ class ClockFit:
             """(windows,) a table (windows, lags) at each window's lag on a line, linear between the grid's points."""
             place = (np.clip(line[0] + line[1] * elapsed, _LAGS[0], _LAGS[-1]) - _LAGS[0]) / _FINE_STEP
             before = np.minimum(place.astype(np.intp), last - 1)
-            return table[rows, before] + (place - before) * (table[rows, before + 1] - table[rows, before])
+            value: FloatArray = table[rows, before] + (place - before) * (table[rows, before + 1] - table[rows, before])
+            return value
 
         # The prior: 1 / variance of the offset and its time from the middle, 1 / variance of the drift.
         trust, at, line0, drift_trust = 0.0, 0.0, np.zeros(2), DRIFT_PRIOR**-2

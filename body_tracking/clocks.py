@@ -128,8 +128,8 @@ def fit_clock(
     """
     weights = stddevs**-2
     information = line_information(times, weights) + np.diag([0.0, drift_stddev**-2])
-    line: FloatArray = np.linalg.solve(information, [weights @ offsets, weights @ (times * offsets)])
-    return line, information
+    line = np.linalg.solve(information, np.array([weights @ offsets, weights @ (times * offsets)]))
+    return np.asarray(line, dtype=np.float64), information
 
 
 class LeastDelay:
