@@ -27,7 +27,8 @@ from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState, PointCloud2
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import TIME_REFERENCE, TRANSFORM, RosMessages

@@ -30,9 +30,10 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality
 from body_tracking.calibration.storage import save
 from body_tracking.cdr import encode_skeletons
+from body_tracking.clocks import ClockModel
 from body_tracking.messages.diagnostics import NodeStatus, statuses
 from body_tracking.nodes.bag_topics import to_profile
 from body_tracking.parameters import SECTION, to_ros

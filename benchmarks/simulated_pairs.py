@@ -52,7 +52,8 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.offline import WHOLE
 from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult, ClockModel
+from body_tracking.calibration.result import CalibrationResult
+from body_tracking.clocks import ClockModel
 from body_tracking.measurement import body_heading, left_right_axes, viewing_angle
 from body_tracking.sensors import RecordedFrame
 from body_tracking.sensors.csv_recording import CsvRecording

@@ -1,4 +1,4 @@
-"""Left and right of one body: which way its upper and its lower half face, and how both are exchanged.
+"""Left and right of one body: which way its upper and its lower half face, and how they are swapped.
 
 A Kinect takes every body to face it, and sometimes turns only the shoulders. Upper and lower body each have a heading
 here, the direction of their left-right axis in the horizontal plane of ``world``; it is a plain number, because the
@@ -8,12 +8,11 @@ arithmetic of two angles per sensor is cheaper without arrays.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
-from body_tracking.skeleton import MIRROR, N_JOINTS, FloatArray, Joint
+from body_tracking.skeleton import MIRROR, N_JOINTS, FloatArray, IntArray, Joint
 
 SAME_SENSE = 0.5
 """Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
@@ -62,39 +61,39 @@ def heading_weights(points: FloatArray, variance: FloatArray) -> list[float]:
     return weights
 
 
-def agree(headings: Sequence[float], believed: Sequence[float]) -> bool:
-    """Whether nothing is to be put right, as far as that is known."""
-    return not any(math.cos(a - b) < SAME_SENSE for a, b in zip(headings, believed, strict=True))
-
-
-def put_right(
-    headings: Sequence[float],
-    believed: Sequence[float],
-    points: FloatArray,
-    variance: FloatArray,
-    states: np.ndarray,
-    counters: Counter[str],
-) -> None:
-    """Repair or reject, in place, what one sensor sees turned around or with its sides swapped.
+def reversed_halves(headings: Sequence[float], believed: Sequence[float]) -> list[tuple[IntArray, bool]]:
+    """The halves of a body that do not have the believed heading, as far as that is known.
 
     Args:
         headings: of both halves, as :func:`headings_of` says.
         believed: those that are taken for true.
-        points: (25, 3) metres in world.
-        variance: (25,) square metres.
-        states: (25,).
-        counters: counts ``repaired`` and ``turned``.
+
+    Returns:
+        The joints of each such half, and whether its heading is opposite to the believed one, so that left and right
+        are swapped; else it is across.
     """
-    for half, joints in enumerate(HALVES):
-        agreement = math.cos(headings[half] - believed[half])
-        if not agreement < SAME_SENSE:  # NaN for an axis that is not known: nothing to be said
-            continue
-        if agreement < -SAME_SENSE:
+    cosines = [math.cos(a - b) for a, b in zip(headings, believed, strict=True)]
+    # NaN for an axis that is not known: nothing to be said
+    return [
+        (joints, cosine < -SAME_SENSE) for joints, cosine in zip(HALVES, cosines, strict=True) if cosine < SAME_SENSE
+    ]
+
+
+def swap_left_right(
+    halves: Sequence[tuple[IntArray, bool]], points: FloatArray, variance: FloatArray, states: np.ndarray
+) -> None:
+    """Swap left and right, in place, in halves that are opposite, and give up the joints of those that are across.
+
+    Args:
+        halves: as :func:`reversed_halves` says.
+        points: (25, 3) metres.
+        variance: (25,) square metres; doubled by a swap, infinite where given up.
+        states: (25,).
+    """
+    for joints, opposite in halves:
+        if opposite:
             other = MIRROR[joints]
-            points[joints] = points[other]
+            points[joints], states[joints] = points[other], states[other]
             variance[joints] = 2.0 * variance[other]
-            states[joints] = states[other]
-            counters["repaired"] += 1
         else:
             variance[joints] = np.inf
-            counters["turned"] += 1

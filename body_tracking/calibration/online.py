@@ -14,20 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import (
-    DRIFT_PRIOR,
-    FINE_RANGE,
-    RECEIPT_PRIOR,
-    ClockEstimate,
-    ClockFit,
-    correlate_clocks,
-)
+from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
 from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
 from body_tracking.calibration.result import (
     CalibrationResult,
-    ClockModel,
-    KnownClock,
     SensorPose,
     SensorQuality,
     level_pose,
@@ -35,6 +26,8 @@ from body_tracking.calibration.result import (
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
+from body_tracking.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
+from body_tracking.clocks import ClockModel, jumped_back
 from body_tracking.measurement import joint_stddev
 from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
@@ -82,7 +75,7 @@ HALF_TURN = 0.5 * np.pi
 """A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
 CLOCK_STEP = 1.0
-"""A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
+"""A saved offset that is farther from the guess by the times of receipt is of another clock, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,10 +206,10 @@ class _Track:
         self.late = 0
 
     def push(self, skeleton: Skeleton, received_ns: int) -> bool:
-        """Keep a frame; False when the sensor's clock went back by more than :data:`CLOCK_STEP`."""
+        """Keep a frame; False when the sensor's clock jumped back."""
         if self.stamps and skeleton.stamp_ns <= self.stamps[-1]:
             self.late += 1
-            return self.stamps[-1] - skeleton.stamp_ns < CLOCK_STEP * NANOSECONDS
+            return not jumped_back(skeleton.stamp_ns, self.stamps[-1])
         self.stamps.append(skeleton.stamp_ns)
         known = skeleton.valid
         self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
@@ -271,24 +264,19 @@ class _Sensor:
         self.rotation: FloatArray | None = None  # as published, slewing toward the target
         self.translation: FloatArray = np.zeros(3)
         self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
-        self.known = KnownClock()  # the clock in use
-        self.loaded: KnownClock | None = None  # from another session
+        self.clock = ClockModel()  # in use
+        self.loaded: ClockModel | None = None  # from another session
         self.quality = SensorQuality()  # but for the clock
         self.turned = 0.0
         self.forget()
 
-    @property
-    def clock(self) -> ClockModel:
-        """The clock in use."""
-        return self.known.model
-
     def forget(self) -> None:
         """Start estimating anew; what is published stays."""
-        self.known = KnownClock(self.clock)
+        self.clock = replace(self.clock, stddev=np.inf, drift_stddev_ppm=np.inf)
         self.clock_guessed = False
         self.clock_saved = False
-        self.clock_expected: KnownClock | None = None  # from before the motion that the fit has seen
-        self.received: KnownClock | None = None  # by the times of receipt
+        self.clock_expected: ClockModel | None = None  # from before the motion that the fit has seen
+        self.received: ClockModel | None = None  # by the times of receipt
         self.clock_locked = False
         self.clock_base = self.clock  # what the fit is relative to
         self.clock_fit: ClockFit | None = None
@@ -429,22 +417,22 @@ class OnlineCalibration:
         own, theirs = (np.median(track.delays[:GUESS_FRAMES]) for track in (self._track, other.track))
         guess = float(own - theirs) / NANOSECONDS
         assert self._anchor is not None
-        if other.rotation is None or abs(other.clock.anchored_at(self._anchor).offset - guess) > CLOCK_STEP:
+        if other.rotation is None or abs(other.clock.offset_ns_at(self._anchor) / NANOSECONDS - guess) > CLOCK_STEP:
             if other.rotation is not None:
                 self.events.append(f"the clock of {name} is not the one that was calibrated: looking for its offset")
                 self._changed = True
             offset = GUESS_GRID * round(guess / GUESS_GRID)
-            other.known = KnownClock(ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor))
+            other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
             other.loaded = None
         elif other.loaded is None:
             other.clock_saved = True  # of this session, whose motion is not to count twice
         else:
-            other.known = other.clock_expected = self._carried(other.loaded)
-            other.clock_saved = other.known.stddev < RECEIPT_PRIOR
+            other.clock = other.clock_expected = self._carried(other.loaded)
+            other.clock_saved = other.clock.stddev < RECEIPT_PRIOR
         other.clock_guessed = True
         return True
 
-    def _carried(self, loaded: KnownClock) -> KnownClock:
+    def _carried(self, loaded: ClockModel) -> ClockModel:
         """What a clock of another session says of the beginning of this one."""
         assert self._anchor is not None
         return loaded.carried_to(self._anchor, WANDER_PPM)
@@ -464,15 +452,17 @@ class OnlineCalibration:
             return
         offset = round(RECEIPT_GRID * round((own - theirs) / NANOSECONDS / RECEIPT_GRID) * NANOSECONDS)
         middle = (first + last) // 2 - offset
-        other.received = KnownClock(ClockModel(offset, 0.0, middle), RECEIPT_PRIOR, 1e6 * DRIFT_PRIOR)
+        other.received = ClockModel(offset, 0.0, middle, RECEIPT_PRIOR, 1e6 * DRIFT_PRIOR)
         if other.clock_saved and abs(first - other.clock.to_reference(first) - offset) < FINE_RANGE * NANOSECONDS:
             if other.clock_expected is None:
-                other.known = replace(other.received, model=other.clock.anchored_at(middle))
+                other.clock = replace(
+                    other.received, offset_ns=other.clock.offset_ns_at(middle), drift_ppm=other.clock.drift_ppm
+                )
             return  # a clock that was calibrated is better, where it has not drifted away since
         if other.clock_saved:
             self._not_as_saved(name, other)
         other.loaded = other.clock_expected = None
-        other.known = other.received
+        other.clock = other.received
         self._pair_anew(other, horizon)
         self._changed = True
 
@@ -532,7 +522,7 @@ class OnlineCalibration:
     @staticmethod
     def _moved_enough(other: _Sensor, horizon: int) -> bool:
         """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
-        waited = other.received is not None and horizon - other.received.model.anchor_ns > NO_POSE_AFTER * NANOSECONDS
+        waited = other.received is not None and horizon - other.received.anchor_ns > NO_POSE_AFTER * NANOSECONDS
         return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
@@ -553,7 +543,7 @@ class OnlineCalibration:
         other.movement_since = self._now
         self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
         if other.clock_expected is None:
-            other.known = replace(other.known, model=other.clock_base)
+            other.clock = other.clock_base
             self._pair_anew(other, horizon)  # the pairs so far were made with the guess
         # Windows lie on multiples of their length, whenever the clock was found.
         first = (self._track.stamps[0] - self._anchor) // CLOCK_WINDOW_NS
@@ -572,39 +562,17 @@ class OnlineCalibration:
         stamps = np.array(since) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
-    def _as_estimate(self, known: KnownClock, base: ClockModel) -> ClockEstimate:
-        """A clock against another one, in seconds since the anchor."""
-        assert self._anchor is not None
-        at_ns = known.model.anchor_ns
-        return ClockEstimate(
-            (known.model.to_sensor(at_ns) - base.to_sensor(at_ns)) / NANOSECONDS,
-            1e-6 * (known.model.drift_ppm - base.drift_ppm),
-            (at_ns - self._anchor) / NANOSECONDS,
-            known.stddev,
-            1e-6 * known.drift_stddev_ppm,
-        )
-
-    def _as_known(self, estimate: ClockEstimate, base: ClockModel) -> KnownClock:
-        """The inverse of :meth:`_as_estimate`."""
-        assert self._anchor is not None
-        at_ns = self._anchor + round(estimate.at * NANOSECONDS)
-        offset_ns = base.anchored_at(at_ns).offset_ns + round(estimate.offset * NANOSECONDS)
-        model = ClockModel(offset_ns, base.drift_ppm + 1e6 * estimate.drift, at_ns)
-        return KnownClock(model, estimate.stddev, 1e6 * estimate.drift_stddev)
-
     def _not_as_saved(self, name: str, other: _Sensor) -> None:
         self.events.append(f"{name}: its clock was set since it was calibrated")
         other.loaded = other.clock_expected = None
 
-    def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockEstimate | None:
+    def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockModel | None:
         """The clock by all the motion so far and by what was known before it, unless these contradict each other."""
-        received = None if other.received is None else self._as_estimate(other.received, other.clock_base)
-        found = fit.solve(received)
-        if found is None or other.clock_expected is None:
+        found, expected = fit.solve(other.received), other.clock_expected
+        if found is None or expected is None:
             return found
-        expected = self._as_estimate(other.clock_expected, other.clock_base)
-        apart = found.offset_at(found.at) - expected.offset_at(found.at)
-        if abs(apart) > MOVED_SIGMAS * np.hypot(found.stddev, expected.stddev_at(found.at)):
+        apart = (found.offset_ns - expected.offset_ns_at(found.anchor_ns)) / NANOSECONDS
+        if abs(apart) > MOVED_SIGMAS * np.hypot(found.stddev, expected.stddev_at(found.anchor_ns)):
             self._not_as_saved(name, other)
             return found
         return fit.solve(expected)
@@ -618,25 +586,27 @@ class OnlineCalibration:
             start, stop = other.clock_window_end, other.clock_window_end + CLOCK_WINDOW_NS
             other.clock_window_end = stop
             if other.clock_fit is None:
-                other.clock_fit = ClockFit(0.0)
+                other.clock_fit = ClockFit(other.clock_base, self._anchor, LIKE)
             measured |= other.clock_fit.add(
                 (start + CLOCK_WINDOW_NS // 2 - self._anchor) / NANOSECONDS,
-                self._since_anchor(self._track, ClockModel(), start, stop),
-                self._since_anchor(
-                    other.track,
-                    other.clock_base,
-                    other.clock.to_sensor(start - around),
-                    other.clock.to_sensor(stop + around),
+                joint_speeds(*self._since_anchor(self._track, ClockModel(), start, stop)),
+                joint_speeds(
+                    *self._since_anchor(
+                        other.track,
+                        other.clock_base,
+                        other.clock.to_sensor(start - around),
+                        other.clock.to_sensor(stop + around),
+                    )
                 ),
             )
         found = self._fitted_clock(name, other, other.clock_fit) if measured and other.clock_fit is not None else None
         if found is None:
             return
-        other.known = self._as_known(found, other.clock_base)
+        other.clock = found
         gone = other.clock.to_sensor(other.clock_window_end) - other.clock_base.to_sensor(other.clock_window_end)
         if abs(gone) > REBASE_CLOCK * NANOSECONDS:
             # What is known by now is what the next fit expects.
-            other.clock_expected, other.clock_base, other.clock_fit = other.known, other.clock, None
+            other.clock_expected, other.clock_base, other.clock_fit = other.clock, other.clock, None
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
         if abs(moved) > REPAIR_CLOCK:
@@ -734,7 +704,7 @@ class OnlineCalibration:
     def _result(self, valid_from_ns: int, *, published: bool) -> CalibrationResult:
         base_rotation = self._base.rotation
         poses = {self.reference: self._base}
-        clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0)}
+        clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0, 0.0, 0.0)}
         quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0, 0.0)}
         for name, other in self._sensors.items():
             if other.rotation is None or other.target is None:
@@ -748,8 +718,8 @@ class OnlineCalibration:
             clocks[name] = other.clock
             quality[name] = replace(
                 other.quality,
-                clock_stddev=other.known.stddev,
-                clock_drift_stddev_ppm=other.known.drift_stddev_ppm,
+                clock_stddev=other.clock.stddev,
+                clock_drift_stddev_ppm=other.clock.drift_stddev_ppm,
             )
         stamped = {
             name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
@@ -809,8 +779,11 @@ class OnlineCalibration:
             other.target = rotation, translation, translation
             other.quality = result.quality.get(name, SensorQuality())
             drift_stddev_ppm = min(other.quality.clock_drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
-            known = KnownClock(result.clocks.get(name, ClockModel()), other.quality.clock_stddev, drift_stddev_ppm)
-            other.known = other.loaded = known
+            other.clock = other.loaded = replace(
+                result.clocks.get(name, ClockModel()),
+                stddev=other.quality.clock_stddev,
+                drift_stddev_ppm=drift_stddev_ppm,
+            )
 
     # --- services
 
@@ -839,16 +812,16 @@ class OnlineCalibration:
             if other.rotation is None:
                 waiting.append(name)
                 continue
-            quality, clock = other.quality, other.known
-            at_ns = clock.model.anchor_ns if self._now is None else self._now
+            quality, clock = other.quality, other.clock
+            at_ns = clock.anchor_ns if self._now is None else self._now
             if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
                 unsure.append(name)
             values |= {
                 f"{name} residual_mm": round(1e3 * quality.residual, 1),
                 f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
                 f"{name} translation_stddev_mm": round(1e3 * quality.translation_stddev, 1),
-                f"{name} clock_offset_s": round(clock.model.anchored_at(at_ns).offset, 4),
-                f"{name} clock_drift_ppm": round(clock.model.drift_ppm, 1),
+                f"{name} clock_offset_s": round(clock.offset_ns_at(at_ns) / NANOSECONDS, 4),
+                f"{name} clock_drift_ppm": round(clock.drift_ppm, 1),
                 f"{name} clock_stddev_ms": round(1e3 * clock.stddev_at(at_ns), 2),
                 f"{name} clock_from": _clock_from(other),
                 f"{name} pairs": len(other.pairs),

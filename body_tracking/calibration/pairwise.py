@@ -87,7 +87,7 @@ class PairEstimate:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
-def agreeing(reference: FloatArray, sensor_in_reference: FloatArray) -> BoolArray:
+def same_sense(reference: FloatArray, sensor_in_reference: FloatArray) -> BoolArray:
     """Frames in which both sensors give the body's left-right axis the same sense.
 
     Args:
@@ -153,7 +153,7 @@ def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterat
         rotated = sensor @ rotation.T
         error = reference - rotated - translation
         squared = np.einsum("nji,nji->nj", error - offsets, error - offsets) * precision
-        same = agreeing(pairs.reference, pairs.sensor @ rotation.T)
+        same = same_sense(pairs.reference, pairs.sensor @ rotation.T)
         if same.sum() < 5:
             raise CalibrationError("the sensors do not agree on the body's left and right in any frame")
         weights = precision / (1.0 + squared / CAUCHY**2) * same[:, None]

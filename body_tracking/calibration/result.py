@@ -7,74 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from body_tracking.skeleton import NANOSECONDS, FloatArray
-
-MAX_DRIFT_PPM = 10_000.0
-"""A clock that is a hundredth faster than another is no drift but a damaged number; NTP slews by 500 ppm at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockModel:
-    """A sensor's clock against the reference sensor's clock.
-
-    ``sensor = reference + offset + drift * (reference - anchor)``; two sensors that count from their own start have an
-    offset of seconds and a drift of some tens of parts per million.
-
-    Attributes:
-        offset_ns: sensor clock minus reference clock at the anchor, nanoseconds.
-        drift_ppm: by how much the sensor's clock runs fast, parts per million.
-        anchor_ns: reference time at which the offset holds exactly.
-    """
-
-    offset_ns: int = 0
-    drift_ppm: float = 0.0
-    anchor_ns: int = 0
-
-    def to_sensor(self, reference_ns: int) -> int:
-        """Reference time to the sensor's time."""
-        return reference_ns + self.offset_ns + round(self.drift_ppm * 1e-6 * (reference_ns - self.anchor_ns))
-
-    def to_reference(self, sensor_ns: int) -> int:
-        """The sensor's time to reference time; the inverse of :meth:`to_sensor` to a nanosecond."""
-        # In integers but for the drift's small share: stamps since an epoch have no room for nanoseconds in a float.
-        elapsed = sensor_ns - self.offset_ns - self.anchor_ns
-        drift = self.drift_ppm * 1e-6
-        return self.anchor_ns + elapsed - round(elapsed * (drift / (1.0 + drift)))
-
-    @property
-    def offset(self) -> float:
-        """The offset in seconds."""
-        return self.offset_ns / NANOSECONDS
-
-    def anchored_at(self, reference_ns: int) -> ClockModel:
-        """The same clock by its offset at another reference time."""
-        return ClockModel(self.to_sensor(reference_ns) - reference_ns, self.drift_ppm, reference_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class KnownClock:
-    """A clock, and how well it is known.
-
-    Attributes:
-        model: anchored where the errors of offset and drift have nothing to do with each other.
-        stddev: of the offset at the anchor, seconds; infinity while unknown.
-        drift_stddev_ppm: of the drift, parts per million; infinity while unknown.
-    """
-
-    model: ClockModel = ClockModel()
-    stddev: float = float("inf")
-    drift_stddev_ppm: float = float("inf")
-
-    def stddev_at(self, reference_ns: int) -> float:
-        """Standard deviation of the offset at a reference time, seconds."""
-        elapsed = (reference_ns - self.model.anchor_ns) / NANOSECONDS
-        return float(np.hypot(self.stddev, 1e-6 * self.drift_stddev_ppm * elapsed)) if elapsed else self.stddev
-
-    def carried_to(self, reference_ns: int, wander_ppm: float) -> KnownClock:
-        """What it says of another time, if the drift may have changed by so much on the way."""
-        drift_stddev_ppm = float(np.hypot(self.drift_stddev_ppm, wander_ppm))
-        changing = KnownClock(self.model, self.stddev, drift_stddev_ppm)
-        return KnownClock(self.model.anchored_at(reference_ns), changing.stddev_at(reference_ns), drift_stddev_ppm)
+from body_tracking.clocks import ClockModel
+from body_tracking.skeleton import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,13 @@ import numpy as np
 import yaml
 
 from body_tracking import files
-from body_tracking.calibration.result import MAX_DRIFT_PPM, CalibrationResult, ClockModel, SensorPose, SensorQuality
+from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.clocks import ClockModel
 from body_tracking.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
+
+MAX_DRIFT_PPM = 10_000.0
+"""A clock that is a hundredth faster than another is no drift but a damaged number; NTP slews by 500 ppm at most."""
 
 _HEADER = """\
 # Calibration written by body_tracking: the pose of each <sensor>_optical_frame (x right, y down, z forward) in world,

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from body_tracking.calibration.pairwise import PairEstimate, Pairs, agreeing, estimate
+from body_tracking.calibration.pairwise import PairEstimate, Pairs, estimate, same_sense
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.skeleton import MIRROR, BoolArray, FloatArray
 
@@ -23,7 +23,7 @@ MIN_SAME = 0.2
 """Where the sensors agree on left and right in fewer frames than this share, the others have to do."""
 
 
-def exchanged(pairs: Pairs, frames: BoolArray) -> Pairs:
+def with_sides_swapped(pairs: Pairs, frames: BoolArray) -> Pairs:
     """The same pairs, left and right of the sensor exchanged in some frames.
 
     Args:
@@ -50,7 +50,7 @@ def registration(pairs: Pairs) -> Pose | None:
 
 def half_turn_from(pairs: Pairs, rotation: FloatArray) -> Pose | None:
     """The pose with which each frame says the opposite of left and right than with a given one."""
-    return registration(exchanged(pairs, agreeing(pairs.reference, pairs.sensor @ rotation.T)))
+    return registration(with_sides_swapped(pairs, same_sense(pairs.reference, pairs.sensor @ rotation.T)))
 
 
 def best_estimate(pairs: Pairs, starts: Iterable[Pose]) -> PairEstimate | None:
@@ -68,9 +68,9 @@ def best_estimate(pairs: Pairs, starts: Iterable[Pose]) -> PairEstimate | None:
     """
     found: list[tuple[float, PairEstimate]] = []
     for rotation, translation in starts:
-        same = agreeing(pairs.reference, pairs.sensor @ rotation.T)
+        same = same_sense(pairs.reference, pairs.sensor @ rotation.T)
         try:
-            judged = estimate(exchanged(pairs, ~same), rotation, translation)
+            judged = estimate(with_sides_swapped(pairs, ~same), rotation, translation)
             kept = judged if same.mean() < MIN_SAME else estimate(pairs, judged.rotation, judged.translation)
         except CalibrationError:
             continue

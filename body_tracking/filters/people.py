@@ -9,7 +9,8 @@ from itertools import groupby
 from typing import Any
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.filters.person import FilterSettings, PersonFilter
 from body_tracking.fusion.people import People
 from body_tracking.fusion.subject import ALL, HeldSubject

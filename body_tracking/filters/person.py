@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.filters import (
     DEFAULT_FILTER,
     ModelFilter,

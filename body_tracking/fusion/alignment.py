@@ -1,8 +1,8 @@
 """One sensor's frames as they come, in ``world`` and the reference's clock: for a filter that takes each by itself.
 
 What :mod:`body_tracking.fusion.fusion` does with frames that it pairs is done here with each alone: poses and clocks
-come into force at their times, every joint states its uncertainty, and a body that a sensor sees turned around is put
-right by what the others see at that time. Nothing waits and nothing is lost: late frames go on as they are.
+come into force at their times, every joint states its uncertainty, and a body that a sensor sees turned around is
+corrected by what the others see at that time. Nothing waits and nothing is lost: late frames go on as they are.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.fusion.fusion import WORLD, FusionError
-from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.sides import Sides
 from body_tracking.measurement import joint_stddev, viewing_angle
-from body_tracking.sides import agree, heading_weights, headings_of, put_right
+from body_tracking.sides import heading_weights, headings_of, reversed_halves, swap_left_right
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 FRESH = 0.1
@@ -146,7 +147,7 @@ class SensorAlignment:
 
     def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
         """Start anew when a sensor's clock jumped back: the reference's takes the others with it."""
-        if source.last_ns is not None and stamp_ns < source.last_ns - CLOCK_JUMP * NANOSECONDS:
+        if jumped_back(stamp_ns, source.last_ns):
             if sensor == self.reference:
                 self.reset()
             else:
@@ -163,17 +164,16 @@ class SensorAlignment:
         A sensor that was started again may count from another beginning, and its frames would throw a filter from one
         time to another until the calibration has found its clock again.
         """
-        jump = CLOCK_JUMP * NANOSECONDS
         if sensor == self.reference:
             for other in self._sensors.values():
-                if other.newest is not None and other.newest.stamp_ns > stamp + jump:
+                if other.newest is not None and other.newest.stamp_ns > stamp + JUMP_BACK_NS:
                     other.ahead, other.newest = True, None
             return True
         reference = self._sensors[self.reference].newest
         if reference is None:
             return True
-        source.ahead &= stamp > reference.stamp_ns + jump
-        return not source.ahead and stamp >= reference.stamp_ns - jump
+        source.ahead &= stamp > reference.stamp_ns + JUMP_BACK_NS
+        return not source.ahead and not jumped_back(stamp, reference.stamp_ns)
 
     def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
         """The frame with left and right as they are believed from what all sensors see at that time."""
@@ -188,13 +188,12 @@ class SensorAlignment:
         weights = [frame.weights for frame in frames]
         believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
         points, variance, states = seen.positions, seen.variance, seen.states
-        counted: Counter[str] = Counter()
-        if not agree(seen.headings, believed):
+        if halves := reversed_halves(seen.headings, believed):
             points, variance, states = points.copy(), variance.copy(), states.copy()
-            put_right(seen.headings, believed, points, variance, states, counted)
+            swap_left_right(halves, points, variance, states)
         known = np.isfinite(variance)
-        self.counters["repaired"] += counted["repaired"] > 0
-        if counted["turned"]:
+        self.counters["repaired"] += any(opposite for _, opposite in halves)
+        if not all(opposite for _, opposite in halves):
             self.counters["turned_joints"] += int(np.count_nonzero(np.isfinite(seen.variance) & ~known))
         covariances = np.zeros((N_JOINTS, 3, 3))
         covariances[:, _DIAGONAL, _DIAGONAL] = variance[:, None]

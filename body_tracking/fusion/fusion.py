@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.errors import BodyTrackingError
-from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.rhythm import Rhythm
 from body_tracking.fusion.sides import HOLD, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
@@ -247,7 +248,7 @@ class Fusion:
     def _accepts(self, sensor: str, source: _Sensor, skeleton: Skeleton, now_ns: int) -> bool:
         """Remember a frame, and note whether the output is to answer it; False when it is of no use."""
         if source.frames and skeleton.stamp_ns <= source.frames[-1].stamp_ns:
-            if source.frames[-1].stamp_ns - skeleton.stamp_ns < CLOCK_JUMP * NANOSECONDS:
+            if not jumped_back(skeleton.stamp_ns, source.frames[-1].stamp_ns):
                 self.counters["late"] += 1
                 return False
             if sensor == self.reference:
@@ -276,19 +277,18 @@ class Fusion:
         The clock of another sensor may be misstated. What it says of a time to come is not waited for: where the
         reference's frames have been older than the output for longer than a delay explains, the output starts again.
         """
-        jump = CLOCK_JUMP * NANOSECONDS
         source.newest_ns = stamp
         if sensor != self.reference:
             reference_ns = self._sensors[self.reference].newest_ns
-            source.ahead &= reference_ns is not None and stamp > reference_ns + jump
-            return not source.ahead and (reference_ns is None or stamp >= reference_ns - jump)
+            source.ahead &= reference_ns is not None and stamp > reference_ns + JUMP_BACK_NS
+            return not source.ahead and not jumped_back(stamp, reference_ns)
         for other in self._sensors.values():
-            other.ahead |= other.newest_ns is not None and other.newest_ns > stamp + jump
-        if self._last_ns is None or self._last_ns <= stamp + jump:
+            other.ahead |= other.newest_ns is not None and other.newest_ns > stamp + JUMP_BACK_NS
+        if self._last_ns is None or self._last_ns <= stamp + JUMP_BACK_NS:
             self._behind_since_ns = None
         elif self._behind_since_ns is None:
             self._behind_since_ns = now_ns
-        elif now_ns - self._behind_since_ns > jump:
+        elif now_ns - self._behind_since_ns > JUMP_BACK_NS:
             self._forget_output()
             self.counters["resets"] += 1
         return True

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from body_tracking.fusion.placement import CLOCK_JUMP
+from body_tracking.clocks import JUMP_BACK_NS, jumped_back
 from body_tracking.fusion.rhythm import DUE_MARGIN, Rhythm
 from body_tracking.skeleton import NANOSECONDS, Skeleton
 
@@ -88,12 +88,12 @@ class Ordering:
         """
         source = self._sources[sensor]
         stamp_ns = skeleton.stamp_ns
-        if source.newest_ns is not None and stamp_ns < source.newest_ns - CLOCK_JUMP * NANOSECONDS:
+        if jumped_back(stamp_ns, source.newest_ns):
             self._of_before = self.flush()
             source = self._sources[sensor]
         if source.newest_ns is None or stamp_ns > source.newest_ns:
-            if source.newest_ns is not None and (step := (stamp_ns - source.newest_ns) / NANOSECONDS) < CLOCK_JUMP:
-                source.rhythm.note(step)
+            if source.newest_ns is not None and (step := stamp_ns - source.newest_ns) < JUMP_BACK_NS:
+                source.rhythm.note(step / NANOSECONDS)
             source.newest_ns = stamp_ns
         self._arrived += 1
         insort(self._waiting, _Waiting(stamp_ns, self._arrived, now_ns + self._wait_ns, sensor, skeleton))

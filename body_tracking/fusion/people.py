@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.fusion.association import Association
-from body_tracking.fusion.placement import CLOCK_JUMP, Placement
+from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.subject import (
     ALL,
     FIRST,
@@ -205,7 +206,7 @@ class People:
 
     def _placed(self, sensor: str, source: _Sensor, sensor_ns: int) -> tuple[int, SensorPose] | None:
         """A frame's time in the reference's clock and its sensor's pose; None where they are not known."""
-        if source.last_ns is not None and sensor_ns < source.last_ns - CLOCK_JUMP * NANOSECONDS:
+        if jumped_back(sensor_ns, source.last_ns):
             if sensor == self.reference:
                 self.reset()
             else:
@@ -228,16 +229,15 @@ class People:
 
     def _in_step(self, sensor: str, source: _Sensor, stamp_ns: int) -> bool:
         """Whether a frame is of the time in which the reference sensor is, as far as that can be told."""
-        jump = CLOCK_JUMP * NANOSECONDS
         if sensor == self.reference:
             for other in self._sensors.values():
-                other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + jump
+                other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + JUMP_BACK_NS
             return True
         reference_ns = self._sensors[self.reference].newest_ns
         if reference_ns is None:
             return True
-        source.ahead &= stamp_ns > reference_ns + jump
-        return not source.ahead and stamp_ns >= reference_ns - jump
+        source.ahead &= stamp_ns > reference_ns + JUMP_BACK_NS
+        return not source.ahead and not jumped_back(stamp_ns, reference_ns)
 
     def _tell_pending(self) -> None:
         """Tell the association what sensors saw of one who was alone."""

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.fusion.fusion import WORLD, Fusion, FusionParameters
 from body_tracking.fusion.people import People
 from body_tracking.fusion.subject import ALL, PeopleParameters

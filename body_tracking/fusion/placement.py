@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.skeleton import MAX_STAMP_NS
-
-CLOCK_JUMP = 1.0
-"""A sensor whose stamps go back by more than this starts again, seconds."""
 
 _MOST = 64
 """Poses, and clocks, of one sensor that may wait for their time: a calibration announces one at a time."""

@@ -9,7 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from body_tracking.sides import HALVES, PAIRS, SAME_SENSE, heading_weights, headings_of, put_right
+from body_tracking.sides import (
+    HALVES,
+    PAIRS,
+    SAME_SENSE,
+    heading_weights,
+    headings_of,
+    reversed_halves,
+    swap_left_right,
+)
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 _CLOSE = math.sqrt(0.5)
@@ -172,7 +180,10 @@ class Sides:
                 counters["jumped"] += 1
         believed = self.believed(stamp, names, angles, headings, weights, counters)
         for index, found in enumerate(headings):
-            put_right(found, believed, points[index], variance[index], states[index], counters)
+            halves = reversed_halves(found, believed)
+            swap_left_right(halves, points[index], variance[index], states[index])
+            for _, opposite in halves:
+                counters["repaired" if opposite else "turned"] += 1
         lines = [[abs(math.cos(a - b)) for a, b in zip(found, believed, strict=True)] for found in headings]
         return np.array(lines) > _SURE
 

@@ -25,14 +25,14 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from body_tracking.calibration.clock import STEP
+from body_tracking.clock_correlation import STEP, Series
 from body_tracking.inertial.alignment import (
     MOUNTING_STDDEV,
     AlignmentError,
     rotation_vectors,
     yaw,
 )
-from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, Turning, independent_samples, sampled
+from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, independent_samples
 from body_tracking.skeleton import FloatArray
 
 SEGMENT_STDDEV: Final = float(np.radians(8.0))
@@ -84,7 +84,7 @@ def assign(stated: Sequence[str], likelihood: FloatArray) -> Assignment:
     return Assignment(found, exchanged, float(likelihood[np.arange(k), columns].sum() - likelihood.trace()))
 
 
-def likelihood_by_motion(sensors: Sequence[Turning], bones: Sequence[Turning | None]) -> FloatArray:
+def likelihood_by_motion(sensors: Sequence[Series], bones: Sequence[Series | None]) -> FloatArray:
     """(k, k) log likelihoods by how fast sensors and bones turn, in one clock (eq. 13).
 
     Args:
@@ -92,15 +92,17 @@ def likelihood_by_motion(sensors: Sequence[Turning], bones: Sequence[Turning | N
         bones: of the k segments as a camera sees them; None of one that it does not see, of which nothing is known.
     """
     result = np.zeros((len(sensors), len(bones)))
-    seen = [(j, bone) for j, bone in enumerate(bones) if bone is not None]
+    seen = [(j, bone) for j, bone in enumerate(bones) if bone is not None and len(bone.stamps)]
     for i, sensor in enumerate(sensors):
+        if not len(sensor.stamps):
+            continue
         for j, bone in seen:
             begin, end = max(sensor.stamps[0], bone.stamps[0]), min(sensor.stamps[-1], bone.stamps[-1])
             if end - begin < LEAST_OVERLAP:
                 continue
             times = np.arange(begin, end, STEP)
-            (a, known_a), (b, known_b) = sampled(sensor, times), sampled(bone, times)
-            both = known_a & known_b
+            (a, known_a), (b, known_b) = sensor.at(times), bone.at(times)
+            a, b, both = a[:, 0], b[:, 0], known_a & known_b
             if both.sum() * STEP < LEAST_OVERLAP or min(float(a[both].std()), float(b[both].std())) < LEAST_RATE:
                 continue
             rho = float(np.clip(np.corrcoef(a[both], b[both])[0, 1], 0.0, 0.99))

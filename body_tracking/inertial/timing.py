@@ -11,12 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from body_tracking.clocks import ReceiptClock, jumped_back
 from body_tracking.inertial.parameters import REFERENCE, SHARED
-from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.skeleton import NANOSECONDS
 
-JUMP_NS = NANOSECONDS
-"""By which stamps go back from which on time has jumped."""
 _TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
 """Seconds by which transports differ, per root second by which that changes, and that motion tells at best."""
 
@@ -72,7 +70,7 @@ class SensorClocks:
     def hear(self, stamp_ns: int, received_ns: int) -> bool:
         """Note a frame of the camera itself; whether another clock counts from now on."""
         before, self._frame_ns = self._frame_ns, stamp_ns
-        if before is None or stamp_ns <= before - JUMP_NS:
+        if before is None or jumped_back(stamp_ns, before):
             self._camera.reset()
         known = self._camera.delay_ns is not None
         return not self._camera.add(stamp_ns, received_ns) or not known

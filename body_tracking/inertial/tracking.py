@@ -17,6 +17,8 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.clock_correlation import Series
+from body_tracking.clocks import JUMP_BACK_NS, jumped_back
 from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
@@ -28,13 +30,13 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.inertial.body import WornBody, joint_variances
-from body_tracking.inertial.clock import Turning, clock_offset
+from body_tracking.inertial.clock import clock_offset, turning_of_bone, turning_of_sensor
 from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by_motion, likelihood_by_pose
 from body_tracking.inertial.heading import HEADING_WALK, JOINTS, HeadingTracker, bone_of
 from body_tracking.inertial.held_pose import HeldPose, PoseFinder
 from body_tracking.inertial.mounting import mountings as meant_mountings
 from body_tracking.inertial.parameters import ARMS_DOWN, AUTO, REFERENCE, T_POSE, TrackingParameters
-from body_tracking.inertial.timing import JUMP_NS, SensorClocks
+from body_tracking.inertial.timing import SensorClocks
 from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, WornSensor
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import UpperBody
@@ -286,10 +288,11 @@ class InertialTracker:
             return
         self._receive(received_ns)
         newest, first = self._newest_ns, not self._clocks.camera_known
-        if newest is not None and newest - JUMP_NS < skeleton.stamp_ns <= newest:
+        back = jumped_back(skeleton.stamp_ns, newest)
+        if newest is not None and skeleton.stamp_ns <= newest and not back:
             self.counters["camera's late frames"] += 1
             return
-        jumped = self._clocks.see(skeleton.stamp_ns, received_ns, newest is not None and skeleton.stamp_ns <= newest)
+        jumped = self._clocks.see(skeleton.stamp_ns, received_ns, back)
         if jumped:
             self.counters["camera's time jumped"] += 1
             self._pending.clear()
@@ -304,7 +307,7 @@ class InertialTracker:
         self._body.see(skeleton)
 
     def _receive(self, received_ns: int) -> None:
-        if self._received_ns is not None and received_ns < self._received_ns - JUMP_NS:
+        if jumped_back(received_ns, self._received_ns):
             self.counters["time jumps"] += 1
             self.reset()
         self._received_ns = received_ns
@@ -460,28 +463,28 @@ class InertialTracker:
         self._tracker.loosen(segment, max(turn, 0.2))
         self._detectors[segment] = self._new_detectors(segment)
 
-    def _bones(self, segments: Sequence[str]) -> list[Turning | None]:
+    def _bones(self, segments: Sequence[str]) -> list[Series | None]:
         """How fast the camera has seen bones turn."""
         assert self._epoch_ns is not None
         stamps = np.array([(each.stamp_ns - self._epoch_ns) / NANOSECONDS for each in self._seen])
         positions = np.array([np.where(each.valid[:, None], each.positions, np.nan) for each in self._seen])
-        found: list[Turning | None] = []
+        found: list[Series | None] = []
         for segment in segments:
             bone = bone_of(segment)
             if bone is None or len(stamps) < 2:
                 found.append(None)
             else:
-                found.append(Turning.of_bone(stamps, positions[:, bone.end] - positions[:, bone.start]))
+                found.append(turning_of_bone(stamps, positions[:, bone.end] - positions[:, bone.start]))
         return found
 
-    def _turning(self, number: int, sensor: WornSensor, stamp_ns: int) -> Turning | None:
+    def _turning(self, number: int, sensor: WornSensor, stamp_ns: int) -> Series | None:
         """How fast a sensor has felt its bone turn."""
         felt = self._recent(sensor, stamp_ns, _LOOK_BACK_S)
         bone = bone_of(sensor.segment)
         if len(felt) < 2 or bone is None:
             return None
         stream = self._stream(sensor, felt)
-        return Turning.of_sensor(stream.stamps, stream.rates, self.alignment.rotations[number] @ bone.axis)
+        return turning_of_sensor(stream.stamps, stream.rates, self.alignment.rotations[number] @ bone.axis)
 
     def _look_at_clock(self, now: float, stamp_ns: int) -> None:
         """Of one sensor after the other, by how much its stamps are off those of the camera."""
@@ -495,7 +498,7 @@ class InertialTracker:
             return
         found = clock_offset(seen, felt, window=_CLOCK_WINDOW)
         if found is not None and sensor.segment not in self._exchanged.values():
-            self._clocks.correct(self._stated(sensor), now, found.offset, found.offset_stddev)
+            self._clocks.correct(self._stated(sensor), now, found.offset, found.stddev)
             self.counters["clocks by motion"] += 1
 
     def _look_for_exchange(self, now: float, stamp_ns: int) -> None:
@@ -678,7 +681,10 @@ class InertialTracker:
 
     def _orientation(self, sensor: WornSensor, felt: Felt, stamp_ns: int) -> SegmentOrientation | None:
         last = self._told_ns.get(sensor.segment)
-        if last is not None and -JUMP_NS < stamp_ns - last < _AHEAD_OF * NANOSECONDS / self.parameters.orientation_rate:
+        if (
+            last is not None
+            and -JUMP_BACK_NS < stamp_ns - last < _AHEAD_OF * NANOSECONDS / self.parameters.orientation_rate
+        ):
             return None
         number = self.segments.index(sensor.segment)
         world, covariance = self._placed(number, felt, felt.rotation)

@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.clocks import ReceiptClock
 from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.kinematics import so3
@@ -29,10 +30,6 @@ _OTHER_FRAME = 50
 """Readings of another frame in a row from which on it is the sensor's."""
 _SPACING_NS = NANOSECONDS // 55
 """Between readings that are kept: 50 of a second are enough for what they are kept for."""
-_DELAY_S = 15.0
-"""The least delay is that of the last one to two times so long."""
-_CLOCK_SET_S = 0.5
-"""Seconds by which a delay shrinks that no transport explains: the clock was set."""
 _STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2
 """rad2: of a driver that states no covariance."""
 _FIELDS = 100
@@ -48,42 +45,6 @@ _TURNED, _TURNED_S = float(np.radians(60.0)) ** 2, 10.0
 
 class WornSensorError(BodyTrackingError):
     """A reading that cannot be of this sensor."""
-
-
-class ReceiptClock:
-    """What the times of receipt tell of a clock: stamps were given at the least so long before the receipt.
-
-    The least delay of the last quarter to half minute, so that a clock that runs fast or slow is followed.
-    """
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Know nothing."""
-        self._before: int | None = None
-        self._least: int | None = None
-        self._until_ns = 0
-
-    @property
-    def delay_ns(self) -> int | None:
-        """Receipt minus stamp at least; None before anything was received."""
-        if self._least is None or self._before is None:
-            return self._least
-        return min(self._least, self._before)
-
-    def add(self, stamp_ns: int, received_ns: int) -> bool:
-        """Take one more; False when the clock was set since the last one."""
-        delay, known = received_ns - stamp_ns, self.delay_ns
-        if known is not None and delay < known - _CLOCK_SET_S * NANOSECONDS:
-            self.reset()
-            self.add(stamp_ns, received_ns)
-            return False
-        if self._least is None or received_ns > self._until_ns:
-            self._before, self._least = self._least, delay
-            self._until_ns = received_ns + round(_DELAY_S * NANOSECONDS)
-        self._least = min(self._least, delay)
-        return True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

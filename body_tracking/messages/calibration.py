@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.messages.base import (
     TIME_REFERENCE,
     TRANSFORM,

@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 
-from body_tracking.pipeline.stage import JUMP_BACK_NS
+from body_tracking.clocks import JUMP_BACK_NS
 from body_tracking.skeleton import NANOSECONDS
 
 GAP_NS = 50_000_000

@@ -6,9 +6,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from body_tracking.clocks import jumped_back
 from body_tracking.errors import BodyTrackingError
 from body_tracking.pipeline.codecs import Wire
-from body_tracking.pipeline.stage import JUMP_BACK_NS, Now, Output, Port, Stage
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _LOOKS = 2
 """What a stage follows has to be the same at so many looks."""
@@ -120,7 +121,7 @@ class OfflineRunner:
         if stamp_ns is None:
             return
         key = port.topic, number
-        if stamp_ns < self._last_ns.get(key, stamp_ns) - JUMP_BACK_NS:
+        if jumped_back(stamp_ns, self._last_ns.get(key)):
             stage.reset(port.topic)
         self._last_ns[key] = stamp_ns
 

@@ -14,10 +14,6 @@ from body_tracking.parameters import Parameter, Value
 from body_tracking.pipeline.codecs import Codec
 from body_tracking.recording.qos import Qos
 
-JUMP_BACK_NS = 1_000_000_000
-"""An input's stamp further behind the one before than this is a backward jump of time (a loop, another recording), not
-a late frame: the stage starts anew."""
-
 
 class Now(NamedTuple):
     """When a message arrived.

@@ -20,6 +20,7 @@ from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.storage import load
 from body_tracking.cdr import decode_skeletons
+from body_tracking.clocks import jumped_back
 from body_tracking.errors import BodyTrackingError
 from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
@@ -30,7 +31,6 @@ from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_parameters import parameters_for as parameters_of_nodes
 from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.pipeline.stage import JUMP_BACK_NS
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.rig import RigReader
@@ -197,7 +197,7 @@ class _Frames:
             self._counters[f"malformed {raw.topic}"] += 1
             return None
         stamp = skeletons[0].stamp_ns
-        if stamp < self._last.get(raw.topic, stamp) - JUMP_BACK_NS:
+        if jumped_back(stamp, self._last.get(raw.topic)):
             self._counters["time jumps"] += 1
         self._last[raw.topic] = stamp
         if not any(skeleton.valid.any() for skeleton in skeletons):
@@ -221,7 +221,7 @@ def skeletons_of(
         if skeletons is None:
             continue
         stamp = skeletons[0].stamp_ns
-        if stamp < last.get(sensor, stamp) - JUMP_BACK_NS:
+        if jumped_back(stamp, last.get(sensor)):
             subjects[sensor].reset()
         last[sensor] = stamp
         subject = subjects[sensor].pick(skeletons)

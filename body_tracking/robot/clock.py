@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from body_tracking.clocks import LeastDelay
 from body_tracking.skeleton import NANOSECONDS
 
 AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK = "auto", "ros", "sensor"
@@ -40,7 +41,7 @@ class StampClock:
     def reset(self) -> None:
         """Decide anew."""
         self.kind = self._given
-        self._offset_ns: float | None = None
+        self._offset = LeastDelay(rise=_DRIFT)
         self._noted_ns = 0
 
     def note(self, stamp_ns: int, now_ns: int, steady_ns: int) -> None:
@@ -52,17 +53,11 @@ class StampClock:
         if self.kind == ROS_CLOCK:
             return
         offset_ns = now_ns - stamp_ns
-        if self._offset_ns is None:
-            self._offset_ns = offset_ns
-        else:
-            drifted_ns = self._offset_ns + _DRIFT * (steady_ns - self._noted_ns)
-            if offset_ns > drifted_ns - ANOTHER_CLOCK_NS:  # else the stamp is by another clock
-                drifted_ns = min(drifted_ns, offset_ns)
-            self._offset_ns = drifted_ns
+        if not self._offset or offset_ns > self._offset.at(steady_ns) - ANOTHER_CLOCK_NS:  # else it is another clock's
+            self._offset.add(steady_ns, offset_ns)
         self._noted_ns = steady_ns
 
     def age_ns(self, stamp_ns: int, now_ns: int) -> int:
         """How long ago a stamp was, nanoseconds; negative in the future."""
-        if self._offset_ns is None:
-            return now_ns - stamp_ns
-        return round(now_ns - stamp_ns - self._offset_ns) + self._delay_ns
+        age_ns = now_ns - stamp_ns
+        return age_ns - self._offset.at(self._noted_ns) + self._delay_ns if self._offset else age_ns

@@ -33,6 +33,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from body_tracking.clocks import jumped_back
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.robot.calibration import CalibrationWatch
@@ -40,9 +41,6 @@ from body_tracking.robot.clock import ANOTHER_CLOCK_NS, AUTO_CLOCK, StampClock
 from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
-
-JUMP_BACK_NS = NANOSECONDS
-"""A stamp further behind than this is a backward jump of time, not a late message."""
 
 ROBOT_SILENCE = 0.5
 """Seconds without a word of the robot's own state after which it is taken to be away."""
@@ -208,7 +206,7 @@ class Follower:
             self.refuse_angles(foreign)
             return jumped
         last_ns = self._angles.stamp_ns if self._angles is not None else None
-        if last_ns is not None and angles.stamp_ns < last_ns - JUMP_BACK_NS:
+        if jumped_back(angles.stamp_ns, last_ns):
             jumped = True
             self.time_jumped_back()
         elif last_ns is not None and angles.stamp_ns <= last_ns:
@@ -297,7 +295,7 @@ class Follower:
 
     def _ros_time(self, now_ns: int, steady_ns: int) -> bool:
         """Whether ROS time jumped back, as where a recording begins again: the clock of the stamps is decided anew."""
-        jumped = now_ns < self._ros_ns - JUMP_BACK_NS
+        jumped = jumped_back(now_ns, self._ros_ns)
         self._ros_ns = now_ns
         if jumped:
             self.time_jumped_back()

@@ -12,6 +12,7 @@ from collections import deque
 
 import numpy as np
 
+from body_tracking.clocks import ClockModel, LeastDelay, clock_of_line, fit_clock, jumped_back
 from body_tracking.skeleton import NANOSECONDS
 
 WINDOW = 60
@@ -37,7 +38,6 @@ _SLEW = 100
 """The correction of a stamp changes by at most a hundredth of the time that has passed."""
 _SET_NS = NANOSECONDS // 4
 """A correction that is off by more is set at once: a clock was set, or the first round trip was a bad one."""
-_JUMP_BACK_NS = NANOSECONDS
 
 
 class RoundTrips:
@@ -55,9 +55,7 @@ class RoundTrips:
 
     def __init__(self) -> None:
         self._bins: deque[tuple[int, int, int]] = deque()
-        self._reference_ns = 0
-        self._offset_ns = 0
-        self._drift = 0.0
+        self._clock = ClockModel()  # the local one against the remote one
         self._contradictions = 0
         self.steps = 0
 
@@ -69,12 +67,12 @@ class RoundTrips:
     @property
     def remote_ns(self) -> int:
         """The remote time of the last round trip."""
-        return self._reference_ns
+        return self._bins[-1][0] if self._bins else 0
 
     @property
     def drift(self) -> float:
         """Seconds per second by which the local clock is faster."""
-        return self._drift
+        return 1e-6 * self._clock.drift_ppm
 
     @property
     def round_trip_ns(self) -> int:
@@ -83,7 +81,7 @@ class RoundTrips:
 
     def offset_ns(self, remote_ns: int) -> int:
         """The local clock minus the remote one when that shows this time."""
-        return self._offset_ns + round(self._drift * (remote_ns - self._reference_ns))
+        return self._clock.offset_ns_at(remote_ns)
 
     def add(self, t1: int, t2: int, t3: int, t4: int) -> bool:
         """Take a round trip, nanoseconds; whether it counts.
@@ -100,7 +98,6 @@ class RoundTrips:
             if self._contradictions < _CONTRADICTIONS:
                 return False
             self._bins.clear()
-            self._drift = 0.0
             self.steps += 1
         self._contradictions = 0
         if self._bins and remote // _BIN == self._bins[-1][0] // _BIN:
@@ -114,19 +111,15 @@ class RoundTrips:
         return True
 
     def _fit(self) -> None:
-        reference, zero, _ = self._bins[-1]
-        bins = (
-            np.array([(remote - reference, offset - zero, trip) for remote, offset, trip in self._bins]) / NANOSECONDS
-        )
-        age, offset, half = bins[:, 0], bins[:, 1], bins[:, 2] / 2.0
-        weight = 1.0 / (half - half.min() + _ERROR) ** 2
-        normal = np.array([[weight.sum(), weight @ age], [weight @ age, weight @ (age * age) + 1.0 / DRIFT_PRIOR**2]])
-        value, drift = np.linalg.solve(normal, [weight @ offset, weight @ (age * offset)])
-        lower, upper = (offset - half - drift * age).max(), (offset + half - drift * age).min()
+        zero_ns, offset_ns, _ = self._bins[-1]
+        bins = np.array([(remote - zero_ns, offset - offset_ns, trip) for remote, offset, trip in self._bins])
+        age, offset, half = (bins * [1.0, 1.0, 0.5] / NANOSECONDS).T
+        line, information = fit_clock(age, offset, half - half.min() + _ERROR, DRIFT_PRIOR)
+        level = offset - line[1] * age
+        lower, upper = (level - half).max(), (level + half).min()
         if lower <= upper:
-            value = min(max(value, lower), upper)
-        self._reference_ns, self._offset_ns = reference, zero + round(float(value) * NANOSECONDS)
-        self._drift = float(drift)
+            line[0] = min(max(line[0], lower), upper)
+        self._clock = clock_of_line(line, information, zero_ns).plus(ClockModel(offset_ns))
 
 
 class CaptureClock:
@@ -142,7 +135,7 @@ class CaptureClock:
 
     def __init__(self, least_delay_ns: int = 0) -> None:
         self._least_delay_ns = least_delay_ns
-        self._lags: deque[tuple[int, int]] = deque()
+        self._lag = LeastDelay(_LAG_WINDOW)
         self._frames = 0
         self._last_sensor_ns = 0
         self._correction_ns = 0
@@ -163,14 +156,10 @@ class CaptureClock:
         lag, step = sent_ns - sensor_ns, sensor_ns - self._last_sensor_ns
         anew = self._last_stamp_ns is None or step < 0  # the sensor has begun to count anew
         if anew:
-            self._lags.clear()
-        while self._lags and self._lags[-1][1] >= lag:
-            self._lags.pop()
+            self._lag.clear()
         self._frames += 1
-        self._lags.append((self._frames, lag))
-        while self._frames - self._lags[0][0] >= _LAG_WINDOW:
-            self._lags.popleft()
-        target = self._lags[0][1] + offset_ns - self._least_delay_ns
+        self._lag.add(self._frames, lag)
+        target = self._lag.at(self._frames) + offset_ns - self._least_delay_ns
         error = target - self._correction_ns
         if anew or abs(error) > _SET_NS:
             self._correction_ns = target
@@ -178,7 +167,7 @@ class CaptureClock:
             self._correction_ns += max(-step // _SLEW, min(step // _SLEW, error))
         self._last_sensor_ns = sensor_ns
         stamp = sensor_ns + self._correction_ns
-        if self._last_stamp_ns is not None and 0 <= self._last_stamp_ns - stamp < _JUMP_BACK_NS:
-            stamp = self._last_stamp_ns + 1
+        if self._last_stamp_ns is not None and not jumped_back(stamp, self._last_stamp_ns):
+            stamp = max(stamp, self._last_stamp_ns + 1)
         self._last_stamp_ns = stamp
         return stamp

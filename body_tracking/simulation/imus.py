@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
-from body_tracking.calibration.result import ClockModel
+from body_tracking.clocks import ClockModel
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.simulation.imu_driver import Z, fuse, rotate, stated_covariance

@@ -31,7 +31,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
+from body_tracking.clocks import ClockModel
 from body_tracking.measurement import body_heading
 from body_tracking.sensors import RecordedFrame, optical_frame
 from body_tracking.simulation import kinect_joints as tables

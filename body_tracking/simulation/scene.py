@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.calibration.result import ClockModel
+from body_tracking.clocks import ClockModel
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.model import Posture

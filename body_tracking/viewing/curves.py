@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.clocks import jumped_back
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray
 
 BAND: Final = 1.959963984540054
 """Half the width of a band with 95 % of a normal distribution, in standard deviations."""
 WIDEST: Final = 60.0
 """A band is drawn no farther than this from its angle, degrees; with an infinite deviation it goes that far."""
-_JUMP_BACK_NS: Final = NANOSECONDS
 _PREFERRED: Final = ("elbow_flexion", "shoulder_elevation", "shoulder_flexion", "trunk_flexion", "p_shoulder", "elbow")
 
 
@@ -68,7 +68,7 @@ class AngleHistory:
             stddevs: (n,) radians, infinity where not known.
         """
         last = self._rows[-1][0] if self._rows else None
-        if tuple(names) != self.names or (last is not None and stamp_ns < last - _JUMP_BACK_NS):
+        if tuple(names) != self.names or jumped_back(stamp_ns, last):
             self.names = tuple(names)
             self.clear()
         elif last is not None and stamp_ns <= last:

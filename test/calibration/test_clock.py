@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.clock import (
-    FINE_RANGE,
-    MIN_STDDEV,
-    RECEIPT_PRIOR,
-    ClockEstimate,
-    ClockFit,
-    correlate_clocks,
-)
-from body_tracking.skeleton import FloatArray
+from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
+from body_tracking.clock_correlation import DRIFT_PRIOR, FINE_RANGE, MIN_STDDEV, ClockFit
+from body_tracking.clocks import ClockModel
+from body_tracking.skeleton import NANOSECONDS, FloatArray
 from walkers import walk
 
 
@@ -80,9 +75,20 @@ def test_too_little_overlap_is_no_answer() -> None:
     assert correlate_clocks((a[0][:40], a[1][:40]), (b[0][300:], b[1][300:]), 0.0, 0.5) is None
 
 
+def known(
+    offset: float, drift: float, at: float, stddev: float = RECEIPT_PRIOR, drift_stddev: float = DRIFT_PRIOR
+) -> ClockModel:
+    """A clock in seconds; by default as the times of receipt leave it."""
+    return ClockModel(round(offset * NANOSECONDS), 1e6 * drift, round(at * NANOSECONDS), stddev, 1e6 * drift_stddev)
+
+
+def offset_at(clock: ClockModel, time: float) -> float:
+    return clock.offset_ns_at(round(time * NANOSECONDS)) / NANOSECONDS
+
+
 def fitted(
-    offset: float, drift: float, seconds: float = 55.0, expected: ClockEstimate | None = None, repeated: int = 1
-) -> ClockEstimate:
+    offset: float, drift: float, seconds: float = 55.0, expected: ClockModel | None = None, repeated: int = 1
+) -> ClockModel:
     """By as many windows as there are, each taken once or as often as it is repeated."""
     return solved(seen(0.0, 0.0, 60.0, 4), seen(offset, drift, 60.0, 5), seconds, expected, repeated)
 
@@ -91,14 +97,18 @@ def solved(
     own: tuple[FloatArray, FloatArray],
     theirs: tuple[FloatArray, FloatArray],
     seconds: float,
-    expected: ClockEstimate | None = None,
+    expected: ClockModel | None = None,
     repeated: int = 1,
-) -> ClockEstimate:
-    fit = ClockFit(0.0)
+) -> ClockModel:
+    fit = ClockFit(like=LIKE)
     for start in np.repeat(np.arange(0.0, seconds, 5.0), repeated):
         window = (own[0] > start) & (own[0] <= start + 5.0)
         around = (theirs[0] > start - 2 * FINE_RANGE) & (theirs[0] <= start + 5.0 + 2 * FINE_RANGE)
-        fit.add(start + 2.5, (own[0][window], own[1][window]), (theirs[0][around], theirs[1][around]))
+        fit.add(
+            start + 2.5,
+            joint_speeds(own[0][window], own[1][window]),
+            joint_speeds(theirs[0][around], theirs[1][around]),
+        )
     found = fit.solve(expected)
     assert found is not None
     return found
@@ -108,12 +118,14 @@ def solved(
 def test_offset_and_drift_are_fitted_within_the_stated_uncertainty(offset: float, drift: float) -> None:
     found = fitted(offset, drift)
     assert 0.0 < found.stddev < 0.01
-    assert 0.0 < found.drift_stddev < 400e-6
-    assert found.at == pytest.approx(27.5, abs=10.0)
-    for at in (0.0, found.at, 60.0):
-        assert found.offset_at(at) == pytest.approx(offset + drift * at, abs=3 * found.stddev_at(at))
+    assert 0.0 < found.drift_stddev_ppm < 400.0
+    middle = found.anchor_ns / NANOSECONDS
+    assert middle == pytest.approx(27.5, abs=10.0)
+    for at in (0.0, middle, 60.0):
+        stddev = found.stddev_at(round(at * NANOSECONDS))
+        assert offset_at(found, at) == pytest.approx(offset + drift * at, abs=3 * stddev)
     for at in (0.0, 60.0):  # a third of a frame, half a minute away from the middle
-        assert found.offset_at(at) == pytest.approx(offset + drift * at, abs=0.011)
+        assert offset_at(found, at) == pytest.approx(offset + drift * at, abs=0.011)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.005, 0.013, 0.0167, 0.025])
@@ -133,41 +145,41 @@ def test_the_offset_does_not_follow_the_phase_of_the_frames(phase: float) -> Non
 def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
     plain, shifted = fitted(0.01, 0.0), fitted(0.01 + 0.05, 100e-6)
     for at, within in ((0.0, 0.008), (30.0, 0.005), (60.0, 0.008)):
-        assert shifted.offset_at(at) - plain.offset_at(at) == pytest.approx(0.05 + 100e-6 * at, abs=within)
+        assert offset_at(shifted, at) - offset_at(plain, at) == pytest.approx(0.05 + 100e-6 * at, abs=within)
 
 
 def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
     """The estimate is drawn to what they say, the less the more motion there was; to what cannot be, not at all."""
     for seconds in (15.0, 55.0):
         plain, drawn, other = (
-            fitted(0.02, 0.0, seconds, None if expected is None else ClockEstimate(expected, at=2.0))
+            fitted(0.02, 0.0, seconds, None if expected is None else known(expected, 0.0, 2.0))
             for expected in (None, -0.05, 0.5)
         )
         share = (plain.stddev / RECEIPT_PRIOR) ** 2
-        off = plain.offset_at(plain.at) - drawn.offset_at(plain.at)
+        off = (plain.offset_ns - drawn.offset_ns_at(plain.anchor_ns)) / NANOSECONDS
         assert 0.0 < off < 2.0 * share * (plain.offset + 0.05)
         assert other == plain
 
 
 def test_what_is_known_exactly_is_kept() -> None:
-    expected = ClockEstimate(0.03, 100e-6, 10.0, 1e-5, 1e-8)
+    expected = known(0.03, 100e-6, 10.0, 1e-5, 1e-8)
     found = fitted(0.02, 0.0, expected=expected)
     for at in (0.0, 60.0):
-        assert found.offset_at(at) == pytest.approx(expected.offset_at(at), abs=2e-5)
+        assert offset_at(found, at) == pytest.approx(offset_at(expected, at), abs=2e-5)
     assert found.stddev == pytest.approx(MIN_STDDEV, rel=0.01)
-    assert found.drift_stddev == pytest.approx(1e-8, rel=0.01)
+    assert found.drift_stddev_ppm == pytest.approx(1e-2, rel=0.01)
 
 
 def test_the_same_motion_again_says_no_more_of_the_offset_but_of_the_drift() -> None:
     once, often = fitted(0.02, 0.0), fitted(0.02, 0.0, repeated=10)
     floor = np.sqrt((once.stddev**2 - MIN_STDDEV**2) / 2.0 + MIN_STDDEV**2)  # after a minute half is common to all
     assert 0.95 * floor < often.stddev < once.stddev
-    assert often.drift_stddev < 0.5 * once.drift_stddev
+    assert often.drift_stddev_ppm < 0.5 * once.drift_stddev_ppm
 
 
 def test_an_offset_beyond_the_grid_is_no_answer() -> None:
-    fit = ClockFit(0.0)
+    fit = ClockFit(like=LIKE)
     own, theirs = seen(0.0, 0.0, 20.0, 4), seen(0.4, 0.0, 20.0, 5)
-    fit.add(10.0, own, theirs)
+    fit.add(10.0, joint_speeds(*own), joint_speeds(*theirs))
     assert fit.solve() is None
-    assert ClockFit(0.0).solve() is None
+    assert ClockFit().solve() is None

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.coverage import Coverage
-from body_tracking.calibration.pairwise import Pairs, agreeing, estimate, start_from_midline
+from body_tracking.calibration.pairwise import Pairs, estimate, same_sense, start_from_midline
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.skeleton import MIRROR, FloatArray
 from walkers import about_y, walk
@@ -125,8 +125,8 @@ def test_the_spine_alone_gives_a_start_whatever_the_labels() -> None:
 
 def test_agreement_is_about_the_sense_of_the_axis() -> None:
     body = walk(np.zeros(1))
-    assert agreeing(body, body).all()
-    assert not agreeing(body, body[:, MIRROR]).any()
+    assert same_sense(body, body).all()
+    assert not same_sense(body, body[:, MIRROR]).any()
 
 
 def test_too_few_pairs_and_contradicting_ones_are_refused() -> None:

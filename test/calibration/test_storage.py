@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorPose, SensorQuality, level_pose
+from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import load, save
+from body_tracking.clocks import ClockModel
 
 
 def example(seed: int = 0) -> CalibrationResult:

@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.pairwise import Pairs
-from body_tracking.calibration.turned import best_estimate, exchanged, half_turn_from, registration
+from body_tracking.calibration.turned import best_estimate, half_turn_from, registration, with_sides_swapped
 from body_tracking.skeleton import MIRROR, FloatArray, Joint
 from walkers import about_y, performed
 
@@ -58,13 +58,13 @@ def test_frames_are_exchanged_as_if_the_sensor_had_said_so() -> None:
     pairs = pairs_of("hair_combing", 0.0)
     pairs.variance[:, Joint.HAND_LEFT] = np.inf
     frames = np.arange(len(pairs)) % 2 == 0
-    other = exchanged(pairs, frames)
+    other = with_sides_swapped(pairs, frames)
     assert_array_equal(other.sensor[frames], pairs.sensor[frames][:, MIRROR])
     assert_array_equal(other.sensor[~frames], pairs.sensor[~frames])
     assert_array_equal(other.variance[~frames], pairs.variance[~frames])
     # a hand that one of them does not see is in no pair, whichever it is
     assert np.isinf(other.variance[frames][:, [Joint.HAND_LEFT, Joint.HAND_RIGHT]]).all()
-    assert_array_equal(exchanged(exchanged(pairs, frames), frames).sensor, pairs.sensor)
+    assert_array_equal(with_sides_swapped(with_sides_swapped(pairs, frames), frames).sensor, pairs.sensor)
 
 
 def test_nothing_known_is_no_estimate() -> None:

@@ -443,7 +443,7 @@ def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -
     worn = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05)
     estimator = ExtendedKalmanFilter()
     errors, covariances = followed(estimator, in_order(turned_away(person, 2.5, 5.0), worn.measure(person)), person)
-    assert estimator.counters["put_right"] > 60
+    assert estimator.counters["sides_swapped"] > 60
     assert np.degrees(np.abs(errors[:, 5]).max()) < 15.0
     assert rms(errors[:, 3:6]) < 1.5 * rms(followed_unturned(person, worn)[:, 3:6])
     assert np.linalg.eigvalsh(covariances[-1])[0] > 0.0
@@ -451,7 +451,7 @@ def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -
     # one that knows nothing but the camera cannot tell
     alone = ExtendedKalmanFilter()
     errors, _ = followed(alone, turned_away(person, 2.5, 5.0), person)
-    assert alone.counters["put_right"] == 0
+    assert alone.counters["sides_swapped"] == 0
     assert np.degrees(np.abs(errors[:, 5]).max()) > 90.0
 
 

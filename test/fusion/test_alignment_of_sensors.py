@@ -9,7 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
+from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.clocks import ClockModel
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import FusionError
 from body_tracking.measurement import joint_stddev

@@ -14,7 +14,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.online import OnlineCalibration
-from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
+from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.clocks import ClockModel
 from body_tracking.fusion.fusion import Fusion, FusionError, FusionParameters
 from body_tracking.fusion.sides import HOLD
 from body_tracking.measurement import left_right_axes

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
+from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.clocks import ClockModel
 from body_tracking.fusion.fusion import Fusion
 from body_tracking.fusion.people import People, Slots
 from body_tracking.fusion.people_fusion import PeopleFusion

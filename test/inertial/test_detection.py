@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.clock_correlation import Series
 from body_tracking.inertial.alignment import AlignmentError, pose_covariance, pose_rotations, yaw
-from body_tracking.inertial.clock import Turning
+from body_tracking.inertial.clock import turning
 from body_tracking.inertial.detection import (
     SLIP_TIME,
     SURE,
@@ -30,7 +31,7 @@ LEFT_RIGHT = [0, 3, 2, 1, 4]
 UPPER_LOWER = [0, 2, 1, 3, 4]
 
 
-def turnings(seed: int, noise: float) -> tuple[list[Turning], list[Turning]]:
+def turnings(seed: int, noise: float) -> tuple[list[Series], list[Series]]:
     """The rates of sensors and of bones: each limb moves in its own way, a forearm with its upper arm besides."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, 40.0, 0.02)
@@ -38,8 +39,8 @@ def turnings(seed: int, noise: float) -> tuple[list[Turning], list[Turning]]:
     own = np.array([np.interp(times, knots, np.abs(rng.normal(size=len(knots)))) for _ in WORN])
     own[2] += 0.7 * own[1]
     own[4] += 0.7 * own[3]
-    felt = [Turning(times, np.abs(each + noise * rng.normal(size=len(times)))) for each in own]
-    seen = [Turning(times[::2], np.abs(each[::2] + noise * rng.normal(size=len(times[::2])))) for each in own]
+    felt = [turning(times, np.abs(each + noise * rng.normal(size=len(times)))) for each in own]
+    seen = [turning(times[::2], np.abs(each[::2] + noise * rng.normal(size=len(times[::2])))) for each in own]
     return felt, seen
 
 

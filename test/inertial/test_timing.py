@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from body_tracking.clocks import ReceiptClock
 from body_tracking.inertial.parameters import OWN, REFERENCE, SHARED
 from body_tracking.inertial.timing import SensorClocks
-from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.skeleton import NANOSECONDS
 
 OFFSETS = st.integers(-(10**12), 10**12)

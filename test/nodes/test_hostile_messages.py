@@ -28,7 +28,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
-from body_tracking.calibration.result import ClockModel, level_pose  # noqa: E402
+from body_tracking.calibration.result import level_pose  # noqa: E402
+from body_tracking.clocks import ClockModel  # noqa: E402
 from body_tracking.kinematics.tracking import angle_names  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds  # noqa: E402

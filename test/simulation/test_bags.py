@@ -14,8 +14,9 @@ import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking import graph
-from body_tracking.calibration.result import ClockModel, SensorPose
+from body_tracking.calibration.result import SensorPose
 from body_tracking.cli import main
+from body_tracking.clocks import ClockModel
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import left_right_axes
 from body_tracking.messages.base import (

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import cumulative_trapezoid
 
-from body_tracking.calibration.result import ClockModel
+from body_tracking.clocks import ClockModel
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.simulation.imu_errors import (

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from standing import HANGING, flesh, placed, standing
 
-from body_tracking.calibration.result import ClockModel, SensorPose, level_pose
+from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.clocks import ClockModel
 from body_tracking.sensors import RecordedFrame
 from body_tracking.simulation.kinect import (
     KinectErrors,

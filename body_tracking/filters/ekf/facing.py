@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.model import Posture
-from body_tracking.sides import agree, headings_of, put_right
+from body_tracking.sides import headings_of, reversed_halves, swap_left_right
 from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 
 _IMPROBABLE = 20.0
@@ -35,7 +34,7 @@ class Facing:
 
     Args:
         space: of the states.
-        counters: of the filter; counts ``put_right``.
+        counters: of the filter; counts ``sides_swapped``.
     """
 
     def __init__(self, space: StateSpace, counters: dict[str, int]) -> None:
@@ -48,7 +47,7 @@ class Facing:
             if limb in _LIMBS
         }
 
-    def put_right(self, state: State, skeleton: Skeleton) -> tuple[State, Skeleton]:
+    def corrected(self, state: State, skeleton: Skeleton) -> tuple[State, Skeleton]:
         """A frame with left and right as they are believed.
 
         Args:
@@ -66,16 +65,16 @@ class Facing:
         posture = self._space.model.forward(state.q, state.lengths)
         expected = np.full((N_JOINTS, 3), np.nan)
         expected[self._space.model.joints] = posture.positions
-        believed, seen = headings_of(expected), headings_of(skeleton.positions)
-        if agree(seen, believed):
+        halves = reversed_halves(headings_of(skeleton.positions), headings_of(expected))
+        if not halves:
             return state, skeleton
         doubt = state.doubt + self._evidence(posture, state.sources.segments[speaking], skeleton)
         state = state.but(doubt=max(doubt, 0.0))
         if doubt > _DOUBTED or self._is_improbable(state):
             return state, skeleton
-        self._counters["put_right"] += 1
+        self._counters["sides_swapped"] += 1
         points, states, factors = skeleton.positions.copy(), skeleton.states.copy(), np.ones(N_JOINTS)
-        put_right(seen, believed, points, factors, states, Counter())
+        swap_left_right(halves, points, factors, states)
         states[np.isinf(factors)] = 0
         covariances = skeleton.covariances
         if covariances is not None:

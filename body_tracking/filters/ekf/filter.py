@@ -75,7 +75,7 @@ class ExtendedKalmanFilter:
                 "orientations_late",
                 "orientations_refused",
                 "slips",
-                "put_right",
+                "sides_swapped",
             ),
             0,
         )
@@ -467,7 +467,7 @@ class ExtendedKalmanFilter:
             state = state.but(seen=SegmentLengths(self.parameters.slow_time))
         state = self._motion.predicted(state, measurement.stamp_ns)
         if state.sources.names:
-            state, skeleton = self._facing.put_right(state, measurement.skeleton)
+            state, skeleton = self._facing.corrected(state, measurement.skeleton)
             if skeleton is not measurement.skeleton:
                 measurement = self._measurement(skeleton, measurement.sensor)
             measurement = self._orientations.without_thumbs(state, measurement)
