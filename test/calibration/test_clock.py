@@ -74,10 +74,14 @@ def test_a_likely_correlation_is_no_more_than_the_correlation(offset: float) -> 
         assert short.correlation - short.likely > long.correlation - long.likely > 0.0
 
 
-def test_too_little_overlap_is_no_answer() -> None:
+def test_too_little_overlap_and_an_offset_beyond_the_grid_are_no_answer() -> None:
     a, b = seen(0.0, 0.0, 12.0, 1), seen(0.0, 0.0, 12.0, 2)
     assert correlate_clocks((a[0][:5], a[1][:5]), b, 0.0, 3.0) is None
     assert correlate_clocks((a[0][:40], a[1][:40]), (b[0][300:], b[1][300:]), 0.0, 0.5) is None
+    fit = ClockFit(0.0)
+    assert fit.solve() is None
+    fit.add(10.0, seen(0.0, 0.0, 20.0, 4), seen(0.4, 0.0, 20.0, 5))
+    assert fit.solve() is None
 
 
 def fitted(
@@ -130,12 +134,6 @@ def test_the_offset_does_not_follow_the_phase_of_the_frames(phase: float) -> Non
     assert abs(found.offset) < min(0.005, found.stddev)
 
 
-def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
-    plain, shifted = fitted(0.01, 0.0), fitted(0.01 + 0.05, 100e-6)
-    for at, within in ((0.0, 0.008), (30.0, 0.005), (60.0, 0.008)):
-        assert shifted.offset_at(at) - plain.offset_at(at) == pytest.approx(0.05 + 100e-6 * at, abs=within)
-
-
 def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
     """The estimate is drawn to what they say, the less the more motion there was; to what cannot be, not at all."""
     for seconds in (15.0, 55.0):
@@ -163,11 +161,3 @@ def test_the_same_motion_again_says_no_more_of_the_offset_but_of_the_drift() -> 
     floor = np.sqrt((once.stddev**2 - MIN_STDDEV**2) / 2.0 + MIN_STDDEV**2)  # after a minute half is common to all
     assert 0.95 * floor < often.stddev < once.stddev
     assert often.drift_stddev < 0.5 * once.drift_stddev
-
-
-def test_an_offset_beyond_the_grid_is_no_answer() -> None:
-    fit = ClockFit(0.0)
-    own, theirs = seen(0.0, 0.0, 20.0, 4), seen(0.4, 0.0, 20.0, 5)
-    fit.add(10.0, own, theirs)
-    assert fit.solve() is None
-    assert ClockFit(0.0).solve() is None

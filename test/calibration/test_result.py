@@ -20,13 +20,10 @@ STAMPS = st.integers(0, 2_000_000_000 * NANOSECONDS)
     st.integers(0, 3600 * NANOSECONDS),
 )
 def test_a_clock_converts_back_and_forth_to_a_nanosecond(anchor: int, offset: int, drift: float, elapsed: int) -> None:
+    """Without drift exactly, even since an epoch."""
     clock = ClockModel(offset, drift, anchor)
     assert abs(clock.to_reference(clock.to_sensor(anchor + elapsed)) - (anchor + elapsed)) <= 1
-
-
-@given(STAMPS, st.integers(-2_000_000_000, 2_000_000_000))
-def test_without_drift_not_a_nanosecond_is_lost_even_since_an_epoch(stamp: int, offset: int) -> None:
-    assert ClockModel(offset, 0.0, 0).to_reference(stamp + offset) == stamp
+    assert ClockModel(offset, 0.0, 0).to_reference(anchor + offset) == anchor
 
 
 def test_a_fast_clock_runs_ahead() -> None:
@@ -62,12 +59,6 @@ def test_the_reference_sensor_looks_along_x_with_z_up() -> None:
     assert_allclose(pose.apply(np.array([0.0, 0.0, 2.0])), [2.0, 0.0, 0.9], atol=1e-12)  # forward
     assert_allclose(pose.apply(np.array([1.0, 0.0, 0.0])), [0.0, -1.0, 0.9], atol=1e-12)  # right
     assert_allclose(pose.apply(np.array([0.0, 1.0, 0.0])), [0.0, 0.0, -0.1], atol=1e-12)  # down
-
-
-def test_a_sensor_that_looks_down_sees_the_floor_ahead() -> None:
-    ahead = level_pose("kinect1", pitch=0.3).apply(np.array([0.0, 0.0, 2.0]))
+    ahead = level_pose("kinect1", pitch=0.3).apply(np.array([0.0, 0.0, 2.0]))  # looks down: at the floor ahead
     assert_allclose(ahead, [2.0 * np.cos(0.3), 0.0, -2.0 * np.sin(0.3)], atol=1e-12)
-
-
-def test_a_sensor_rolled_clockwise_sees_its_right_lower() -> None:
-    assert level_pose("kinect1", roll=0.2).apply(np.array([1.0, 0.0, 0.0]))[2] < 0.0
+    assert level_pose("kinect1", roll=0.2).apply(np.array([1.0, 0.0, 0.0]))[2] < 0.0  # clockwise: its right is lower

@@ -10,7 +10,6 @@ import pytest
 from body_tracking.calibration.joint_centres import LEARNT, turned
 from body_tracking.filters import SkeletonFilter, make_filter, smoother
 from body_tracking.filters.ekf import EkfParameters
-from body_tracking.filters.linear import FilterError
 from body_tracking.filters.smoother import Smoothed, smooth
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.measurement import BASE_STDDEV
@@ -192,10 +191,3 @@ def test_a_recording_is_smoothed_in_sections_as_in_one(
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=tolerance)
-
-
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("bad", [1, "yes", None])
-def test_it_is_on_or_off(name: str, bad: object) -> None:
-    with pytest.raises(FilterError, match="t_pose"):
-        make_filter(name, t_pose=bad)
