@@ -217,14 +217,6 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
     truth = somebody(2, 8.0)
     estimator = ExtendedKalmanFilter(EkfParameters(settle_time=4.0))
     found = []
-    bones = {
-        "upper_arm_left": (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
-        "forearm_right": (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
-        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
-        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-        "clavicle_right": (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
-        "head": (Joint.NECK, Joint.HEAD),
-    }
     for skeleton in measured(truth).skeletons:
         output = estimator.update(skeleton)
         if output is None:
@@ -233,9 +225,6 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
         assert_allclose(
             output.positions[POINTS], MODEL.forward(estimate.q, estimate.lengths).positions, rtol=0.0, atol=1e-12
         )
-        for name, (start, end) in bones.items():
-            length = np.linalg.norm(output.positions[end] - output.positions[start])
-            assert_allclose(length, estimate.lengths[MODEL.length_names.index(name)], rtol=0.0, atol=1e-9)
         found.append((skeleton.stamp_ns, estimate.lengths))
     settled = np.stack([lengths for stamp_ns, lengths in found if stamp_ns > START_NS + 4.2 * NANOSECONDS])
     assert len(settled) > 100
@@ -635,59 +624,36 @@ def test_outliers_hardly_matter() -> None:
     assert max(bad) < np.sqrt(3.0) * NOISE
 
 
-DAMAGES = (
-    "nan_positions",
-    "infinite_positions",
-    "far_positions",
-    "everything_nan",
-    "nothing_tracked",
-    "nan_covariances",
-    "zero_covariances",
-    "negative_covariances",
-    "infinite_covariances",
-    "huge_covariances",
-    "tiny_covariances",
-)
-
-
-def damaged(skeleton: Skeleton, damage: str, rng: np.random.Generator) -> Skeleton:
+def damaged(skeleton: Skeleton, field: str, value: float, rng: np.random.Generator) -> Skeleton:
     some = rng.random(N_JOINTS) < 0.3
-    positions, states = skeleton.positions.copy(), skeleton.states.copy()
-    values = {
-        "nan_positions": np.nan,
-        "infinite_positions": -np.inf,
-        "far_positions": rng.choice([150.0, -1e6, 1e300]),
-        "nan_covariances": np.nan,
-        "zero_covariances": 0.0,
-        "negative_covariances": -1e-3,
-        "infinite_covariances": np.inf,
-        "huge_covariances": 1e12,
-        "tiny_covariances": 1e-15,
-    }
-    if damage.endswith("covariances"):
+    if field == "covariances":
         covariances = np.tile(NOISE**2 * np.eye(3), (N_JOINTS, 1, 1))
-        covariances[some] *= values[damage] / NOISE**2
+        covariances[some] *= value / NOISE**2
         return replace(skeleton, covariances=covariances)
-    if damage == "everything_nan":
-        positions[:] = np.nan
-    elif damage == "nothing_tracked":
-        states[:] = TrackingState.NOT_TRACKED
-    else:
-        positions[some, rng.integers(3)] = values[damage]
-    return replace(skeleton, positions=positions, states=states)
+    positions = skeleton.positions.copy()
+    positions[some, rng.integers(3)] = value
+    return replace(skeleton, positions=positions)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_numbers_do_no_harm(damage: str) -> None:
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("positions", value) for value in (np.nan, -np.inf, 150.0, -1e6, 1e300)]
+    + [("covariances", value) for value in (np.nan, 0.0, -1e-3, np.inf, 1e12, 1e-15)]
+    + [("all positions", np.nan), ("all states", TrackingState.NOT_TRACKED)],
+)
+def test_damaged_numbers_do_no_harm(field: str, value: float) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
     truth = somebody(70, 1.8)
     rng = np.random.default_rng(1)
+    skeletons = list(measured(truth).skeletons)
+    for k in range(0, len(skeletons), 3):
+        whole = field.removeprefix("all ")
+        if whole == field:
+            skeletons[k] = damaged(skeletons[k], field, value, rng)
+        else:
+            skeletons[k] = replace(skeletons[k], **{whole: np.full_like(getattr(skeletons[k], whole), value)})
     estimator = ExtendedKalmanFilter()
-    skeletons = [
-        damaged(skeleton, damage, rng) if k % 3 == 0 else skeleton
-        for k, skeleton in enumerate(measured(truth).skeletons)
-    ]
     outputs = run(estimator, skeletons)
     assert_sound(outputs, estimator)
     assert rms(errors_of(outputs, truth)) < np.sqrt(3.0) * NOISE

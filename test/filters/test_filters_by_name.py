@@ -23,6 +23,7 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.linear import LINEAR_MODELS, FilterError
 from body_tracking.filters.prediction import PERIOD_NS, Prediction
+from body_tracking.measurement import BASE_STDDEV
 from body_tracking.parameters import check_all, fields_of, parameters_from
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 from walkers import TRACKED, performed
@@ -79,15 +80,23 @@ def test_the_names_alone_cost_no_scipy() -> None:
 
 # --- stamps
 
+STATED = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
 FRAMES = [
-    Skeleton(100 * NANOSECONDS + k * NANOSECONDS // 30, "world", positions, TRACKED)
+    Skeleton(
+        100 * NANOSECONDS + k * NANOSECONDS // 30,
+        "world",
+        positions,
+        TRACKED,
+        0,
+        BASE_STDDEV[:, None, None] ** 2 * np.eye(3),
+    )
     for k, positions in enumerate(performed("two_handed_wave")[:60])
 ]
-"""A T-pose of two seconds, which the thesis's extended filter starts from."""
+"""A T-pose of two seconds, which the thesis's extended filter starts from, and from which others learn offsets."""
 
 
-def fed(name: str, frames: Iterable[Skeleton] = ()) -> SkeletonFilter:
-    tested = make_filter(name)
+def fed(name: str, frames: Iterable[Skeleton] = (), **parameters: object) -> SkeletonFilter:
+    tested = make_filter(name, **parameters)
     for each in frames:
         tested.update(each)
     return tested
@@ -111,7 +120,10 @@ ANEW = {"backward_jumps": (-50, "world"), "frame_changes": (2, "map"), "gaps": (
 )
 def test_it_starts_anew_as_a_fresh_one(name: str, cause: str) -> None:
     later, frame_id = ANEW[cause]
-    tested, fresh = fed(name, FRAMES), fed(name)
+    # after a gap it is still the same person, whose joints are where a T-pose has told
+    parameters = {"t_pose": False} if cause == "gaps" else {}
+    tested, fresh = fed(name, FRAMES, **parameters), fed(name, **parameters)
+    assert tested.counters.get("t_poses", 1) == (cause != "gaps")
     counted = dict(tested.counters)
     if cause == "reset":
         tested.reset()

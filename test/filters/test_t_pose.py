@@ -126,21 +126,6 @@ def test_who_is_not_seen_for_a_moment_need_not_hold_the_pose_again(name: str) ->
     assert rms(errors) < 0.4 * rms(untaught(name))
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_somebody_else_has_other_joints(name: str) -> None:
-    tested = make_filter(name)
-    for each in skeletons()[:120]:
-        tested.update(each)
-    assert tested.counters["t_poses"] == 1
-    tested.reset()
-    errors = []
-    for seen, true in zip(skeletons()[150:], reaching()[150:], strict=True):
-        out = tested.update(seen)
-        if out is not None:
-            errors.append(off(out, true)[ELBOWS])
-    assert rms(np.degrees(errors)) > 0.8 * rms(untaught(name))
-
-
 def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
     ekf, _, _ = taught("ekf")
     lengths = ekf.estimate.lengths  # type: ignore[attr-defined]

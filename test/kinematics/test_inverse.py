@@ -11,6 +11,7 @@ from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
+from body_tracking.skeleton import BONES as SKELETON_BONES
 from body_tracking.skeleton import BoolArray, FloatArray, Joint
 from draws import draws, some
 
@@ -18,18 +19,8 @@ INVERSE = InverseKinematics(MODEL)
 RANGES = Ranges(MODEL)
 NAMES = MODEL.coordinate_names
 MILLIMETRE = 1e-3
-BONES = (
-    (Joint.SPINE_BASE, Joint.SPINE_MID),
-    (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT),
-    (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
-    (Joint.ELBOW_LEFT, Joint.WRIST_LEFT),
-    (Joint.WRIST_LEFT, Joint.HAND_LEFT),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
-    (Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT),
-    (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
-    (Joint.WRIST_RIGHT, Joint.HAND_RIGHT),
-)
+OF_ARMS_AND_TRUNK = [joint for joint in Joint if joint.name.split("_")[0] in ("SPINE", "SHOULDER", "ELBOW", "WRIST")]
+BONES = [bone for bone in SKELETON_BONES if set(bone) <= {*OF_ARMS_AND_TRUNK, Joint.HAND_LEFT, Joint.HAND_RIGHT}]
 EXACT = np.full(len(MODEL.joints), 1e-4)
 """Metres: a noise that leaves the ranges of motion nothing to say."""
 
