@@ -35,7 +35,7 @@ from body_tracking.inertial.alignment import (
     wrapped,
 )
 from body_tracking.inertial.angles import SegmentAngles
-from body_tracking.inertial.clock import Turning, clock_offset
+from body_tracking.inertial.clock import clock_offset, turning_of_sensor
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.upper_body import UpperBody
@@ -75,20 +75,19 @@ def read_two_arm(path: Path) -> tuple[Stream, Stream]:
 def two_arm(path: Path) -> dict[str, Any]:
     """Clock and return to the T-pose."""
     upper, lower = read_two_arm(path)
-    found = clock_offset(Turning.of_sensor(upper.stamps, upper.rates), Turning.of_sensor(lower.stamps, lower.rates))
+    found = clock_offset(turning_of_sensor(upper.stamps, upper.rates), turning_of_sensor(lower.stamps, lower.rates))
     figures: dict[str, Any] = {"clock_found": found is not None}
     if found is None:
         return figures
     figures |= {
         "offset_s": found.offset,
         "offset_error_s": found.offset - TRUE_OFFSET_S,
-        "offset_stddev_s": found.offset_stddev,
-        "drift_ppm": 1e6 * found.drift,
-        "drift_stddev_ppm": 1e6 * found.drift_stddev,
-        "correlation": found.correlation,
-        "next_best": found.rival,
+        "offset_stddev_s": found.stddev,
+        "drift_ppm": found.drift_ppm,
+        "drift_stddev_ppm": found.drift_stddev_ppm,
     }
-    streams = (upper, Stream(lower.segment, found.to_reference(lower.stamps), lower.rotations, lower.rates))
+    stamps = [found.to_reference(round(stamp * NANOSECONDS)) / NANOSECONDS for stamp in lower.stamps.tolist()]
+    streams = (upper, Stream(lower.segment, np.array(stamps), lower.rotations, lower.rates))
     figures["still_periods"] = len(still_periods(streams))
     segments = [stream.segment for stream in streams]
     begin = max(stream.stamps[0] for stream in streams)
@@ -249,8 +248,7 @@ def show_two_arm(figures: dict[str, Any]) -> None:
     print(
         f"  clock offset {figures['offset_s']:.4f} +- {figures['offset_stddev_s']:.4f} s, "
         f"{1e3 * figures['offset_error_s']:+.1f} ms off (bar {1e3 * CLOCK_BAR_S:.0f}); "
-        f"drift {figures['drift_ppm']:+.0f} +- {figures['drift_stddev_ppm']:.0f} ppm; "
-        f"correlation {figures['correlation']:.3f}, next best {figures['next_best']:.3f}"
+        f"drift {figures['drift_ppm']:+.0f} +- {figures['drift_stddev_ppm']:.0f} ppm"
     )
     print(f"  still periods: {figures['still_periods']}, so the T-pose is taken at the first 0.1 s")
     for segment in ("upper_arm_right", "forearm_right"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise, product
@@ -40,9 +40,15 @@ def recording(path: Path) -> tuple[tuple[str, Skeleton, int], ...]:
 
 
 def run(
-    frames: tuple[tuple[str, Skeleton, int], ...], change: Change | None = None, **parameters: object
+    frames: Iterable[tuple[str, Skeleton, int]],
+    change: Change | None = None,
+    saved: CalibrationResult | None = None,
+    **parameters: object,
 ) -> tuple[OnlineCalibration, list[CalibrationUpdate]]:
+    """The calibration after the frames, some of kinect2's changed, and its updates; what was saved is loaded before."""
     calibration = OnlineCalibration(("kinect1", "kinect2"), CalibrationParameters(**parameters))
+    if saved is not None:
+        calibration.load(saved)
     updates = []
     for sensor, skeleton, received in frames:
         if change is not None and sensor == "kinect2":
@@ -189,9 +195,13 @@ def _walked(seconds: float) -> OnlineCalibration:
     return run(stream(seconds))[0]
 
 
-def saved_after(seconds: float = 20.0) -> CalibrationResult:
-    """What so many seconds of the walk told."""
-    return _walked(seconds).result()
+def saved_after(seconds: float = 20.0, turned: float = 0.0) -> CalibrationResult:
+    """What so many seconds of the walk told; with kinect2 turned since, degrees about the vertical."""
+    saved = _walked(seconds).result()
+    pose = saved.poses["kinect2"]
+    rotation = Rotation.from_euler("z", turned, degrees=True) * Rotation.from_quat(pose.quat_xyzw)
+    saved.poses["kinect2"] = replace(pose, quat_xyzw=rotation.as_quat())
+    return saved
 
 
 def yaw_error(result: CalibrationResult) -> float:
@@ -228,16 +238,8 @@ def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned
 
 
 def test_a_pose_half_a_turn_off_is_put_right_at_once() -> None:
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    saved = saved_after(15.0)
-    pose = saved.poses["kinect2"]
-    saved.poses["kinect2"] = replace(
-        pose, quat_xyzw=(Rotation.from_euler("z", 175, degrees=True) * Rotation.from_quat(pose.quat_xyzw)).as_quat()
-    )
-    calibration.load(saved)
-    for sensor, skeleton, received in stream(15.0):
-        for update in calibration.push(sensor, skeleton, received):
-            assert not 5.0 < yaw_error(update.result) < 170.0
+    calibration, updates = run(stream(15.0), saved=saved_after(15.0, turned=175.0))
+    assert not any(5.0 < yaw_error(update.result) < 170.0 for update in updates)
     assert yaw_error(calibration.current_update().result) < 5.0
 
 
@@ -306,17 +308,13 @@ def test_an_update_holds_only_after_it_was_made() -> None:
             assert {pose.valid_from_ns for pose in update.result.poses.values()} == {update.valid_from_ns}
 
 
-def test_one_sensor_only_still_gives_the_world() -> None:
+def test_one_sensor_only_still_gives_the_world_and_one_that_sees_nobody_stays_uncalibrated() -> None:
     calibration = OnlineCalibration(("kinect1",))
     assert calibration.current_update().result.poses.keys() == {"kinect1"}
     for sensor, skeleton, received in stream(5.0):
         assert calibration.push(sensor, skeleton, received) == []  # kinect2 is nobody
     assert calibration.status()[0] == 0
-
-
-def test_a_sensor_that_sees_nobody_stays_uncalibrated() -> None:
-    only_one = tuple(each for each in stream(10.0) if each[0] == "kinect1")
-    calibration, _ = run(only_one)
+    calibration, _ = run(each for each in stream(10.0) if each[0] == "kinect1")
     assert "kinect2" not in calibration.result().poses
     level, line, _ = calibration.status()
     assert level == 1
@@ -325,22 +323,15 @@ def test_a_sensor_that_sees_nobody_stays_uncalibrated() -> None:
 
 def test_a_saved_calibration_holds_until_a_better_one() -> None:
     first = saved_after()
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    calibration.load(first)
-    held = calibration.current_update().result
+    held = run((), saved=first)[0].current_update().result
     assert_allclose(held.poses["kinect2"].translation, first.poses["kinect2"].translation)
-    updates: list[CalibrationUpdate] = []
-    for sensor, skeleton, received in stream(4.0):  # standing still tells less than what was loaded
-        updates += calibration.push(sensor, skeleton, received)
+    _, updates = run(stream(4.0), saved=first)  # standing still tells less than what was loaded
     for update in updates:
         assert_allclose(update.result.poses["kinect2"].translation, first.poses["kinect2"].translation, atol=1e-9)
 
 
 def test_a_saved_clock_of_another_session_is_not_believed() -> None:
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    calibration.load(saved_after())
-    for sensor, skeleton, received in stream(20.0, offset=-30.0):
-        calibration.push(sensor, skeleton, received)
+    calibration, _ = run(stream(20.0, offset=-30.0), saved=saved_after())
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
 
 
@@ -383,20 +374,19 @@ def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) ->
     """Even by less than the times of receipt can tell."""
     saved = saved_after(30.0)
     saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    calibration.load(saved)
-    for sensor, skeleton, received in stream(float(draws(25, 40)), offset=offset):
-        calibration.push(sensor, skeleton, received)
+    calibration, _ = run(stream(float(draws(25, 40)), offset=offset), saved=saved)
     assert sum("was set since" in event for event in calibration.events) == 1
     result = calibration.result()
     within = 3.0 * result.quality["kinect2"].clock_stddev
     assert result.clocks["kinect2"].offset == pytest.approx(offset, abs=within)
 
 
-def test_a_bag_that_loops_says_no_more_of_the_clock_the_second_time() -> None:
-    frames = stream(20.0)
+def test_a_bag_that_loops_keeps_the_poses_and_says_no_more_of_the_clock() -> None:
     once = saved_after()
-    twice = run((*frames, *frames))[0].result()
+    calibration, _ = run((*stream(20.0), *stream(20.0)))
+    twice = calibration.result()
+    assert any("went back" in event for event in calibration.events)
+    assert Rotation.from_matrix(between(twice)[0] @ between(once)[0].T).magnitude() < np.radians(0.5)
     assert twice.quality["kinect2"].clock_stddev == pytest.approx(once.quality["kinect2"].clock_stddev, rel=0.05)
     assert twice.clocks["kinect2"].offset == pytest.approx(once.clocks["kinect2"].offset, abs=0.001)
 
@@ -416,14 +406,7 @@ def test_a_clock_that_drifts_far_is_followed() -> None:
 
 
 def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:
-    calibration = OnlineCalibration(("kinect1", "kinect2"))
-    saved = saved_after()
-    pose = saved.poses["kinect2"]
-    turned = Rotation.from_euler("z", 20, degrees=True) * Rotation.from_quat(pose.quat_xyzw)
-    saved.poses["kinect2"] = replace(pose, quat_xyzw=turned.as_quat())
-    calibration.load(saved)
-    for sensor, skeleton, received in stream(20.0):
-        calibration.push(sensor, skeleton, received)
+    calibration, _ = run(stream(20.0), saved=saved_after(turned=20.0))
     assert any("does not stand where" in event for event in calibration.events)
     assert yaw_error(calibration.finish()) < 1.0
 
@@ -444,15 +427,6 @@ def test_services_start_anew_and_reset() -> None:
     calibration.reset()
     assert "kinect2" not in calibration.result().poses
     assert calibration.status()[0] == 1
-
-
-def test_a_bag_that_loops_keeps_the_poses_and_starts_the_clock_again() -> None:
-    calibration, _ = run(stream(15.0))
-    before = between(calibration.result())[0]
-    for sensor, skeleton, received in stream(15.0):
-        calibration.push(sensor, skeleton, received)
-    assert any("went back" in event for event in calibration.events)
-    assert Rotation.from_matrix(between(calibration.result())[0] @ before.T).magnitude() < np.radians(0.5)
 
 
 def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str, Skeleton, int]]:

@@ -15,10 +15,14 @@ from walkers import performed
 
 @given(st.integers(0, 2**32 - 1))
 def test_recovers_any_rigid_motion(seed: int) -> None:
+    """Points without weight do not count."""
     rng = np.random.default_rng(seed)
     source = rng.normal(size=(12, 3))
     rotation, translation = Rotation.random(None, rng).as_matrix(), rng.normal(size=3)
-    found, moved = rigid_registration(source @ rotation.T + translation, source, rng.uniform(0.1, 1.0, 12))
+    target, weights = source @ rotation.T + translation, rng.uniform(0.1, 1.0, 12)
+    target[0] += 100.0
+    weights[0] = 0.0
+    found, moved = rigid_registration(target, source, weights)
     assert_allclose(found, rotation, atol=1e-9)
     assert_allclose(moved, translation, atol=1e-9)
 
@@ -37,18 +41,6 @@ def test_a_noisy_t_pose_is_never_reflected() -> None:
         u, _, vt = np.linalg.svd((target - target.mean(0)).T @ (source - source.mean(0)))
         reflected += np.linalg.det(u @ vt) < 0.0
     assert reflected > 0  # the case occurs in this sample
-
-
-def test_points_without_weight_do_not_count() -> None:
-    rng = np.random.default_rng(2)
-    source = rng.normal(size=(10, 3))
-    target = source + [1.0, 2.0, 3.0]
-    target[0] += 100.0
-    weights = np.ones(10)
-    weights[0] = 0.0
-    rotation, translation = rigid_registration(target, source, weights)
-    assert_allclose(rotation, np.eye(3), atol=1e-12)
-    assert_allclose(translation, [1.0, 2.0, 3.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("points", [np.zeros((2, 3)), np.outer(np.arange(5.0), [1.0, 2.0, 3.0]), np.ones((5, 3))])

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from estimates import assert_same, known
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from bent_hands import hand_columns, turned_over
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
-from body_tracking.filters.linear import FilterError
 from body_tracking.kinematics.conventions import angles_of
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
@@ -38,6 +39,7 @@ from body_tracking.skeleton import (
     N_JOINTS,
     NANOSECONDS,
     FloatArray,
+    IntArray,
     Joint,
     Skeleton,
     TrackingState,
@@ -85,23 +87,11 @@ def rms(errors: FloatArray) -> float:
     return float(np.sqrt((errors**2).mean()))
 
 
-def known(estimator: ExtendedKalmanFilter) -> ModelEstimate:
-    estimate = estimator.estimate
-    assert estimate is not None
-    return estimate
-
-
 def stddevs(skeleton: Skeleton) -> FloatArray:
     """(19,) metres: greatest standard deviation over the axes."""
     assert skeleton.covariances is not None
     result: FloatArray = np.sqrt(np.linalg.eigvalsh(skeleton.covariances[POINTS])[:, -1])
     return result
-
-
-def assert_same(one: ModelEstimate, other: ModelEstimate, tolerance: float) -> None:
-    assert one.stamp_ns == other.stamp_ns
-    for name in ("q", "velocity", "covariance", "lengths", "lengths_stddev"):
-        assert_allclose(getattr(one, name), getattr(other, name), rtol=0.0, atol=tolerance, err_msg=name)
 
 
 def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFilter) -> None:
@@ -191,8 +181,12 @@ def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again(
 
 
 def test_its_uncertainty_is_true() -> None:
-    """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees."""
+    """The normalised estimation error squared of the observed coordinates is chi-square with as many degrees.
+
+    So are normalised innovations.
+    """
     for_angles, for_points, for_lengths = [], [], []
+    distance, dimension, frames = 0.0, 0, 0
     for seed in range(draws(2, 10)):
         truth = somebody(20 + seed, 6.0)
         observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
@@ -201,6 +195,9 @@ def test_its_uncertainty_is_true() -> None:
             output = estimator.update(skeleton)
             if output is None or truth.times[k] < SETTLED:
                 continue
+            distance += estimator.innovation_distance
+            dimension += estimator.innovation_dimension
+            frames += 1
             estimate = known(estimator)
             error = MODEL.difference(estimate.q, truth.q[k])[OBSERVED]
             for_angles.append(error @ np.linalg.solve(estimate.covariance[np.ix_(OBSERVED, OBSERVED)], error))
@@ -212,18 +209,7 @@ def test_its_uncertainty_is_true() -> None:
     assert 0.5 < np.mean(for_angles) / len(OBSERVED) < 1.6, np.mean(for_angles) / len(OBSERVED)
     assert 0.5 < np.mean(for_points) / 3.0 < 1.6, np.mean(for_points) / 3.0
     assert 0.3 < np.mean(for_lengths) < 2.5, for_lengths
-
-
-def test_innovations_are_as_large_as_expected() -> None:
-    truth = somebody(30, 6.0)
-    estimator = ExtendedKalmanFilter()
-    distance, dimension = 0.0, 0
-    for skeleton, time in zip(measured(truth).skeletons, truth.times, strict=True):
-        estimator.update(skeleton)
-        if time >= SETTLED:
-            distance += estimator.innovation_distance
-            dimension += estimator.innovation_dimension
-    assert dimension > 0.95 * 57 * (truth.times >= SETTLED).sum()
+    assert dimension > 0.95 * 57 * frames
     assert 0.8 < distance / dimension < 1.25
 
 
@@ -231,14 +217,6 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
     truth = somebody(2, 8.0)
     estimator = ExtendedKalmanFilter(EkfParameters(settle_time=4.0))
     found = []
-    bones = {
-        "upper_arm_left": (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
-        "forearm_right": (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
-        "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
-        "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-        "clavicle_right": (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
-        "head": (Joint.NECK, Joint.HEAD),
-    }
     for skeleton in measured(truth).skeletons:
         output = estimator.update(skeleton)
         if output is None:
@@ -247,9 +225,6 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
         assert_allclose(
             output.positions[POINTS], MODEL.forward(estimate.q, estimate.lengths).positions, rtol=0.0, atol=1e-12
         )
-        for name, (start, end) in bones.items():
-            length = np.linalg.norm(output.positions[end] - output.positions[start])
-            assert_allclose(length, estimate.lengths[MODEL.length_names.index(name)], rtol=0.0, atol=1e-9)
         found.append((skeleton.stamp_ns, estimate.lengths))
     settled = np.stack([lengths for stamp_ns, lengths in found if stamp_ns > START_NS + 4.2 * NANOSECONDS])
     assert len(settled) > 100
@@ -307,29 +282,26 @@ def test_another_person_of_another_size_is_learnt_anew() -> None:
     assert_allclose(known(estimator).lengths, 0.65 * truth.lengths, rtol=0.0, atol=0.02)
 
 
-def test_it_does_not_depend_on_the_origin_of_world() -> None:
-    truth = somebody(3, 3.0)
-    origin = np.array([-3.0, 5.0, 0.7])
+ORIGIN = np.array([-3.0, 5.0, 0.7])
+
+
+@pytest.mark.parametrize(
+    ("signs", "order", "origin"),
+    [([1.0, 1.0, 1.0], np.arange(N_JOINTS), ORIGIN), ([1.0, -1.0, 1.0], MIRROR, np.zeros(3))],
+    ids=["another origin of world", "mirrored"],
+)
+def test_it_depends_neither_on_the_origin_of_world_nor_on_the_side(
+    signs: list[float], order: IntArray, origin: FloatArray
+) -> None:
     here, there = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for skeleton in measured(truth, outliers=0.02).skeletons:
+    for skeleton in measured(somebody(3, 3.0), outliers=0.02).skeletons:
         one = here.update(skeleton)
-        other = there.update(replace(skeleton, positions=skeleton.positions + origin))
+        moved = skeleton.positions[order] * signs + origin
+        other = there.update(replace(skeleton, positions=moved, states=skeleton.states[order]))
         if one is not None and other is not None:
-            assert_allclose(other.positions[POINTS], one.positions[POINTS] + origin, rtol=0.0, atol=1e-6)
+            back = (other.positions[order] - origin) * signs
+            assert_allclose(back[POINTS], one.positions[POINTS], rtol=0.0, atol=1e-6)
     assert here.counters == there.counters
-
-
-def test_it_knows_no_left_and_right() -> None:
-    """A mirrored person gets the mirrored estimate."""
-    truth = somebody(4, 3.0)
-    mirror = np.array([1.0, -1.0, 1.0])
-    straight, mirrored = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for skeleton in measured(truth, outliers=0.02).skeletons:
-        one = straight.update(skeleton)
-        other = mirrored.update(replace(skeleton.mirrored(), positions=skeleton.positions[MIRROR] * mirror))
-        if one is not None and other is not None:
-            assert_allclose(other.positions[MIRROR][POINTS] * mirror, one.positions[POINTS], rtol=0.0, atol=1e-6)
-    assert straight.counters == mirrored.counters
 
 
 # --- two sensors
@@ -378,32 +350,24 @@ def delayed(skeletons: Sequence[Skeleton], longest: float, seed: int, after: int
 
 
 def test_late_frames_count_as_if_they_had_come_in_order() -> None:
-    truth = somebody(5, 3.0)
-    skeletons = measured(truth, outliers=0.03).skeletons
-    shuffled = delayed(skeletons, 0.19, 1)
-    in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    feed(in_order, skeletons)
-    outputs = run(late, shuffled)
-    assert late.counters["late_frames"] > 20 and late.counters["too_late"] == 0
-    assert sum(output is None for output in outputs[START_FRAMES:]) == late.counters["late_frames"]
-    assert_same(known(in_order), known(late), 1e-9)
-
-
-def test_late_frames_of_several_sensors_count_as_if_they_had_come_in_order() -> None:
     rng = np.random.default_rng(6)
     person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
     frames = []
     for number, noise in enumerate((0.01, 0.03)):
         truth = truth_of(person, motion, capture_times(2.0, rng, 20.0) + 0.017 * number)
-        frames += [(skeleton, f"kinect{number}") for skeleton in measured(truth, noise, number).skeletons]
+        seen = measured(truth, noise, number, outliers=0.03).skeletons
+        frames += [(skeleton, f"kinect{number}") for skeleton in seen]
     frames.sort(key=lambda each: each[0].stamp_ns)
     in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     for skeleton, name in frames:
         in_order.update(skeleton, name)
     name_of = {skeleton.stamp_ns: name for skeleton, name in frames}
-    for skeleton in delayed([skeleton for skeleton, _ in frames], 0.15, 2):
+    outputs = [
         late.update(skeleton, name_of[skeleton.stamp_ns])
-    assert late.counters["late_frames"] > 10 and late.counters["too_late"] == 0
+        for skeleton in delayed([skeleton for skeleton, _ in frames], 0.19, 2)
+    ]
+    assert late.counters["late_frames"] > 20 and late.counters["too_late"] == 0
+    assert sum(output is None for output in outputs[15:]) == late.counters["late_frames"]
     assert_same(known(in_order), known(late), 1e-9)
 
 
@@ -425,10 +389,13 @@ def stalled(seed: int, held: int = 6) -> tuple[list[tuple[Skeleton, str]], int]:
 
 @pytest.mark.parametrize("seed", range(1, 1 + draws(1, 3)))
 def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: int) -> None:
+    """However often each of them is repeated before it is put in its place."""
     frames, in_time = stalled(seed)
     together, one_by_one, in_order = ExtendedKalmanFilter(), ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for skeleton, sensor in frames:
+    for number, (skeleton, sensor) in enumerate(frames):
         assert together.take(skeleton, sensor) == one_by_one.take(skeleton, sensor)
+        if number >= in_time:
+            assert not together.take(skeleton, sensor)
         asked = one_by_one.estimate  # has the frame's share in it
     assert asked is not None
     for skeleton, sensor in sorted(frames, key=lambda each: each[0].stamp_ns):
@@ -439,19 +406,9 @@ def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: in
     assert_same(known(together), known(one_by_one), 1e-12)
     assert_same(known(together), known(in_order), 1e-12)
     assert together.counters["late_frames"] == one_by_one.counters["late_frames"] == len(late)
+    assert together.counters["repeated_stamps"] == len(late)
     assert together.counters["taken_again"] == len(newer) < one_by_one.counters["taken_again"]
     assert in_order.counters["taken_again"] == 0
-
-
-def test_a_late_frame_that_is_repeated_before_it_was_put_in_its_place_counts_once() -> None:
-    frames, in_time = stalled(4)
-    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for number, (skeleton, sensor) in enumerate(frames):
-        for _ in range(2 if number >= in_time else 1):
-            twice.take(skeleton, sensor)
-        once.take(skeleton, sensor)
-    assert twice.counters["repeated_stamps"] == len(frames) - in_time
-    assert_same(known(once), known(twice), 0.0)
 
 
 def test_late_frames_count_in_what_is_predicted_and_in_the_next_frame() -> None:
@@ -481,22 +438,17 @@ def test_what_is_too_late_is_dropped_and_counted() -> None:
     assert_same(before, known(estimator), 0.0)
 
 
-def test_a_repeated_frame_counts_once() -> None:
-    skeletons = measured(somebody(8, 1.0)).skeletons
-    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    feed(once, skeletons)
-    outputs = run(twice, [skeleton for skeleton in skeletons for _ in (0, 1)])
-    assert twice.counters["repeated_stamps"] == len(skeletons)
-    assert all(output is None for output in outputs[2 * START_FRAMES - 1 :: 2])
-    assert_same(known(once), known(twice), 1e-12)
-
-
-@pytest.mark.parametrize("after", range(4, 12))
-def test_the_frame_that_it_was_started_by_counts_once(after: int) -> None:
+@pytest.mark.parametrize("repeated", [0, 15])
+@pytest.mark.parametrize("after", [*range(4, 12), 18])
+def test_an_older_frame_that_is_repeated_counts_once(repeated: int, after: int) -> None:
+    """Also that by which the filter was started."""
     skeletons = measured(somebody(8, 0.6)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     feed(once, skeletons)
-    feed(twice, [*skeletons[:after], skeletons[0], *skeletons[after:]])
+    feed(twice, skeletons[:after])
+    again = skeletons[min(repeated, after - 3)]
+    assert twice.update(again) is None
+    feed(twice, skeletons[after:])
     assert twice.counters["repeated_stamps"] == 1
     assert_same(known(once), known(twice), 1e-12)
 
@@ -507,17 +459,6 @@ def test_a_start_in_another_order_is_the_same_start() -> None:
     feed(in_order, skeletons)
     feed(shuffled, [skeletons[k] for k in (1, 0, 3, 2)] + list(skeletons[4:]))
     assert_same(known(in_order), known(shuffled), 1e-9)
-
-
-def test_a_jump_back_in_time_starts_anew_and_is_counted_once() -> None:
-    skeletons = measured(somebody(9, 4.0)).skeletons
-    estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    feed(estimator, skeletons[60:])
-    outputs = run(estimator, skeletons[:30])
-    feed(fresh, skeletons[:30])
-    assert estimator.counters["backward_jumps"] == 1
-    assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(30)]
-    assert_same(known(estimator), known(fresh), 1e-12)
 
 
 def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
@@ -537,39 +478,13 @@ def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
     assert rms(errors_of(outputs, truth, 7.3)) < np.sqrt(3.0) * NOISE
 
 
-def test_another_frame_of_reference_starts_anew() -> None:
-    skeletons = measured(somebody(11, 2.0)).skeletons
-    estimator = ExtendedKalmanFilter()
-    feed(estimator, skeletons[:30])
-    moved = [
-        replace(skeleton, frame_id="odom", positions=skeleton.positions + [10.0, 0.0, 0.0]) for skeleton in skeletons
-    ]
-    outputs = run(estimator, moved[30:])
-    assert estimator.counters["frame_changes"] == 1
-    assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(30)]
-    assert outputs[-1] is not None and outputs[-1].frame_id == "odom" == known(estimator).frame_id
-    assert_sound(outputs, estimator)
-
-
-def test_a_reset_forgets_the_person_but_not_the_counters() -> None:
-    skeletons = measured(somebody(12, 1.0)).skeletons
-    estimator, fresh = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    assert estimator.estimate is None and estimator.predict(START_NS) is None
-    feed(estimator, measured(somebody(13, 1.0)).skeletons)
-    counted = dict(estimator.counters)
-    estimator.reset()
-    assert estimator.estimate is None and estimator.counters == counted
-    feed(estimator, skeletons)
-    feed(fresh, skeletons)
-    assert_same(known(estimator), known(fresh), 0.0)
-
-
 # --- prediction
 
 
 def test_a_prediction_grows_uncertain_ends_and_changes_nothing() -> None:
     skeletons = measured(somebody(14, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
+    assert estimator.predict(START_NS) is None
     outputs = run(estimator, skeletons)
     before, last = known(estimator), outputs[-1]
     assert last is not None
@@ -606,12 +521,13 @@ def test_a_prediction_continues_the_movement() -> None:
     assert go_on < 0.5 * stay
 
 
-def test_an_arm_that_is_missing_is_predicted_and_comes_back() -> None:
+@pytest.mark.parametrize("missing", [ARMS["LEFT"], EVERYTHING], ids=["an arm", "everybody"])
+def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...]) -> None:
     truth = somebody(16, 4.0, tempo=0.6)
-    lost = np.isin(POINTS, ARMS["LEFT"])
+    lost = np.isin(POINTS, missing)
     during = (truth.times >= 2.0) & (truth.times < 2.5)
     estimator = ExtendedKalmanFilter()
-    outputs = run(estimator, measured(truth, dropouts=(Dropout(2.0, 2.5, ARMS["LEFT"]),)).skeletons)
+    outputs = run(estimator, measured(truth, dropouts=(Dropout(2.0, 2.5, missing),)).skeletons)
     spread = []
     for k, output in enumerate(outputs[START_FRAMES:], START_FRAMES):
         assert output is not None
@@ -623,24 +539,10 @@ def test_an_arm_that_is_missing_is_predicted_and_comes_back() -> None:
     before = outputs[int(np.flatnonzero(during)[0]) - 1]
     assert before is not None
     grown = np.stack([stddevs(before)[lost], *spread])
-    assert (np.diff(grown, axis=0) > 0.0).all() and (grown[-1] > 3.0 * grown[0]).all()
+    assert (np.diff(grown, axis=0) > 0.0).all()
+    assert len(missing) == len(EVERYTHING) or (grown[-1] > 3.0 * grown[0]).all()
     assert rms(errors_of(outputs, truth, 2.7)) < np.sqrt(3.0) * NOISE
     assert_sound(outputs, estimator)
-
-
-def test_frames_without_anybody_are_predicted() -> None:
-    truth = somebody(17, 3.0)
-    estimator = ExtendedKalmanFilter()
-    outputs = run(estimator, measured(truth, dropouts=(Dropout(1.5, 2.0, EVERYTHING),)).skeletons)
-    blind = [output for k, output in enumerate(outputs) if 1.5 <= truth.times[k] < 2.0]
-    assert len(blind) > 10
-    spread = []
-    for output in blind:
-        assert output is not None
-        assert_array_equal(output.states[POINTS], TrackingState.INFERRED)
-        spread.append(stddevs(output))
-    assert (np.diff(np.stack(spread), axis=0) > 0.0).all()
-    assert rms(errors_of(outputs, truth, 2.2)) < np.sqrt(3.0) * NOISE
 
 
 # --- bad data
@@ -659,21 +561,6 @@ def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) ->
     assert rms(errors_of(outputs, truth, 1.0)) < np.sqrt(3.0) * NOISE + 0.01
 
 
-def hand_columns(side: str) -> list[int]:
-    """Of the tangent: pronation, flexion and deviation."""
-    names = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
-    return [MODEL.coordinate_names.index(f"{name}_{side}") for name in names]
-
-
-def turned_over(q: FloatArray, side: str) -> FloatArray:
-    """The forearm turned by half a turn and the wrist bent the other way, which moves the thumb alone."""
-    columns = hand_columns(side)
-    pronation, *wrist = MODEL.difference(MODEL.neutral(), q)[columns]
-    tangent = np.zeros(MODEL.nv)
-    tangent[columns] = -np.copysign(np.pi, pronation), *(-2.0 * np.array(wrist))
-    return MODEL.integrate(q, tangent)
-
-
 def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[int, Truth, str]]:
     """(seed, what is true, side) of people who have bent a wrist by more than 40 degrees at some time."""
     found: list[tuple[int, Truth, str]] = []
@@ -689,48 +576,26 @@ def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[i
     return found[:count]
 
 
-def hand_errors(rotations: Sequence[FloatArray], truth: Truth, side: str) -> FloatArray:
-    """(n,) radians by which a hand is turned against the truth, from rotations (12, 3, 3) of the last n instants."""
-    hand = MODEL.segment_names.index(f"hand_{side}")
-    true = MODEL.forward(truth.q[-len(rotations) :], truth.lengths).rotations[:, hand]
-    cosine = 0.5 * (np.einsum("kij,kij->k", np.stack(rotations)[:, hand], true) - 1.0)
-    result: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return result
-
-
-def pose(estimator: ExtendedKalmanFilter) -> FloatArray:
-    """(12, 3, 3) the rotations of all segments."""
-    return MODEL.forward(known(estimator).q, known(estimator).lengths).rotations
-
-
-@pytest.mark.parametrize("noise", [0.006, 0.013, 0.025])
-def test_a_hand_that_starts_turned_over_is_right_within_half_a_second(noise: float) -> None:
-    for seed, truth, side in bent_hands(draws(2, 10), 1.2):
-        estimator = ExtendedKalmanFilter()
-        estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
-        hands = []
-        for skeleton in measured(truth, noise).skeletons:
-            estimator.update(skeleton)
-            hands.append(pose(estimator))
-        late = truth.times > 0.5
-        assert np.degrees(hand_errors(hands, truth, side)[late].max()) < 75.0, (seed, side)
-
-
-@pytest.mark.parametrize("noise", [0.006, 0.02])
-def test_a_hand_that_turns_over_later_is_right_soon(noise: float) -> None:
-    """As if a movement that nobody saw had ended in the wrong pose: at the latest after a second and a half."""
-    for seed, truth, side in bent_hands(draws(2, 6), 2.5, 0.7):
-        estimator = ExtendedKalmanFilter()
-        hands = []
-        for skeleton, time in zip(measured(truth, noise).skeletons, truth.times, strict=True):
+@pytest.mark.parametrize(("begin", "noise"), [(0.0, 0.006), (0.0, 0.013), (0.0, 0.025), (0.7, 0.006), (0.7, 0.02)])
+def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
+    """From the start, or later, as if a movement that nobody saw had ended in the wrong pose: after 1.5 s at most."""
+    seconds, end = (1.2, 0.5) if begin == 0.0 else (2.5, 2.2)
+    for seed, truth, side in bent_hands(draws(2, 6 if begin else 10), seconds, begin):
+        estimator, turned = ExtendedKalmanFilter(), begin == 0.0
+        if turned:
+            estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
+        hand = MODEL.segment_names.index(f"hand_{side}")
+        true = MODEL.forward(truth.q, truth.lengths).rotations[:, hand]
+        for skeleton, time, right in zip(measured(truth, noise).skeletons, truth.times, true, strict=True):
             estimator.update(skeleton)
             state = estimator._state
-            if time > 0.7 and state is not None:
-                if not hands:
-                    estimator._state = state.but(q=turned_over(state.q, side))
-                hands.append(pose(estimator))
-        late = truth.times[-len(hands) :] > 2.2
-        assert np.degrees(hand_errors(hands, truth, side)[late].max()) < 75.0, (seed, side)
+            if time > begin and not turned:
+                assert state is not None
+                estimator._state = state.but(q=turned_over(state.q, side))
+                turned = True
+            elif time > end:
+                found = MODEL.forward(known(estimator).q, known(estimator).lengths).rotations[hand]
+                assert np.degrees(Rotation.from_matrix(found.T @ right).magnitude()) < 75.0, (seed, side)
 
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
@@ -759,59 +624,36 @@ def test_outliers_hardly_matter() -> None:
     assert max(bad) < np.sqrt(3.0) * NOISE
 
 
-DAMAGES = (
-    "nan_positions",
-    "infinite_positions",
-    "far_positions",
-    "everything_nan",
-    "nothing_tracked",
-    "nan_covariances",
-    "zero_covariances",
-    "negative_covariances",
-    "infinite_covariances",
-    "huge_covariances",
-    "tiny_covariances",
-)
-
-
-def damaged(skeleton: Skeleton, damage: str, rng: np.random.Generator) -> Skeleton:
+def damaged(skeleton: Skeleton, field: str, value: float, rng: np.random.Generator) -> Skeleton:
     some = rng.random(N_JOINTS) < 0.3
-    positions, states = skeleton.positions.copy(), skeleton.states.copy()
-    values = {
-        "nan_positions": np.nan,
-        "infinite_positions": -np.inf,
-        "far_positions": rng.choice([150.0, -1e6, 1e300]),
-        "nan_covariances": np.nan,
-        "zero_covariances": 0.0,
-        "negative_covariances": -1e-3,
-        "infinite_covariances": np.inf,
-        "huge_covariances": 1e12,
-        "tiny_covariances": 1e-15,
-    }
-    if damage.endswith("covariances"):
+    if field == "covariances":
         covariances = np.tile(NOISE**2 * np.eye(3), (N_JOINTS, 1, 1))
-        covariances[some] *= values[damage] / NOISE**2
+        covariances[some] *= value / NOISE**2
         return replace(skeleton, covariances=covariances)
-    if damage == "everything_nan":
-        positions[:] = np.nan
-    elif damage == "nothing_tracked":
-        states[:] = TrackingState.NOT_TRACKED
-    else:
-        positions[some, rng.integers(3)] = values[damage]
-    return replace(skeleton, positions=positions, states=states)
+    positions = skeleton.positions.copy()
+    positions[some, rng.integers(3)] = value
+    return replace(skeleton, positions=positions)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_numbers_do_no_harm(damage: str) -> None:
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("positions", value) for value in (np.nan, -np.inf, 150.0, -1e6, 1e300)]
+    + [("covariances", value) for value in (np.nan, 0.0, -1e-3, np.inf, 1e12, 1e-15)]
+    + [("all positions", np.nan), ("all states", TrackingState.NOT_TRACKED)],
+)
+def test_damaged_numbers_do_no_harm(field: str, value: float) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
     truth = somebody(70, 1.8)
     rng = np.random.default_rng(1)
+    skeletons = list(measured(truth).skeletons)
+    for k in range(0, len(skeletons), 3):
+        whole = field.removeprefix("all ")
+        if whole == field:
+            skeletons[k] = damaged(skeletons[k], field, value, rng)
+        else:
+            skeletons[k] = replace(skeletons[k], **{whole: np.full_like(getattr(skeletons[k], whole), value)})
     estimator = ExtendedKalmanFilter()
-    skeletons = [
-        damaged(skeleton, damage, rng) if k % 3 == 0 else skeleton
-        for k, skeleton in enumerate(measured(truth).skeletons)
-    ]
     outputs = run(estimator, skeletons)
     assert_sound(outputs, estimator)
     assert rms(errors_of(outputs, truth)) < np.sqrt(3.0) * NOISE
@@ -829,37 +671,7 @@ def test_without_a_trunk_there_is_no_start() -> None:
     assert rms(errors_of(outputs, truth, 1.2)) < np.sqrt(3.0) * NOISE
 
 
-def test_a_person_who_is_nowhere_is_never_found() -> None:
-    nobody = Skeleton(START_NS, "world", np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8))
-    estimator = ExtendedKalmanFilter()
-    outputs = run(estimator, [replace(nobody, stamp_ns=START_NS + k * NANOSECONDS // 30) for k in range(30)])
-    assert outputs == [None] * 30 and estimator.estimate is None
-    assert estimator.counters["no_trunk"] > 0
-
-
 # --- parameters
-
-
-@pytest.mark.parametrize("name", [item.name for item in fields(EkfParameters) if "min" in item.metadata])
-def test_parameters_out_of_range_are_refused(name: str) -> None:
-    item = next(each for each in fields(EkfParameters) if each.name == name)
-    low, high = item.metadata["min"], item.metadata["max"]
-    assert low <= item.default <= high and item.metadata["doc"] and item.metadata["unit"]
-    for bad in (low - 1e-6 * max(1.0, abs(low)), 1.000001 * high, np.nan, np.inf, True, "1", None):
-        with pytest.raises(FilterError, match=name):
-            EkfParameters(**{name: bad})  # type: ignore[arg-type]
-    for good in (low, high):
-        EkfParameters(**{name: good})
-
-
-def test_an_older_frame_that_is_repeated_counts_once() -> None:
-    skeletons = measured(somebody(8, 1.0)).skeletons
-    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    feed(once, skeletons)
-    feed(twice, skeletons)
-    assert twice.update(skeletons[-3]) is None
-    assert twice.counters["repeated_stamps"] == 1
-    assert_same(known(once), known(twice), 1e-12)
 
 
 def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,15 +10,13 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from body_tracking.filters.linear import FilterError
 from body_tracking.filters.schlagenhauf import SchlagenhaufKalmanFilter, SchlagenhaufParameters
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.simulation.bags import SHIPPED
 from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
-from walkers import performed
+from walkers import TRACKED, performed
 
 FRAME_NS = NANOSECONDS // 30
-TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 LENGTHS = np.array([0.24, 0.26, 0.18, 0.32, 0.25, 0.17, 0.19, 0.33, 0.26, 0.16])
 PLACE = np.array([2.0, -0.4, 0.2])
 YAW = 2.5
@@ -40,8 +36,8 @@ def pose(theta: FloatArray, model: Schlagenhauf26 = MODEL, lengths: FloatArray =
     return positions
 
 
-def skeleton(stamp_ns: int, positions: FloatArray, states: np.ndarray = TRACKED, frame_id: str = "world") -> Skeleton:
-    return Skeleton(stamp_ns, frame_id, positions.copy(), states.copy())
+def skeleton(stamp_ns: int, positions: FloatArray, states: np.ndarray = TRACKED) -> Skeleton:
+    return Skeleton(stamp_ns, "world", positions.copy(), states.copy())
 
 
 def started(parameters: SchlagenhaufParameters | None = None) -> SchlagenhaufKalmanFilter:
@@ -61,7 +57,10 @@ def moving(rng: np.random.Generator, frames: int) -> FloatArray:
 
 
 def test_every_frame_is_one_step_of_algorithm_2() -> None:
-    """Line by line, with the gain and the innovation of missing joints set to zero (section 5.5.2)."""
+    """Line by line, with the gain and the innovation of missing joints set to zero (section 5.5.2).
+
+    But for line 8: the innovation is z - h(s), not z - H s.
+    """
     rng = np.random.default_rng(0)
     tracker, p = started(), SchlagenhaufParameters()
     s = np.zeros(52)
@@ -93,17 +92,6 @@ def test_every_frame_is_one_step_of_algorithm_2() -> None:
         )
         assert_allclose(result.positions[JOINTS], MODEL.forward(s[:26], LENGTHS).positions, rtol=0, atol=1e-9)
         assert_array_equal(result.states[JOINTS] == TrackingState.INFERRED, missing[::3])
-
-
-def test_the_innovation_is_z_minus_h_of_s() -> None:
-    """A subject who stays in the T-pose has no innovation and stays at zero; z - H s (line 8) would not be zero."""
-    tracker = started()
-    still = pose(np.zeros(26))
-    assert np.abs(still[JOINTS]).max() > 0.1
-    for k in range(FRAMES + 1, FRAMES + 100):
-        tracker.update(skeleton(k * FRAME_NS, still))
-        assert_allclose(tracker.innovations, 0.0, atol=1e-12)
-    assert_allclose(tracker.q, 0.0, atol=1e-12)
 
 
 def test_without_any_joint_the_model_alone_goes_on() -> None:
@@ -236,37 +224,16 @@ def test_unobserved_angles_grow_uncertain_without_bound() -> None:
 
 
 def test_its_time_step_is_fixed() -> None:
-    """DESIGN 4 (7), as published: the stamps change nothing but their order."""
+    """DESIGN 5.7, as published: the stamps change nothing but their order, and a gap is one step."""
     rng = np.random.default_rng(5)
     regular, irregular = started(), started()
     stamp_ns = FRAMES * FRAME_NS
     for k, theta in enumerate(moving(rng, 30), start=1):
-        stamp_ns += int(rng.integers(NANOSECONDS // 100, NANOSECONDS))
+        stamp_ns += int(rng.integers(NANOSECONDS // 100, 3 * NANOSECONDS))
         regular.update(skeleton((FRAMES + k) * FRAME_NS, pose(theta)))
         irregular.update(skeleton(stamp_ns, pose(theta)))
     assert_array_equal(regular.q, irregular.q)
-
-
-def test_time_that_stands_still_runs_back_or_leaps() -> None:
-    tracker = started()
-    start = FRAMES * FRAME_NS
-    bent = pose(np.full(26, 0.2))
-    assert tracker.update(skeleton(start, bent)) is None
-    assert tracker.update(skeleton(start - FRAME_NS, bent)) is None
-    assert (tracker.counters["repeated_stamps"], tracker.counters["late_frames"]) == (1, 1)
-    assert_array_equal(tracker.q, 0.0)
-    leapt = tracker.update(skeleton(start + 3 * NANOSECONDS, bent))
-    assert leapt is not None and tracker.counters["gaps"] == 1
-    assert tracker.update(skeleton(NANOSECONDS, bent)) is None  # a new start waits for the T-pose
-    assert tracker.counters["backward_jumps"] == 1 and not tracker.calibrated
-    assert np.isnan(tracker.lengths).all()
-
-    tracker = started()
-    assert tracker.update(skeleton(start + FRAME_NS, bent, frame_id="map")) is None
-    assert tracker.counters["frame_changes"] == 1 and not tracker.calibrated
-    tracker.reset()
-    assert tracker.counters["frames"] == FRAMES + 1
-    assert tracker.update(skeleton(start + 2 * FRAME_NS, bent)) is None
+    assert irregular.counters["gaps"] > 0
 
 
 @given(
@@ -299,14 +266,3 @@ def test_a_broken_covariance_starts_it_anew_instead_of_handing_out_nan(damage: f
     assert result is not None and np.isfinite(result.positions[JOINTS]).all()
     assert_array_equal(tracker.q, 0.0)
     assert_allclose(tracker.lengths, LENGTHS, atol=1e-12)
-
-
-def test_parameters_are_checked_and_say_what_they_are() -> None:
-    with pytest.raises(FilterError, match=r"'process_noise': -1\.0"):
-        SchlagenhaufParameters(process_noise=-1.0)
-    with pytest.raises(FilterError, match="whole number"):
-        SchlagenhaufParameters(calibration_frames=2.5)  # type: ignore[arg-type]
-    with pytest.raises(FilterError, match="'measurement_stddev': nan"):
-        SchlagenhaufParameters(measurement_stddev=float("nan"))
-    for item in fields(SchlagenhaufParameters):
-        assert item.metadata["doc"] and item.metadata["min"] <= item.default <= item.metadata["max"]

@@ -54,24 +54,21 @@ def lagged(
 ) -> list[tuple[Skeleton, ModelEstimate]]:
     """All that a fixed-lag smoother tells of a recording."""
     live = FixedLagSmoother(lag_s, parameters)
+    return told_live(live, frames) + live.flush()
+
+
+def filtered(frames: Recording, parameters: EkfParameters | None = None) -> list[tuple[Skeleton, ModelEstimate]]:
+    """All that the filter tells of a recording."""
+    return told_live(ExtendedKalmanFilter(parameters), frames)
+
+
+def told_live(live: FixedLagSmoother | ExtendedKalmanFilter, frames: Recording) -> list[tuple[Skeleton, ModelEstimate]]:
     told = []
     for sensor, skeleton in frames:
         result = live.update(skeleton, sensor)
         if result is not None:
             assert live.estimate is not None
             told.append((result, live.estimate))
-    return told + live.flush()
-
-
-def filtered(frames: Recording, parameters: EkfParameters | None = None) -> list[tuple[Skeleton, ModelEstimate]]:
-    """All that the filter tells of a recording."""
-    ekf = ExtendedKalmanFilter(parameters)
-    told = []
-    for sensor, skeleton in frames:
-        result = ekf.update(skeleton, sensor)
-        if result is not None:
-            assert ekf.estimate is not None
-            told.append((result, ekf.estimate))
     return told
 
 
@@ -95,6 +92,11 @@ def assert_same(
         assert_allclose(estimate.velocity, other.velocity, atol=10 * tolerance)
         assert_allclose(estimate.lengths, other.lengths, atol=tolerance)
         assert_allclose(estimate.covariance, other.covariance, atol=10 * tolerance)
+
+
+def instant(truth: Truth, skeleton: Skeleton) -> int:
+    """The nearest one of which the truth is known."""
+    return int(np.abs(truth.times - (skeleton.stamp_ns - START_NS) / NANOSECONDS).argmin())
 
 
 def rest(rng: np.random.Generator, frames: int, size: float) -> Recording:
@@ -209,16 +211,20 @@ def test_moves_errors_as_the_filter_does() -> None:
     assert np.diag(added)[:NV].min() > 0.0
 
 
-def test_a_lag_as_long_as_the_recording_is_the_full_smoother(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So is what the full one keeps of the forward pass, section by section."""
+def test_a_lag_as_long_as_the_recording_is_the_full_smoother_and_none_the_filter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So is what the full one keeps of the forward pass, section by section; it has the same lengths in all frames."""
     _, frames = recorded(4, 2.0, 0.01)
+    shares: list[float] = []
     monkeypatch.setattr(smoother, "_SECTION", 13)
-    assert_same(told_by(smooth(frames, learn=False)), lagged(frames, LONG), 1e-9)
-
-
-def test_without_lag_it_is_the_filter() -> None:
-    _, frames = recorded(5, 1.5, 0.02)
+    full = told_by(smooth(frames, learn=False, progress=shares.append))
+    assert_same(full, lagged(frames, LONG), 1e-9)
     assert_same(lagged(frames, 0.0), filtered(frames), 1e-12)
+    assert np.ptp([estimate.lengths for _, estimate in told_by(smooth(frames))], axis=0).max() < 1e-9
+    assert shares == sorted(shares)
+    assert len(shares) >= len(frames) // 13
+    assert shares[-1] == 1.0
 
 
 def gained(before: list[tuple[Skeleton, ModelEstimate]], after: list[tuple[Skeleton, ModelEstimate]]) -> FloatArray:
@@ -269,7 +275,7 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
         ):
             # the first second finds the person, the last 0.2 s of the live one have no later frames
             for skeleton, estimate in told:
-                at = int(np.abs(truth.times - (skeleton.stamp_ns - START_NS) / NANOSECONDS).argmin())
+                at = instant(truth, skeleton)
                 if 1.0 < truth.times[at] < 3.8:
                     errors[name].append(skeleton.positions[MODEL.joints] - truth.positions[at])
                     if name == "full":
@@ -283,12 +289,6 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
     assert np.mean(inside) > (0.88 if noise < 0.01 else 0.83)
 
 
-def test_lengths_are_the_same_in_all_frames() -> None:
-    _, frames = recorded(7, 3.0, 0.01)
-    lengths = np.array([estimate.lengths for _, estimate in told_by(smooth(frames))])
-    assert np.ptp(lengths, axis=0).max() < 1e-9
-
-
 def test_bridges_a_dropout_from_both_sides() -> None:
     """Where an arm is out of sight, what comes after tells where it was."""
     arm = ARMS["LEFT"]
@@ -298,7 +298,7 @@ def test_bridges_a_dropout_from_both_sides() -> None:
         truth, frames = recorded(seed, 3.5, 0.005, MeasurementErrors(0.005, dropouts=(dropout,)))
         for name, told in (("filter", filtered(frames)), ("full", lagged(frames, LONG))):
             for skeleton, _ in told:
-                at = int(np.abs(truth.times - (skeleton.stamp_ns - START_NS) / NANOSECONDS).argmin())
+                at = instant(truth, skeleton)
                 if 2.0 <= truth.times[at] < 2.5:
                     errors[name].append(
                         (skeleton.positions[MODEL.joints] - truth.positions[at])[np.isin(MODEL.joints, arm)]
@@ -392,19 +392,11 @@ def test_a_late_frame_takes_its_place() -> None:
 def test_reset_forgets() -> None:
     _, frames = recorded(16, 1.0, 0.01)
     live = FixedLagSmoother(0.1)
-    for sensor, skeleton in frames:
-        live.update(skeleton, sensor)
-    assert live.estimate is not None
+    told = told_live(live, frames)
     live.reset()
     assert live.estimate is None
     assert live.flush() == []
-    again = [live.update(skeleton, sensor) for sensor, skeleton in frames]
-    fresh = FixedLagSmoother(0.1)
-    for one, sensor_skeleton in zip(again, frames, strict=True):
-        other = fresh.update(sensor_skeleton[1], sensor_skeleton[0])
-        assert (one is None) == (other is None)
-        if one is not None and other is not None:
-            assert_array_equal(one.positions, other.positions)
+    assert_same(told_live(live, frames), told, 0.0)
 
 
 # --- borders
@@ -415,8 +407,8 @@ def test_takes_frames_in_any_order_and_answers_in_that() -> None:
     order = np.random.default_rng(0).permutation(len(frames))
     straight = smooth(frames)
     shuffled = smooth([frames[k] for k in order])
-    for place, k in enumerate(order):
-        one, other = shuffled.skeletons[place], straight.skeletons[k]
+    for one, k in zip(shuffled.skeletons, order, strict=True):
+        other = straight.skeletons[k]
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             assert one.stamp_ns == frames[k][1].stamp_ns
@@ -436,16 +428,6 @@ def test_a_recording_of_nobody_says_nothing() -> None:
     assert [live.update(skeleton) for _, skeleton in nobody] == [None] * 9
     assert live.estimate is None
     assert live.flush() == []
-
-
-def test_tells_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(smoother, "_SECTION", 10)
-    _, frames = recorded(18, 1.0, 0.01)
-    shares: list[float] = []
-    smooth(frames, progress=shares.append)
-    assert shares == sorted(shares)
-    assert len(shares) >= 9
-    assert shares[-1] == 1.0
 
 
 @pytest.mark.parametrize("lag_s", [-0.1, np.nan, np.inf])

@@ -8,25 +8,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
+from two_kinects import FRAME, OFFSET_NS, POSES, truth
 
-from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.calibration.result import level_pose
 from body_tracking.clocks import ClockModel
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import FusionError
 from body_tracking.measurement import joint_stddev
-from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Joint, Skeleton
-from walkers import OPTICAL_FROM_LEVEL, about_y, frame, walk
-
-FRAME = 1 / 30
-OFFSET_NS = 400_000_000
-POSES = {
-    "kinect1": level_pose("kinect1"),
-    "kinect2": SensorPose(
-        "kinect2",
-        OPTICAL_FROM_LEVEL.T @ np.array([2.0, 0.0, 1.4]),
-        Rotation.from_matrix(OPTICAL_FROM_LEVEL.T @ about_y(-60.0)).as_quat(),
-    ),
-}
+from body_tracking.skeleton import MIRROR, NANOSECONDS, Joint, Skeleton
+from walkers import frame
 
 
 def alignment(*calibrated: str) -> SensorAlignment:
@@ -35,15 +25,6 @@ def alignment(*calibrated: str) -> SensorAlignment:
         made.set_pose(POSES[sensor])
     made.set_clock("kinect2", 0, ClockModel(OFFSET_NS))
     return made
-
-
-def valid_from(pose: SensorPose, valid_from_ns: int) -> SensorPose:
-    return SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
-
-
-def truth(times: FloatArray) -> FloatArray:
-    """The walk in world."""
-    return walk(times) @ OPTICAL_FROM_LEVEL
 
 
 def seen(sensor: str, time: float, mirrored: bool = False) -> Skeleton:
@@ -61,30 +42,22 @@ def pushed(made: SensorAlignment, sensor: str, skeleton: Skeleton) -> Skeleton:
     return aligned
 
 
-def test_a_known_pose_and_clock_give_back_the_truth_at_its_time() -> None:
+@pytest.mark.parametrize("mirrored_from", [60, 30])
+def test_a_known_pose_and_clock_give_back_the_truth_at_its_time(mirrored_from: int) -> None:
+    """A body that one sensor sees mirrored is repaired."""
     made = alignment()
     for number in range(60):
         for sensor, time in (("kinect1", number * FRAME), ("kinect2", number * FRAME + 0.011)):
-            given = seen(sensor, time)
+            given = seen(sensor, time, sensor == "kinect2" and number >= mirrored_from)
             aligned = pushed(made, sensor, given)
             assert aligned.stamp_ns == round(time * NANOSECONDS)
             assert aligned.frame_id == "world"
             assert_allclose(aligned.positions, truth(np.array([time]))[0], atol=1e-9)
-            stddev = joint_stddev(given.positions, given.states)
-            assert_allclose(aligned.covariances, (stddev**2)[:, None, None] * np.eye(3))
+            if number < mirrored_from:
+                stddev = joint_stddev(given.positions, given.states)
+                assert_allclose(aligned.covariances, (stddev**2)[:, None, None] * np.eye(3))
     assert made.counters["aligned"] == 120
-    assert made.counters["repaired"] == 0
-
-
-def test_a_body_that_one_sensor_sees_mirrored_is_repaired() -> None:
-    made = alignment()
-    for number in range(90):
-        time = number * FRAME
-        pushed(made, "kinect1", seen("kinect1", time))
-        mirrored = number >= 45
-        aligned = pushed(made, "kinect2", seen("kinect2", time + 0.011, mirrored))
-        assert_allclose(aligned.positions, truth(np.array([time + 0.011]))[0], atol=1e-9)
-    assert made.counters["repaired"] == 45
+    assert made.counters["repaired"] == 60 - mirrored_from
 
 
 def test_a_body_that_one_sensor_sees_across_keeps_its_midline_only() -> None:
@@ -109,7 +82,7 @@ def test_a_body_that_one_sensor_sees_across_keeps_its_midline_only() -> None:
 
 def test_a_pose_holds_from_its_time_on_and_before_nothing_is_said() -> None:
     made = alignment("kinect1")
-    made.set_pose(valid_from(POSES["kinect2"], NANOSECONDS))
+    made.set_pose(replace(POSES["kinect2"], valid_from_ns=NANOSECONDS))
     assert made.push("kinect2", seen("kinect2", 0.9)) is None
     assert made.counters["uncalibrated"] == 1
     assert_allclose(pushed(made, "kinect2", seen("kinect2", 1.1)).positions, truth(np.array([1.1]))[0], atol=1e-9)
@@ -117,7 +90,7 @@ def test_a_pose_holds_from_its_time_on_and_before_nothing_is_said() -> None:
 
 def test_a_clock_that_jumps_back_starts_anew_and_poses_hold() -> None:
     made = alignment("kinect1")
-    made.set_pose(valid_from(POSES["kinect2"], NANOSECONDS))
+    made.set_pose(replace(POSES["kinect2"], valid_from_ns=NANOSECONDS))
     pushed(made, "kinect1", seen("kinect1", 5.0))
     pushed(made, "kinect1", seen("kinect1", 0.5))
     assert made.counters["resets"] == 1
@@ -142,16 +115,12 @@ def test_a_sensor_that_counts_from_another_beginning_is_left_out_until_its_clock
     assert taken == [True] * 20 + [off > 0.0] + [False] * 19 + [True] * 20
 
 
-def test_a_late_frame_goes_on_as_it_is() -> None:
+def test_a_late_frame_goes_on_as_it_is_and_strangers_are_counted_or_refused() -> None:
     made = alignment()
     pushed(made, "kinect1", seen("kinect1", 1.0))
     aligned = pushed(made, "kinect1", seen("kinect1", 0.95))
     assert_allclose(aligned.positions, truth(np.array([0.95]))[0], atol=1e-9)
     assert made.counters["late"] == 1
-
-
-def test_who_does_not_belong_is_counted_or_refused() -> None:
-    made = alignment()
     assert made.push("kinect9", seen("kinect1", 0.0)) is None
     made.set_pose(level_pose("kinect9"))
     made.set_clock("kinect9", 0, ClockModel())

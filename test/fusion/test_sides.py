@@ -46,15 +46,12 @@ def test_one_that_turns_the_body_at_once_is_not_followed(others: int) -> None:
     assert believed(6.0, right | {"wrong": (2.0, 4.5)}) == pytest.approx([0.0] * 180)
 
 
-def test_one_that_still_errs_does_not_keep_the_others_from_being_believed() -> None:
+@pytest.mark.parametrize("right", [["front"], ["front", "left"]])
+def test_one_that_still_errs_does_not_keep_the_others_from_being_believed(right: list[str]) -> None:
     """Two sensors behind somebody err alike; the believed one comes to its senses, the other one never does."""
-    found = believed(8.0, {"behind": (0.0, 3.0), "front": (0.0, 0.0), "also behind": (0.0, 8.0)})
+    seen = {"behind": (0.0, 3.0)} | dict.fromkeys(right, (0.0, 0.0)) | {"also behind": (0.0, 8.0)}
+    found = believed(8.0, seen)
     assert found[round(30 * (3.0 + HOLD)) + 2 :] == pytest.approx([0.0] * 118)
-
-
-def test_nor_does_one_of_four() -> None:
-    seen = {"behind": (0.0, 3.0), "front": (0.0, 0.0), "left": (0.0, 0.0), "also behind": (0.0, 8.0)}
-    assert believed(8.0, seen)[-1] == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("wrong", [2.5, 4.0])

@@ -15,35 +15,20 @@ def body(number: int, distance: float, state: int = 2) -> Skeleton:
     return Skeleton(0, "kinect1_optical_frame", positions, np.full(25, state, np.uint8), number)
 
 
-def test_the_nearest_is_picked_and_kept() -> None:
+def test_the_nearest_with_a_joint_is_picked_and_kept_until_gone() -> None:
     selector = SubjectSelector()
-    picked = selector.pick([body(3, 2.0), body(5, 1.5)])
-    assert picked is not None
-    assert picked.body == 5
-    picked = selector.pick([body(3, 1.0), body(5, 4.0)])
-    assert picked is not None
-    assert picked.body == 5
 
+    def pick(*bodies: Skeleton) -> int | None:
+        picked = selector.pick(list(bodies))
+        return None if picked is None else picked.body
 
-def test_who_is_gone_is_replaced_by_the_nearest() -> None:
-    selector = SubjectSelector()
-    selector.pick([body(5, 1.5)])
-    picked = selector.pick([body(3, 3.0), body(4, 2.0)])
-    assert picked is not None
-    assert picked.body == 4
+    assert pick() is None
+    assert pick(body(1, 1.0, state=0)) is None
+    assert pick(body(1, 1.0, state=0), body(3, 2.0), body(5, 1.5)) == 5
+    assert pick(body(3, 1.0), body(5, 4.0)) == 5
+    assert pick(body(3, 3.0), body(4, 2.0)) == 4
     selector.reset()
-    picked = selector.pick([body(3, 1.0), body(4, 2.0)])
-    assert picked is not None
-    assert picked.body == 3
-
-
-def test_a_body_without_a_joint_is_nobody() -> None:
-    selector = SubjectSelector()
-    assert selector.pick([]) is None
-    assert selector.pick([body(1, 1.0, state=0)]) is None
-    picked = selector.pick([body(1, 1.0, state=0), body(2, 9.0)])
-    assert picked is not None
-    assert picked.body == 2
+    assert pick(body(3, 1.0), body(4, 2.0)) == 3
 
 
 def test_one_of_several_is_held_through_messages_without_that_one() -> None:

@@ -70,13 +70,20 @@ class Wearer:
             look(tracker, instant, self.sensors(instant))
 
 
+def see_bones(
+    wearer: Wearer, tracker: HeadingTracker, instant: int, sensors: FloatArray, stddev: float, errors: FloatArray
+) -> None:
+    """Both bones, off by these errors, (2, 3) in units of their deviation."""
+    for number, name in enumerate(ARM):
+        bone = bone_of(name)
+        assert bone is not None
+        seen = wearer.world[instant, number] @ bone.axis + stddev * errors[number]
+        tracker.observe_bone(float(wearer.times[instant]), name, sensors[number], seen, stddev)
+
+
 def by_bones(wearer: Wearer, stddev: float) -> Callable[[HeadingTracker, int, FloatArray], None]:
     def look(tracker: HeadingTracker, instant: int, sensors: FloatArray) -> None:
-        for number, name in enumerate(ARM):
-            bone = bone_of(name)
-            assert bone is not None
-            seen = wearer.world[instant, number] @ bone.axis + stddev * wearer.rng.normal(size=3)
-            tracker.observe_bone(float(wearer.times[instant]), name, sensors[number], seen, stddev)
+        see_bones(wearer, tracker, instant, sensors, stddev, wearer.rng.normal(size=(2, 3)))
 
     return look
 
@@ -103,12 +110,7 @@ def test_what_is_stated_holds_with_a_camera_whose_errors_last_and_headings_that_
         error = wearer.rng.normal(size=(2, 3))
         for instant in range(0, len(wearer.times), 5):
             error = fades * error + np.sqrt(1.0 - fades**2) * wearer.rng.normal(size=(2, 3))
-            sensors, now = wearer.sensors(instant), float(wearer.times[instant])
-            for number, name in enumerate(ARM):
-                bone = bone_of(name)
-                assert bone is not None
-                seen = wearer.world[instant, number] @ bone.axis + 0.08 * error[number]
-                tracker.observe_bone(now, name, sensors[number], seen, 0.08)
+            see_bones(wearer, tracker, instant, wearer.sensors(instant), 0.08, error)
             if instant % 90 == 45:
                 off = wearer.error(tracker.alignment, instant)
                 inside.append(np.abs(off) < 1.96 * tracker.alignment.stddev.reshape(-1))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,31 +79,31 @@ def test_a_segment_without_sensor_has_no_angles() -> None:
         angles(0, np.eye(3))
 
 
-def test_a_real_suit_tells_its_own_angles(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def imu_recordings(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark of this name."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import imu_recordings
+    yield importlib.import_module("imu_recordings")
+    sys.modules.pop("imu_recordings")
 
-    path = shared_data / "imu" / imu_recordings.XSENS
+
+def present(path: Path) -> Path:
     if not path.is_file():
         pytest.skip(f"{path} is absent")
-    figures = imu_recordings.xsens(path)
+    return path
+
+
+def test_a_real_suit_tells_its_own_angles(shared_data: Path, imu_recordings: Any) -> None:
+    figures = imu_recordings.xsens(present(shared_data / "imu" / imu_recordings.XSENS))
     rows = {name: row for name, row in figures.items() if isinstance(row, dict) and "rms_deg" in row}
     assert len(rows) == 10
     for name, row in rows.items():
         assert row["rms_deg"] < 3.0, name
         assert row["convention_deg"] < 0.01, name
-    sys.modules.pop("imu_recordings")
 
 
-def test_a_real_arm_comes_back_to_where_it_was_aligned(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import imu_recordings
-
-    path = shared_data / "imu" / imu_recordings.TWO_ARM
-    if not path.is_file():
-        pytest.skip(f"{path} is absent")
-    figures = imu_recordings.two_arm(path)
-    assert figures["upper_arm_right"]["passages"] > 30
-    assert figures["upper_arm_right"]["median_deg"] < 5.0
-    assert figures["upper_arm_right"]["last_deg"] < 5.0
-    sys.modules.pop("imu_recordings")
+def test_a_real_arm_comes_back_to_where_it_was_aligned(shared_data: Path, imu_recordings: Any) -> None:
+    figures = imu_recordings.two_arm(present(shared_data / "imu" / imu_recordings.TWO_ARM))["upper_arm_right"]
+    assert figures["passages"] > 30
+    assert figures["median_deg"] < 5.0
+    assert figures["last_deg"] < 5.0

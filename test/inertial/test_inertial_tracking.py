@@ -14,7 +14,7 @@ from body_tracking.errors import BodyTrackingError
 from body_tracking.inertial.alignment import pose_rotations, rotation_vectors
 from body_tracking.inertial.mounting import mounting, mountings
 from body_tracking.inertial.parameters import TrackingParameters
-from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError
+from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, Told
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.kinematics import so3
 from body_tracking.kinematics.model import SEGMENTS
@@ -27,6 +27,7 @@ from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, Tra
 SECONDS = 22.0
 """Of people who reach out in all directions: about the shortest that there is."""
 WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
+STILL = np.zeros(3)
 
 
 def covered(fed: Fed, segment: str, since: float) -> FloatArray:
@@ -54,6 +55,7 @@ def test_two_forearms_beside_a_camera_are_told_within_what_is_stated(wrists: Fed
         # pronation turns by 150 degrees in this movement; what is off is hardly more than the alignment's own error
         assert np.degrees(np.sqrt((error**2).mean())) < 12.0
     assert wrists.tracker.counters["alignments by a pose"] == 1
+    assert "T-pose" in wrists.tracker.align()
     assert not {line for line in lines(wrists, 6.0) if line}
 
 
@@ -262,66 +264,58 @@ def tposed() -> FloatArray:
     return positions
 
 
-def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_turned() -> None:
+def aligned_by_magnetometers() -> InertialTracker:
     tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
-    told = held(tracker)
+    assert held(tracker)
     assert tracker.aligned
-    assert told
-    headings = tracker.alignment.headings
-    assert np.abs(headings - headings[0]).max() < np.radians(1.5)
-    apart = tracker.alignment.covariance[3::4, 3::4]
+    return tracker
+
+
+def told_later(
+    tracker: InertialTracker,
+    stamp_ns: int,
+    rate: FloatArray | None = STILL,
+    turned: FloatArray = STILL,
+    *,
+    skeleton: bool = True,
+) -> Told:
+    """What a reading of the left forearm, so long after a T-pose, makes the tracker tell."""
+    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
+    stamp_ns += 110 * NANOSECONDS
+    sample = ImuSample(stamp_ns, "forearm_left", so3.exp(turned), level, rate, None if rate is None else up, None)
+    return tracker.add("forearm_left", sample, stamp_ns + 10_000_000, skeleton=skeleton)
+
+
+def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_turned() -> None:
+    alignment = aligned_by_magnetometers().alignment
+    assert np.abs(alignment.headings - alignment.headings[0]).max() < np.radians(1.5)
+    apart = alignment.covariance[3::4, 3::4]
     assert apart[0, 0] + apart[1, 1] - 2.0 * apart[0, 1] < np.radians(10.0) ** 2
 
 
-def test_no_rate_is_told_that_a_driver_does_not_tell() -> None:
+@pytest.mark.parametrize("rate", [None, np.array([0.1, 0.0, 0.0])], ids=["none", "some"])
+def test_no_rate_is_told_that_a_driver_does_not_tell(rate: FloatArray | None) -> None:
     """The difference of two orientations is too rough to be taken for a measurement."""
-    for rate in (None, np.array([0.1, 0.0, 0.0])):
-        tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
-        held(tracker)
-        level = np.diag([1e-4, 1e-4, 1e-3])
-        for k in range(2):
-            stamp_ns = 110 * NANOSECONDS + k * NANOSECONDS // 20
-            turned = so3.exp(np.array([0.005 * k, 0.0, 0.0]))
-            sample = ImuSample(stamp_ns, "forearm_left", turned, level, rate, None, None)
-            told = tracker.add("forearm_left", sample, stamp_ns + 10_000_000).orientation
-            assert told is not None
-            assert (told.angular_velocity is None) is (rate is None)
+    tracker = aligned_by_magnetometers()
+    for k in range(2):
+        told = told_later(tracker, k * NANOSECONDS // 20, rate, np.array([0.005 * k, 0.0, 0.0])).orientation
+        assert told is not None
+        assert (told.angular_velocity is None) is (rate is None)
 
 
 def test_no_body_is_fitted_where_nobody_wants_one() -> None:
-    tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
-    held(tracker)
-    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
-    stamps = [110 * NANOSECONDS + k * NANOSECONDS // 5 for k in range(3)]
-    told = [
-        tracker.add(
-            "forearm_left",
-            ImuSample(stamp_ns, "forearm_left", np.array([0.0, 0.0, 0.0, 1.0]), level, np.zeros(3), up, None),
-            stamp_ns + 10_000_000,
-            skeleton=wanted,
-        ).skeleton
-        for stamp_ns, wanted in zip(stamps, (True, False, True), strict=True)
-    ]
-    assert [each is not None for each in told] == [True, False, True]
+    tracker = aligned_by_magnetometers()
+    for k, wanted in enumerate((True, False, True)):
+        told = told_later(tracker, k * NANOSECONDS // 5, skeleton=wanted)
+        assert (told.skeleton is not None) is wanted
 
 
 def test_stamps_that_jitter_cost_no_orientations() -> None:
     """Of 100 readings a second every third one has an orientation: that is as good as 30 times a second."""
-    tracker = InertialTracker(("upper_trunk", "upper_arm_left", "forearm_left"), TrackingParameters(camera=False))
-    held(tracker)
-    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
+    tracker = aligned_by_magnetometers()
     jitter = np.random.default_rng(0).integers(-1_000_000, 1_000_000, 300).tolist()
-    stamps = [110 * NANOSECONDS + k * NANOSECONDS // 100 + off for k, off in enumerate(jitter)]
-    still = np.array([0.0, 0.0, 0.0, 1.0])
-    told = [
-        tracker.add(
-            "forearm_left",
-            ImuSample(stamp_ns, "forearm_left", still, level, np.zeros(3), up, None),
-            stamp_ns + 10_000_000,
-            skeleton=False,
-        ).orientation
-        for stamp_ns in stamps
-    ]
+    stamps = [k * NANOSECONDS // 100 + off for k, off in enumerate(jitter)]
+    told = [told_later(tracker, stamp_ns, skeleton=False).orientation for stamp_ns in stamps]
     assert sum(each is not None for each in told) == 100
 
 
@@ -337,12 +331,6 @@ def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_com
     # a sensor's reading of the same instant, which came 5 ms sooner
     assert (first[-1][0] - 5 * NANOSECONDS - 100 * NANOSECONDS) % (NANOSECONDS // 50) == 15_000_000
     assert unheard[-1][0] == first[-1][0] - 30_000_000
-
-
-def test_a_pose_may_be_asked_for_again(wrists: Fed) -> None:
-    text = wrists.tracker.align()
-    assert "T-pose" in text
-    assert "second" in text
 
 
 def test_time_that_runs_backwards_begins_anew_and_is_counted() -> None:

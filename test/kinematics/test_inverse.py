@@ -6,29 +6,21 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from bent_hands import hand_columns, turned_over
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint
+from body_tracking.skeleton import BONES as SKELETON_BONES
+from body_tracking.skeleton import BoolArray, FloatArray, Joint
 from draws import draws, some
 
 INVERSE = InverseKinematics(MODEL)
 RANGES = Ranges(MODEL)
 NAMES = MODEL.coordinate_names
 MILLIMETRE = 1e-3
-BONES = (
-    (Joint.SPINE_BASE, Joint.SPINE_MID),
-    (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT),
-    (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT),
-    (Joint.ELBOW_LEFT, Joint.WRIST_LEFT),
-    (Joint.WRIST_LEFT, Joint.HAND_LEFT),
-    (Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT),
-    (Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT),
-    (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT),
-    (Joint.WRIST_RIGHT, Joint.HAND_RIGHT),
-)
+OF_ARMS_AND_TRUNK = [joint for joint in Joint if joint.name.split("_")[0] in ("SPINE", "SHOULDER", "ELBOW", "WRIST")]
+BONES = [bone for bone in SKELETON_BONES if set(bone) <= {*OF_ARMS_AND_TRUNK, Joint.HAND_LEFT, Joint.HAND_RIGHT}]
 EXACT = np.full(len(MODEL.joints), 1e-4)
 """Metres: a noise that leaves the ranges of motion nothing to say."""
 
@@ -54,29 +46,14 @@ def with_bent_wrists(q: FloatArray, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     bent = q.copy()
     for side in ("left", "right"):
-        low, high = (limits[columns_of(side) - 6] for limits in (RANGES.low, RANGES.high))
+        low, high = (limits[hand_columns(side) - 6] for limits in (RANGES.low, RANGES.high))
         angles = rng.uniform(low, high, (len(q), len(low)))
         forth = rng.random(len(q)) < 0.5
         angles[:, 1] = np.where(forth, high[1], low[1]) * rng.uniform(0.5, 0.95, len(q))
         tangent = np.zeros((len(q), MODEL.nv))
-        tangent[:, columns_of(side)] = angles - MODEL.difference(MODEL.neutral(), bent)[:, columns_of(side)]
+        tangent[:, hand_columns(side)] = angles - MODEL.difference(MODEL.neutral(), bent)[:, hand_columns(side)]
         bent = MODEL.integrate(bent, tangent)
     return bent
-
-
-def columns_of(side: str) -> IntArray:
-    """(3,) of the tangent: pronation, flexion, deviation."""
-    names = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
-    return np.array([NAMES.index(f"{name}_{side}") for name in names], dtype=np.intp)
-
-
-def turned_over(q: FloatArray, side: str) -> FloatArray:
-    """(35,) the forearm turned by half a turn, and the wrist bent the other way."""
-    columns = columns_of(side)
-    pronation, *wrist = MODEL.difference(MODEL.neutral(), q)[columns]
-    tangent = np.zeros(MODEL.nv)
-    tangent[columns] = -np.copysign(np.pi, pronation), *(-2.0 * np.array(wrist))
-    return MODEL.integrate(q, tangent)
 
 
 def distances(q: FloatArray, lengths: FloatArray, points: FloatArray) -> FloatArray:
@@ -292,4 +269,4 @@ def test_elbow_branch_flips_only_with_a_visible_hand() -> None:
             moved = np.abs(MODEL.difference(one, other)) > 1e-9
             assert INVERSE.is_turned(one, other)
             assert not any(moved[k] for k, name in enumerate(NAMES) if not name.endswith("_right"))
-            assert np.abs(RANGES.excess(other))[columns_of("right") - 6].max() < 1e-9
+            assert np.abs(RANGES.excess(other))[hand_columns("right") - 6].max() < 1e-9

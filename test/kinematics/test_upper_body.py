@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS, BodyModel, ModelError
+from body_tracking.kinematics.model import SEGMENTS, ModelError
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import PARENTS, SHOULDER_AXES, UNOBSERVED, UpperBody
+from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 from body_tracking.skeleton import FloatArray, Joint
 
 MODEL = UpperBody()
@@ -51,19 +51,6 @@ def _null_space(q: FloatArray) -> FloatArray:
     _, values, directions = np.linalg.svd(jacobian)
     null: FloatArray = directions[int((values > 1e-9 * values[0]).sum()) :]
     return null
-
-
-def test_it_is_a_body_model() -> None:
-    model: BodyModel = MODEL
-    assert (model.nq, model.nv, len(model.joints), len(model.segment_names), len(model.length_names)) == (
-        35,
-        32,
-        19,
-        12,
-        21,
-    )
-    assert len(set(model.coordinate_names)) == model.nv
-    assert len(set(model.joints.tolist())) == 19
 
 
 def test_neutral_is_a_person_who_stands_upright_and_faces_x() -> None:
@@ -112,26 +99,6 @@ def test_an_angle_is_positive_in_the_direction_of_its_name(name: str, joint: Joi
     assert step @ np.array(direction) / np.linalg.norm(step) > 0.99
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_shoulder_axes_flex_abduct_and_turn_inwards(side: str) -> None:
-    elbow, wrist = Joint[f"ELBOW_{side.upper()}"], Joint[f"WRIST_{side.upper()}"]
-    outwards = 1.0 if side == "left" else -1.0
-    slots = [MODEL.coordinate_names.index(f"shoulder_{axis}_{side}") for axis in "xyz"]
-    bent = MODEL.coordinate_names.index(f"elbow_flexion_{side}")
-    steps = []
-    for axis in SHOULDER_AXES[side]:
-        v = np.zeros(MODEL.nv)
-        v[slots] = 0.01 * axis
-        v[bent] = np.pi / 2
-        q0 = MODEL.integrate(MODEL.neutral(), v * (np.arange(MODEL.nv) == bent))
-        q1 = MODEL.integrate(MODEL.neutral(), v)
-        steps.append((_place(q1, elbow) - _place(q0, elbow), _place(q1, wrist) - _place(q0, wrist)))
-    assert steps[0][0][0] > 0.002  # flexion: the elbow goes forwards
-    assert outwards * steps[1][0][1] > 0.002  # abduction: outwards
-    np.testing.assert_allclose(steps[2][0], 0.0, atol=1e-12)  # rotation leaves the elbow
-    assert outwards * steps[2][1][1] < -0.002  # and brings the bent forearm inwards
-
-
 def test_mirrored_angles_are_the_mirrored_person() -> None:
     rng = np.random.default_rng(8)
     v = np.zeros(MODEL.nv)
@@ -152,24 +119,15 @@ def test_mirrored_angles_are_the_mirrored_person() -> None:
     np.testing.assert_allclose(two[order], one * [1.0, -1.0, 1.0], atol=1e-14)
 
 
-def test_jacobian_of_the_positions_against_differences() -> None:
+def test_jacobians_of_positions_and_rotations_against_differences() -> None:
     q, lengths = _poses(20), _lengths(20)
-    analytic = MODEL.linearise(q, lengths).jacobian
+    analytic = MODEL.linearise(q, lengths)
     step = STEP * np.eye(MODEL.nv)
-    plus = MODEL.forward(MODEL.integrate(q[:, None], step), lengths[:, None]).positions
-    minus = MODEL.forward(MODEL.integrate(q[:, None], -step), lengths[:, None]).positions
-    numeric = np.moveaxis((plus - minus) / (2.0 * STEP), 1, -1)
-    np.testing.assert_allclose(analytic, numeric, rtol=0, atol=1e-7)
-
-
-def test_jacobian_of_the_rotations_against_differences() -> None:
-    q, lengths = _poses(20), _lengths(20)
-    analytic = MODEL.linearise(q, lengths).rotation_jacobian
-    step = STEP * np.eye(MODEL.nv)
-    plus = MODEL.forward(MODEL.integrate(q[:, None], step), lengths[:, None]).rotations
-    minus = MODEL.forward(MODEL.integrate(q[:, None], -step), lengths[:, None]).rotations
-    turned = so3.log(so3.matrix_to_quat(plus @ minus.swapaxes(-1, -2))) / (2.0 * STEP)
-    np.testing.assert_allclose(analytic, np.moveaxis(turned, 1, -1), rtol=0, atol=1e-7)
+    plus, minus = (MODEL.forward(MODEL.integrate(q[:, None], s * step), lengths[:, None]) for s in (1.0, -1.0))
+    moved = (plus.positions - minus.positions) / (2.0 * STEP)
+    turned = so3.log(so3.matrix_to_quat(plus.rotations @ minus.rotations.swapaxes(-1, -2))) / (2.0 * STEP)
+    np.testing.assert_allclose(analytic.jacobian, np.moveaxis(moved, 1, -1), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(analytic.rotation_jacobian, np.moveaxis(turned, 1, -1), rtol=0, atol=1e-7)
 
 
 def test_one_segment_turns_as_it_does_among_all() -> None:
@@ -225,54 +183,11 @@ def test_many_at_once_are_each_alone() -> None:
             np.testing.assert_allclose(many, getattr(forward, name), rtol=0, atol=1e-14)
         for name in ("jacobian", "length_jacobian", "rotation_jacobian"):
             np.testing.assert_allclose(getattr(together, name)[index], getattr(alone, name), rtol=0, atol=1e-14)
+        # lengths without the dimensions of time go with configurations that have them
+        shared = MODEL.linearise(q, lengths[0, 0]).jacobian
+        np.testing.assert_allclose(shared[index], MODEL.linearise(q[index], lengths[0, 0]).jacobian, rtol=0, atol=1e-14)
         np.testing.assert_allclose(moved[index], MODEL.integrate(q[index], v[index]), rtol=0, atol=1e-14)
         np.testing.assert_allclose(apart[index], MODEL.difference(q[index], q[::-1][index]), rtol=0, atol=1e-14)
-
-
-def test_one_person_at_many_instants() -> None:
-    """Lengths without the dimension of time go with configurations that have it."""
-    q = _poses(5)
-    np.testing.assert_array_equal(
-        MODEL.forward(q, LENGTHS).positions, MODEL.forward(q, np.broadcast_to(LENGTHS, (5, 21))).positions
-    )
-    together = MODEL.linearise(q, LENGTHS)
-    np.testing.assert_allclose(together.jacobian[3], MODEL.linearise(q[3], LENGTHS).jacobian, rtol=0, atol=1e-14)
-
-
-def test_moving_and_turning_the_base_moves_everything_rigidly() -> None:
-    q = _poses(10)
-    turn, shift = so3.exp(np.array([0.3, -1.1, 2.0])), np.array([1.0, -2.0, 0.5])
-    rotation = so3.quat_to_matrix(turn)
-    moved = q.copy()
-    moved[:, :3] = q[:, :3] @ rotation.T + shift
-    base = MODEL.quaternion_of("pelvis")
-    moved[:, base] = so3.quat_multiply(turn, q[:, base])
-    before, after = MODEL.forward(q, LENGTHS), MODEL.forward(moved, LENGTHS)
-    np.testing.assert_allclose(after.positions, before.positions @ rotation.T + shift, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(after.rotations, rotation @ before.rotations, rtol=0, atol=1e-13)
-
-
-def test_segments_keep_their_lengths() -> None:
-    """Whatever the angles: the distance of two points on one segment is its length."""
-    positions = MODEL.forward(_poses(50), LENGTHS).positions
-    length = dict(zip(MODEL.length_names, LENGTHS, strict=True))
-    for one, two, name in (
-        (Joint.SPINE_BASE, Joint.SPINE_MID, "lower_trunk"),
-        (Joint.SPINE_MID, Joint.SPINE_SHOULDER, "upper_trunk"),
-        (Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT, "upper_arm_left"),
-        (Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT, "forearm_right"),
-        (Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, "hand_tip_left"),
-    ):
-        distance = np.linalg.norm(positions[:, _point(one)] - positions[:, _point(two)], axis=-1)
-        np.testing.assert_allclose(distance, length[name], rtol=0, atol=1e-13)
-
-
-def test_a_segment_stands_at_a_point_fixed_to_its_parent() -> None:
-    posture = MODEL.forward(_poses(5), LENGTHS)
-    for segment, parent in enumerate(PARENTS[1:], start=1):
-        reach = posture.origins[:, segment] - posture.origins[:, parent]
-        local = (posture.rotations[:, parent].swapaxes(-1, -2) @ reach[..., None])[..., 0]
-        np.testing.assert_allclose(local, np.broadcast_to(local[0], local.shape), atol=1e-13, err_msg=SEGMENTS[segment])
 
 
 def test_the_points_determine_30_of_32_directions() -> None:
@@ -295,19 +210,17 @@ def _touched(null: FloatArray) -> set[str]:
     return {MODEL.coordinate_names[number] for number in np.flatnonzero(np.abs(null).max(axis=0) > 1e-9)}
 
 
-def test_with_a_straight_trunk_the_undetermined_directions_touch_exactly_the_unobserved_angles() -> None:
-    """Whatever the arms do and however the trunk is twisted."""
+@pytest.mark.parametrize("bent", [(), ("neck",)], ids=["straight", "neck bent"])
+def test_the_undetermined_directions_touch_exactly_the_unobserved_angles(bent: tuple[str, ...]) -> None:
+    """Of a straight trunk, whatever the arms do and however it is twisted; a bent neck's angles depend on the twist."""
+    straight = [part for part in ("lumbar", "thoracic", "neck") if part not in bent]
     for q in _poses(20):
-        null = _null_space(_straightened(q, "lumbar", "thoracic", "neck"))
+        null = _null_space(_straightened(q, *straight))
         assert null.shape == (2, MODEL.nv)
-        assert _touched(null) == set(UNOBSERVED)
-
-
-def test_a_bent_neck_makes_its_angles_depend_on_the_unobserved_twist() -> None:
-    for q in _poses(20):
-        null = _null_space(_straightened(q, "lumbar", "thoracic"))
-        assert null.shape == (2, MODEL.nv)
-        assert _touched(null) == {*UNOBSERVED, "neck_flexion", "neck_lateral"}
+        assert _touched(null) == {
+            *UNOBSERVED,
+            *(f"{part}_{angle}" for part in bent for angle in ("flexion", "lateral")),
+        }
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -1,0 +1,20 @@
+"""What tests of the extended filter ask of its estimates."""
+
+from __future__ import annotations
+
+from numpy.testing import assert_allclose
+
+from body_tracking.filters.ekf import ExtendedKalmanFilter
+from body_tracking.kinematics.estimate import ModelEstimate
+
+
+def known(estimator: ExtendedKalmanFilter) -> ModelEstimate:
+    estimate = estimator.estimate
+    assert estimate is not None
+    return estimate
+
+
+def assert_same(one: ModelEstimate, other: ModelEstimate, tolerance: float) -> None:
+    assert one.stamp_ns == other.stamp_ns
+    for name in ("q", "velocity", "covariance", "lengths", "lengths_stddev"):
+        assert_allclose(getattr(one, name), getattr(other, name), rtol=0.0, atol=tolerance, err_msg=name)
