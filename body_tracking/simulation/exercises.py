@@ -222,7 +222,7 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
 }
 """By name; those with chance in them as functions of a generator, or of None for the standard performance.
 
-The first six are the thesis's (Schlagenhauf 2017, sections 4.3.3-4.3.4 with figures 4.14 and 4.18, 5.6.1, 5.8). Arm
-raises, hair combing, forearm rolling, punching and shoulder lifts are among those of Jatesiktat et al. (2018), section
-IV-B.
+The first six are the thesis's (Schlagenhauf 2017, sections 4.3.3-4.3.4 with figures 4.14 and 4.18, section 5.6.1,
+section 5.8 with figure 5.16). Arm raises, hair combing, forearm rolling, punching and shoulder lifts are among those of
+Jatesiktat et al. (2018), section IV-B.
 """
