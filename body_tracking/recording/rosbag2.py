@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
@@ -38,6 +39,7 @@ __all__ = [
     "RawMessage",
     "TopicInfo",
     "deserialize",
+    "first_field",
     "is_known",
     "recover",
     "remove_file",
@@ -61,6 +63,19 @@ BAG_MESSAGES = BagMessages(_STORE.types)
 def is_known(type_name: str) -> bool:
     """Whether the definition of a message type, such as ``sensor_msgs/msg/PointCloud2``, is at hand."""
     return type_name in _STORE.types
+
+
+def first_field(type_name: str) -> tuple[str, str, bool]:
+    """Name and message type of the first field of a message type, and whether it is a sequence of these.
+
+    The type is empty for a number or a string, and for a message type that is unknown.
+    """
+    _, fields = _STORE.fielddefs.get(type_name, ((), ()))
+    for name, (node, what) in fields:
+        sequence = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        inner, kind = what[0] if sequence else (node, what)
+        return name, str(kind) if inner == Nodetype.NAME else "", sequence
+    return "", "", False
 
 
 def serialize(message: Any) -> bytes:
