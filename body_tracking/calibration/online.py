@@ -81,6 +81,9 @@ NO_POSE_AFTER = 8.0
 HALF_TURN = 0.5 * np.pi
 """A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
+FOREIGN_CLOCK = 5.0
+"""Seconds; a saved clock that is further off is not of stamps in ROS time, whose offsets are small."""
+
 CLOCK_STEP = 1.0
 """A sensor's stamps that move against its receipt by more than this mean that its clock was set, seconds."""
 
@@ -809,7 +812,11 @@ class OnlineCalibration:
             other.target = rotation, translation, translation
             other.quality = result.quality.get(name, SensorQuality())
             drift_stddev_ppm = min(other.quality.clock_drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
-            known = KnownClock(result.clocks.get(name, ClockModel()), other.quality.clock_stddev, drift_stddev_ppm)
+            clock = result.clocks.get(name, ClockModel())
+            known = KnownClock(clock, other.quality.clock_stddev, drift_stddev_ppm)
+            if abs(clock.offset) > FOREIGN_CLOCK:
+                self.events.append(f"{name}: its saved clock is {clock.offset:+.1f} s off, not in ROS time: left out")
+                known = KnownClock(drift_stddev_ppm=1e6 * DRIFT_PRIOR)
             other.known = other.loaded = known
 
     # --- services

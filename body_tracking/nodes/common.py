@@ -74,7 +74,7 @@ from body_tracking.pipeline.shared import skeleton_qos as shared_skeleton_qos
 from body_tracking.pipeline.stage import JUMP_BACK_NS
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.recording.qos import SENSOR_DATA, Qos
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.skeleton import Skeleton
 
 __all__ = ["BODY", "REFERENCE", "RELIABLE", "SENSORS", "WORLD_FRAME"]
 
@@ -153,8 +153,7 @@ class Monitor:
         self.totals["published"] += 1
         if delay_ns is not None:
             self._delays_ns.append(delay_ns)
-        # A sensor that counts from its own start tells nothing about how long ago that was.
-        if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
+        if latency_ns is not None:
             self._latencies_ns.append(latency_ns)
 
     def wants_latency(self) -> bool:

@@ -14,8 +14,8 @@ class RigReader(BagReader):
     """A bag whose topics have the names that they have in the root namespace, and whose header stamps are ROS time.
 
     Stamps by a sensor's own clock are related to the log, see :mod:`body_tracking.recording.stamps`, when messages are
-    first read. Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one that the rig
-    has too.
+    first read. Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one
+    that the rig has too.
 
     Attributes:
         namespace: in which the rig was recorded; ``/`` too where the bag holds several rigs.

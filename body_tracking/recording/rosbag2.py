@@ -70,12 +70,13 @@ def first_field(type_name: str) -> tuple[str, str, bool]:
 
     The type is empty for a number or a string, and for a message type that is unknown.
     """
-    _, fields = _STORE.fielddefs.get(type_name, ((), ()))
-    for name, (node, what) in fields:
-        sequence = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-        inner, kind = what[0] if sequence else (node, what)
-        return name, str(kind) if inner == Nodetype.NAME else "", sequence
-    return "", "", False
+    fields: list[Any] = list(_STORE.fielddefs[type_name][1]) if is_known(type_name) else []
+    if not fields:
+        return "", "", False
+    name, (node, what) = fields[0]
+    sequence = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+    inner, kind = what[0] if sequence else (node, what)
+    return str(name), str(kind) if inner == Nodetype.NAME else "", sequence
 
 
 def serialize(message: Any) -> bytes:

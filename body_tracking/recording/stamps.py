@@ -18,6 +18,7 @@ import struct
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -26,10 +27,8 @@ from body_tracking import graph
 from body_tracking.messages.base import TIME_REFERENCE
 from body_tracking.recording.mcap_file import BagError, McapFile
 from body_tracking.recording.rosbag2 import RawMessage, deserialize, first_field, serialize
+from body_tracking.sensors.ros_time import OTHER_CLOCK_NS
 from body_tracking.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray, IntArray
-
-OTHER_CLOCK_NS: Final = 60 * NANOSECONDS
-"""Stamps this far from the time of receipt are by another clock: no message takes so long, no host is so wrong."""
 
 SAME_CLOCK_NS: Final = NANOSECONDS // 10
 """Sensors whose median differences from the log are this close share a clock: their stamps keep their distances."""
@@ -93,7 +92,7 @@ class RecordedClock:
         edges = [0, *(np.flatnonzero(back | ahead) + 1).tolist(), len(stamps_ns)]
         self._runs = [
             _fitted(stamps_ns[start:stop], differences[start:stop], int(log_ns[start]))
-            for start, stop in zip(edges[:-1], edges[1:], strict=True)
+            for start, stop in pairwise(edges)
         ]
         self._starts = [run.log_ns for run in self._runs]
         self.is_ros_time = not any(run.offset_ns for run in self._runs)
@@ -128,7 +127,7 @@ def _slope(x: FloatArray, y: FloatArray) -> float:
             hull.pop()
         hull.append((cx, cy))
     middle = float(x.mean())
-    for (ax, ay), (bx, by) in zip(hull, hull[1:], strict=False):
+    for (ax, ay), (bx, by) in pairwise(hull):
         if ax < bx and middle <= bx:
             return (by - ay) / (bx - ax)
     return 0.0
@@ -183,7 +182,7 @@ class RecordedStamps:
 
     def _restamp(self, content: Any, clock: RecordedClock, log_ns: int) -> None:
         """Several stamps in one message."""
-        name, kind, sequence = first_field(content.__msgtype__)
+        name, _, sequence = first_field(content.__msgtype__)
         for each in getattr(content, name) if sequence else (content,):
             _set(each.header.stamp, clock, log_ns)
         if content.__msgtype__ == TIME_REFERENCE:  # the same instant by the clock of the sensor that it names
@@ -194,7 +193,7 @@ class RecordedStamps:
         other = [topic for topic in found if not own[topic].is_ros_time]
         sensors = [topic for topic in other if not _RESULT.fullmatch(topic)]
         for topics in _of_one_clock({topic: found[topic] for topic in sensors if own[topic].steady}):
-            stamps_ns, log_ns = (np.concatenate(parts) for parts in zip(*(found[topic] for topic in topics), strict=True))
+            stamps_ns, log_ns = (np.concatenate([found[topic][k] for topic in topics]) for k in range(2))
             order = np.argsort(log_ns, kind="stable")
             self._clocks |= dict.fromkeys(topics, RecordedClock(stamps_ns[order], log_ns[order]))
         self._clocks |= {topic: own[topic] for topic in sensors if not own[topic].steady}
