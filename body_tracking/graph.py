@@ -327,8 +327,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         POINT_CLOUD,
         SKELETON,
         "kinect_skeleton",
-        "what one sensor sees, in `<sensor>_optical_frame` and its own clock: a point per joint, SDK order; fields "
-        "`x y z` float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` uint16",
+        "what one sensor sees, in `<sensor>_optical_frame`: a point per joint, SDK order; fields `x y z` float32, "
+        "`joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` uint16",
     ),
     TopicSpec(
         IMU_SKELETON,
@@ -352,15 +352,15 @@ TOPICS: tuple[TopicSpec, ...] = (
         LATCHED,
         "calibration",
         "the pose of each sensor's optical frame in `world`, one message per sensor; holds from its stamp on (0: "
-        "always), in the reference sensor's clock",
+        "always), by the stamps of the reference sensor",
     ),
     TopicSpec(
         CALIBRATION_CLOCK,
         TIME_REFERENCE,
         LATCHED,
         "calibration",
-        "per other sensor (`source`): what its clock shows (`time_ref`) when the reference sensor's shows the stamp; "
-        "holds from the stamp on",
+        "per other sensor (`source`): what it stamps (`time_ref`) when the reference sensor stamps with the header's "
+        "stamp; holds from there on",
     ),
     TopicSpec(
         TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED, "calibration", "the same poses, where tf2_msgs is installed"
@@ -370,8 +370,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         POINT_CLOUD,
         SKELETON,
         "fusion",
-        "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`; with "
-        "`subject: all` everybody, with the person's number in `body`",
+        "the person in `world`, by the stamps of the reference sensor; in addition covariance `xx xy xz yy yz zz`; "
+        "with `subject: all` everybody, with the person's number in `body`",
     ),
     TopicSpec(
         FILTERED,
