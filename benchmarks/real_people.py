@@ -45,7 +45,7 @@ from body_tracking.graph import FUSED
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay, sensor_topics, skeletons_of
-from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.rig import RigReader
 from body_tracking.simulation.random_people import (
     MODEL,
     MeasurementErrors,
@@ -120,7 +120,7 @@ def progress(text: str) -> None:
 
 def fused_frames(bag: Path) -> list[Frame]:
     """What the fusion published, as one sensor."""
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         found = [decode_skeletons(raw.cdr) for raw in reader.messages([FUSED])]
     return [("", each[0]) for each in found if each]
 
@@ -128,7 +128,7 @@ def fused_frames(bag: Path) -> list[Frame]:
 def unpaired_frames(bag: Path, result: CalibrationResult) -> list[Frame]:
     """Each sensor's frames in world, in the order in which they arrived."""
     frames = []
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         topics = sensor_topics(reader)
         alignment = SensorAlignment(tuple(topics.values()), result.reference)
         for sensor, clock in result.clocks.items():

@@ -49,7 +49,8 @@ from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.replay import ReplaySettings, replay
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.simulation.bags import SEED, SHIPPED, shipped, write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
@@ -117,7 +118,7 @@ def methods_of(bag: Path, setup: Setup) -> tuple[list[Skeleton], dict[str, list[
 
 
 def _read(bag: Path, topic: str) -> list[Skeleton]:
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         return [
             (decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr)))[0]
             for raw in reader.messages([topic])

@@ -45,6 +45,7 @@ import yaml
 from body_tracking import graph
 from body_tracking.calibration.result import CalibrationResult, ClockModel, SensorQuality
 from body_tracking.calibration.storage import save
+from body_tracking.cdr import decode_skeletons
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds
@@ -52,6 +53,7 @@ from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.parameters import SECTION
 from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
 from body_tracking.simulation import scene
 from body_tracking.simulation.bags import write_bag
@@ -101,17 +103,14 @@ class Options:
 
 
 def simulate(seconds: float, folder: Path) -> SimulatedRecording:
-    """The recording as a bag in a folder, and its calibration in two files."""
+    """The recording as a bag in a folder, and its calibration, live or not: stamps of all sensors are ROS time."""
     recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
     write_bag(recording, folder / "bag")
     names = [sensor.pose.sensor for sensor in recording.sensors]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
     quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
-    for file, clocks in (
-        ("recorded.yaml", {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}),
-        ("received.yaml", dict.fromkeys(names, ClockModel())),
-    ):
-        save(CalibrationResult(names[0], poses, clocks, quality), folder / file)
+    clocks = dict.fromkeys(names, ClockModel())
+    save(CalibrationResult(names[0], poses, clocks, quality), folder / "calibration.yaml")
     return recording
 
 
@@ -157,7 +156,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     }
     parameters.write_text(yaml.safe_dump(values), encoding="utf-8")
     up = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", options.filter, "--sensors", ",".join(names)]
-    up += ["--params-file", str(parameters), "--calibration", str(folder / "received.yaml")]
+    up += ["--params-file", str(parameters), "--calibration", str(folder / "calibration.yaml")]
     up += ["--record", str(folder / "live"), "--log-dir", str(folder), "--reliable"]
     with hosts.hosts() as (outside, middle), contextlib.ExitStack() as stack:
 
@@ -290,7 +289,7 @@ def without_lost(folder: Path, came: Mapping[str, FloatArray]) -> Path:
 def offline(folder: Path, bag: Path, out: Path, name: str) -> Angles:
     """What the chain makes of a recording."""
     calibration = folder / f"{out.name}.yaml"
-    shutil.copy(folder / "recorded.yaml", calibration)
+    shutil.copy(folder / "calibration.yaml", calibration)
     command = [sys.executable, "-m", "body_tracking.cli", "replay", str(bag), "-o", str(out), "--filter", name]
     subprocess.run([*command, "--calibration", str(calibration)], check=True, stdout=subprocess.DEVNULL)
     return read_angles(out)
@@ -311,6 +310,10 @@ def measure(options: Options) -> dict[str, Any]:
         whole = offline(folder, folder / "bag", folder / "whole", options.filter)
         lossy = offline(folder, without_lost(folder, came), folder / "of_what_came", options.filter)
         values = last_values(folder / "live")
+        reference = next(iter(came))
+        with RigReader(folder / "bag") as reader:
+            frames = [decode_skeletons(raw.cdr) or () for raw in reader.messages([graph.skeleton_topic(reference)])]
+            recorded = np.array([skeleton.stamp_ns for (skeleton,) in frames])
     result: dict[str, Any] = {
         "seconds": recording.duration,
         "cut_s": options.cut,
@@ -347,9 +350,9 @@ def measure(options: Options) -> dict[str, Any]:
                 for key in ("sessions", "round trip ms", "lost", "clock drift ppm")
             },
         }
-    reference, rows = next(iter(came.items()))
-    # the reference sensor's clock and this machine's, by the frames that both stamped
-    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, (truth[reference][rows[:, 0], 1] - rows[:, 1]), 1)
+    rows = came[reference]
+    # ROS time of the recording and of this machine, by the frames that have both
+    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, recorded[rows[:, 0]] - rows[:, 1], 1)
     stamps = live.stamps + base + slope * (live.stamps - rows[0, 1]) / NANOSECONDS
     result["angles"] = compare(live, stamps, whole, lossy, start, link)
     return result

@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -18,19 +19,17 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
 from body_tracking.skeleton import NANOSECONDS
 
-MOST_S = 1.0
-"""From capture to the log on a busy machine."""
+MOST_S, LATEST_S = 1.0, 10.0
+"""From capture to the log, as a rule and on a machine with much else to do."""
 TICK_S = 0.05
 """Of ``/clock``: the recorder may have heard one less than who publishes."""
-REPORT_S = 10.0
-"""Diagnostics are sent in between and by nodes that lag behind: no capture, but the same clock."""
 HOLD_FROM_S = 1.0
 """Calibration is stamped with the time from which on it holds, half a second ahead."""
 
 
 def test_every_stamp_of_a_live_graph_is_in_the_time_of_its_clock(wave: Path, tmp_path: Path) -> None:
     live = tmp_path / "live"
-    words = ["up", "--bag", wave, "--filter", "ekf", "--record", live, "--reliable"]
+    words = ["up", "--bag", wave, "--rate", "0.5", "--record", live, "--reliable"]
     done = subprocess.run(
         [sys.executable, "-m", "body_tracking.cli", *words],
         capture_output=True,
@@ -60,8 +59,7 @@ def test_every_stamp_of_a_live_graph_is_in_the_time_of_its_clock(wave: Path, tmp
     for topic, ages in found.items():
         holds = topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK)
         early = HOLD_FROM_S if holds else TICK_S
-        late = REPORT_S if topic == graph.DIAGNOSTICS_TOPIC else MOST_S
-        assert -early <= min(ages) and max(ages) < late, (topic, min(ages), max(ages))
+        assert -early <= min(ages) and median(ages) < MOST_S and max(ages) < LATEST_S, (topic, min(ages), max(ages))
     # as a buffer of tf2 has to: at the time of most angles a pose is in force, and not from the beginning of time
     later = [stamp for stamp in shown if any(0 < pose <= stamp for pose in poses)]
     assert len(later) > 0.5 * len(shown)
