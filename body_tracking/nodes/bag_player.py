@@ -59,7 +59,7 @@ class BagPlayer(GraphNode):
     PARAMETERS = PARAMETERS
 
     playback: Playback | None = None
-    clock_topic: Any = None
+    clock_ns = 0
 
     def configure(self, values: Mapping[str, Value]) -> None:
         """Rate and loop may change while it plays."""
@@ -87,6 +87,7 @@ class BagPlayer(GraphNode):
             paused=given["start_paused"],
         )
         self.clock_ns = self.reader.start_ns
+        self.clock_topic = None
         if given["clock_rate"]:
             depth = graph.RELIABLE_SKELETON.depth if given["reliable"] else RELIABLE.depth
             qos = Qos(RELIABLE.reliability, RELIABLE.durability, depth)
@@ -107,8 +108,8 @@ class BagPlayer(GraphNode):
         self.alarm.reset()
 
     def now_ns(self) -> int:
-        """The time of the bag, which is that of the graph where this node publishes ``/clock``."""
-        return super().now_ns() if self.clock_topic is None else self.clock_ns
+        """The time of the bag, which is that of the graph where this node publishes ``/clock``; 0 before it begins."""
+        return self.clock_ns if self.values["clock_rate"] else super().now_ns()
 
     # --- topics
 
