@@ -202,7 +202,7 @@ class PlayedRobots(Robots):
         self.start("calibration", sensors="[kinect1]", use_sim_time=True)
         # One goes by the wall clock and stamps its commands by it: its person's angles are stamped anew. The other goes
         # by /clock, which ends with the player.
-        self.offset_ns: int | None = None
+        self.offset_ns, self.last_ns = 0, 0
         played, live = BODIES["two_joint_arm"], "live"
         for name in (graph.joint_states_topic, graph.joint_states_stddev_topic):
             publisher = self.node.create_publisher(JointState, name(live), RELIABLE)
@@ -215,8 +215,9 @@ class PlayedRobots(Robots):
 
         def on_angles(message: JointState) -> None:
             stamp_ns = to_nanoseconds(message.header.stamp)
-            if self.offset_ns is None:
+            if not self.last_ns or stamp_ns < self.last_ns - NANOSECONDS:  # the bag begins, again
                 self.offset_ns = time.time_ns() - LATENCY_NS - stamp_ns
+            self.last_ns = stamp_ns
             message.header.stamp = to_time(stamp_ns + self.offset_ns, ROS)
             message.name = [f"{name.removesuffix(played)}{live}" for name in message.name]
             publisher.publish(message)
@@ -225,7 +226,7 @@ class PlayedRobots(Robots):
 
     def play(self) -> None:
         """Start the sensor."""
-        self.offset_ns = None
+        self.last_ns = 0
         self.start("bag_player", bag=self.bag, loop=True, wait_for_subscribers=f"['{SENSOR}:3']", wait_timeout=60.0)
 
     def said(self, robot: str) -> dict[str, str]:
