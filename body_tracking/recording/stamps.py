@@ -107,7 +107,9 @@ class RecordedClock:
 
 def _fitted(stamps_ns: IntArray, differences_ns: IntArray, log_ns: int) -> _Run:
     """Equation 1, with a drift of at most :data:`MAX_DRIFT`."""
-    if np.abs(differences_ns).min() <= OTHER_CLOCK_NS:
+    lasted_ns = int(np.ptp(stamps_ns))
+    # A log that was not kept while messages came, as some converters write it, tells nothing.
+    if np.abs(differences_ns).min() <= OTHER_CLOCK_NS or 2 * np.ptp(stamps_ns + differences_ns) < lasted_ns > SET_NS:
         return _Run(log_ns)
     anchor_ns, least_ns = int(stamps_ns.min()), int(differences_ns.min())
     # Relative to these, because a float has no room for nanoseconds since 1970.
