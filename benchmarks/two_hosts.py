@@ -103,14 +103,14 @@ class Options:
 
 
 def simulate(seconds: float, folder: Path) -> SimulatedRecording:
-    """The recording as a bag in a folder, and its calibration, live or not: stamps of all sensors are ROS time."""
+    """The recording as a bag in a folder, and its calibration in two files; in both stamps are ROS time."""
     recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
     write_bag(recording, folder / "bag")
     names = [sensor.pose.sensor for sensor in recording.sensors]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
     quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in names}
-    clocks = dict.fromkeys(names, ClockModel())
-    save(CalibrationResult(names[0], poses, clocks, quality), folder / "calibration.yaml")
+    for file, clock in (("recorded.yaml", ClockModel(anchor_ns=RECEIVED_FROM_NS)), ("received.yaml", ClockModel())):
+        save(CalibrationResult(names[0], poses, dict.fromkeys(names, clock), quality), folder / file)
     return recording
 
 
@@ -156,7 +156,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     }
     parameters.write_text(yaml.safe_dump(values), encoding="utf-8")
     up = [sys.executable, "-m", "body_tracking.cli", "up", "--filter", options.filter, "--sensors", ",".join(names)]
-    up += ["--params-file", str(parameters), "--calibration", str(folder / "calibration.yaml")]
+    up += ["--params-file", str(parameters), "--calibration", str(folder / "received.yaml")]
     up += ["--record", str(folder / "live"), "--log-dir", str(folder), "--reliable"]
     with hosts.hosts() as (outside, middle), contextlib.ExitStack() as stack:
 
@@ -289,7 +289,7 @@ def without_lost(folder: Path, came: Mapping[str, FloatArray]) -> Path:
 def offline(folder: Path, bag: Path, out: Path, name: str) -> Angles:
     """What the chain makes of a recording."""
     calibration = folder / f"{out.name}.yaml"
-    shutil.copy(folder / "calibration.yaml", calibration)
+    shutil.copy(folder / "recorded.yaml", calibration)
     command = [sys.executable, "-m", "body_tracking.cli", "replay", str(bag), "-o", str(out), "--filter", name]
     subprocess.run([*command, "--calibration", str(calibration)], check=True, stdout=subprocess.DEVNULL)
     return read_angles(out)
