@@ -42,7 +42,7 @@ from body_tracking.fusion.subject import ALL, PeopleParameters
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import sensor_topics
-from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.recording.rig import RigReader
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, SimulatedRecording, lanes, simulate
 from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
@@ -160,7 +160,7 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
     newest_ns = -(10**18)
     numbers: Counter[int] = Counter()
     apart: list[float] = []
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         topics = sensor_topics(reader)
         for raw in reader.messages(topics):
             sensor, skeletons = topics[raw.topic], decode_skeletons(raw.cdr)

@@ -38,7 +38,8 @@ from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay, sensor_topics, skeletons_of
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}
@@ -61,7 +62,7 @@ PAUSE = 5.0
 
 def skeletons(bag: Path, topic: str) -> list[Skeleton]:
     """All of a topic's skeletons, in order of their stamps."""
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         found = [decode_skeletons(raw.cdr) for raw in reader.messages([topic])]
     return sorted((each[0] for each in found if each), key=lambda each: each.stamp_ns)
 
@@ -101,7 +102,7 @@ def disagreement(bag: Path, result: CalibrationResult) -> float:
 def settling(bag: Path, movement_ns: int, nominal: float) -> float:
     """Seconds of movement until the published yaw is within 3 degrees of the marks and stays there."""
     reference, wrong_until = None, movement_ns
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         for raw in reader.messages([CALIBRATION]):
             pose = transform_to_pose(deserialize(TRANSFORM, raw.cdr))
             if pose.sensor == "kinect1":
@@ -122,7 +123,7 @@ def reversals(axes: FloatArray) -> int:
 
 def unpaired_frames(bag: Path, result: CalibrationResult) -> list[tuple[str, Skeleton]]:
     """Each sensor's frames in world, in the order in which they arrived."""
-    with BagReader(bag) as reader:
+    with RigReader(bag) as reader:
         topics = sensor_topics(reader)
         alignment = SensorAlignment(tuple(topics.values()), result.reference)
         for sensor, clock in result.clocks.items():

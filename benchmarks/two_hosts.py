@@ -40,12 +40,15 @@ import live
 import numpy as np
 
 from body_tracking import graph
+from body_tracking.cdr import decode_skeletons
+from body_tracking.clocks import ClockModel
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
 from body_tracking.simulation import scene
 from body_tracking.simulation.bags import write_bag
@@ -95,12 +98,12 @@ class Options:
 
 
 def simulate(seconds: float, folder: Path) -> SimulatedRecording:
-    """The recording as a bag in a folder, and its calibration in two files."""
+    """The recording as a bag in a folder, and its calibration in two files; in both stamps are ROS time."""
     recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
     write_bag(recording, folder / "bag")
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    live.calibrated(folder / "recorded.yaml", poses, clocks)
+    trusted = dict.fromkeys(poses, ClockModel(anchor_ns=RECEIVED_FROM_NS))
+    live.calibrated(folder / "recorded.yaml", poses, trusted)
     live.calibrated(folder / "received.yaml", poses)
     return recording
 
@@ -289,6 +292,10 @@ def measure(options: Options) -> dict[str, Any]:
         whole = offline(folder, folder / "bag", folder / "whole", options.filter)
         lossy = offline(folder, without_lost(folder, came), folder / "of_what_came", options.filter)
         values = last_values(folder / "live")
+        reference = next(iter(came))
+        with RigReader(folder / "bag") as reader:
+            frames = [decode_skeletons(raw.cdr) or () for raw in reader.messages([graph.skeleton_topic(reference)])]
+            recorded = np.array([skeleton.stamp_ns for (skeleton,) in frames])
     result: dict[str, Any] = {
         "seconds": recording.duration,
         "cut_s": options.cut,
@@ -325,9 +332,9 @@ def measure(options: Options) -> dict[str, Any]:
                 for key in ("sessions", "round trip ms", "lost", "clock drift ppm")
             },
         }
-    reference, rows = next(iter(came.items()))
-    # the reference sensor's clock and this machine's, by the frames that both stamped
-    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, (truth[reference][rows[:, 0], 1] - rows[:, 1]), 1)
+    rows = came[reference]
+    # ROS time of the recording and of this machine, by the frames that have both
+    slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, recorded[rows[:, 0]] - rows[:, 1], 1)
     stamps = live.stamps + base + slope * (live.stamps - rows[0, 1]) / NANOSECONDS
     result["angles"] = compare(live, stamps, whole, lossy, start, link)
     return result

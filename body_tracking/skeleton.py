@@ -159,8 +159,8 @@ class Skeleton:
     """One body at one instant.
 
     Attributes:
-        stamp_ns: capture time in nanoseconds, in the clock of whoever made it (a sensor's own clock, or the
-            reference sensor's clock for fused and filtered skeletons).
+        stamp_ns: capture time in ROS time, nanoseconds: as its sensor stamps, or as the reference sensor does where it
+            is fused or filtered. In files that are imported, by the sensor's own clock.
         frame_id: the frame of the positions, such as ``kinect1_optical_frame`` or ``world``.
         positions: (n, 3) metres; NaN where nothing is known.
         states: (n,) uint8 of :class:`TrackingState`.

@@ -74,6 +74,9 @@ NO_POSE_AFTER = 8.0
 HALF_TURN = 0.5 * np.pi
 """A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
+FOREIGN_CLOCK = 5.0
+"""Seconds; a saved clock that is further off is not of stamps in ROS time, whose offsets are small."""
+
 CLOCK_STEP = 1.0
 """A saved offset that is farther from the guess by the times of receipt is of another clock, seconds."""
 
@@ -779,11 +782,14 @@ class OnlineCalibration:
             other.target = rotation, translation, translation
             other.quality = result.quality.get(name, SensorQuality())
             drift_stddev_ppm = min(other.quality.clock_drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
-            other.clock = other.loaded = replace(
-                result.clocks.get(name, ClockModel()),
-                stddev=other.quality.clock_stddev,
-                drift_stddev_ppm=drift_stddev_ppm,
-            )
+            clock = result.clocks.get(name, ClockModel())
+            if abs(clock.offset) > FOREIGN_CLOCK:
+                self.events.append(f"{name}: its saved clock is {clock.offset:+.1f} s off, not in ROS time: left out")
+                other.clock = other.loaded = ClockModel(drift_stddev_ppm=1e6 * DRIFT_PRIOR)
+            else:
+                other.clock = other.loaded = replace(
+                    clock, stddev=other.quality.clock_stddev, drift_stddev_ppm=drift_stddev_ppm
+                )
 
     # --- services
 

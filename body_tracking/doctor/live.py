@@ -27,6 +27,8 @@ from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_status import NodeStatus
 from body_tracking.nodes.bag_topics import message_class
+from body_tracking.sensors.ros_time import OTHER_CLOCK_NS
+from body_tracking.skeleton import NANOSECONDS
 
 PATIENCE = 10.0
 """Seconds for a sensor that was asked for to begin."""
@@ -138,13 +140,15 @@ def stream(text: str, kind: str, came: Sequence[tuple[float, float, float]]) -> 
     if not came:
         remedy = "is somebody in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
         return Finding(PROBLEM if kind == IMU else WARNING, f"{text}: nothing came", remedy)
-    times, stamps, ages = zip(*came, strict=True)
+    times, _, ages = zip(*came, strict=True)
     rate = (len(came) - 1) / max(times[-1] - times[0], 1e-3)
-    age, own_clock = median(ages), median(stamps) < 1e9  # no ROS time: it counts from the sensor's start
-    text += f": {rate:.1f} Hz, stamps " + ("of the sensor's own clock" if own_clock else f"{age:.2f} s old")
+    age = median(ages)
+    text += f": {rate:.1f} Hz, stamps {age:.2f} s old"
     remedy = ""
     if rate < LEAST_RATE[kind]:
         remedy = f"it should have {LEAST_RATE[kind]:.0f} Hz: more light, USB 3, the driver's settings, less load"
-    elif abs(age) > OLD and not own_clock:
+    elif abs(age) > OTHER_CLOCK_NS / NANOSECONDS:
+        remedy = "its driver must stamp in ROS time: docs/your_own_sensor.md (right for a recording without /clock)"
+    elif abs(age) > OLD:
         remedy = "synchronise the clocks: sudo timedatectl set-ntp true (right for a recording without /clock)"
     return Finding(WARNING if remedy else OK, text, remedy)

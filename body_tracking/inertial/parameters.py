@@ -37,7 +37,7 @@ class TrackingParameters:
     )
     clock: str = _choice(
         OWN,
-        "own: each sensor has a clock of its own; shared: all have the same; reference: they have that of world",
+        "own: each sensor has a clock of its own; shared: all have the same; reference: stamps are as those of world",
         OWN,
         SHARED,
         REFERENCE,

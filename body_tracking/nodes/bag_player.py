@@ -59,6 +59,7 @@ class BagPlayer(GraphNode):
     PARAMETERS = PARAMETERS
 
     playback: Playback | None = None
+    clock_ns = 0
 
     def configure(self, values: Mapping[str, Value]) -> None:
         """Rate and loop may change while it plays."""
@@ -85,12 +86,12 @@ class BagPlayer(GraphNode):
             clock_hz=given["clock_rate"],
             paused=given["start_paused"],
         )
+        self.clock_ns = self.reader.start_ns
         self.clock_topic = None
         if given["clock_rate"]:
             depth = graph.RELIABLE_SKELETON.depth if given["reliable"] else RELIABLE.depth
             qos = Qos(RELIABLE.reliability, RELIABLE.durability, depth)
             self.clock_topic = self.make_publisher(Clock, graph.CLOCK_TOPIC, to_profile(qos))
-        self.clock_ns = self.reader.start_ns
         self.warned = 0
         self.warn_of_damage()
         self.create_service(Trigger, "~/pause", self.on_pause)
@@ -105,6 +106,10 @@ class BagPlayer(GraphNode):
         """Set the timer anew."""
         self.alarm.timer_period_ns = max(1, after_ns)
         self.alarm.reset()
+
+    def now_ns(self) -> int:
+        """The time of the bag, which is that of the graph where this node publishes ``/clock``; 0 before it begins."""
+        return self.clock_ns if self.values["clock_rate"] else super().now_ns()
 
     # --- topics
 

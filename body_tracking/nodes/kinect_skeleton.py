@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import traceback
+from dataclasses import replace
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -18,9 +19,9 @@ from body_tracking.cdr import encode_skeletons
 from body_tracking.errors import BodyTrackingError
 from body_tracking.nodes.common import RELIABLE, GraphNode, run
 from body_tracking.parameters import Parameter
-from body_tracking.sensors import check_sensor_name
+from body_tracking.sensors import RecordedFrame, check_sensor_name
 from body_tracking.sensors.live import SourceSettings, backends, described, open_source
-from body_tracking.skeleton import Skeleton
+from body_tracking.sensors.ros_time import RosTime
 
 _DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0
@@ -32,7 +33,7 @@ PARAMETERS = (
     Parameter("file", "", "recording: a .csv, .csv.gz or .skeleton file, or a bag"),
     Parameter("recorded_sensor", "", "recording: the sensor's name in the file; empty for the same name"),
     Parameter("rate", 1.0, "recording: seconds of it per second", min=0.01, max=100.0),
-    Parameter("loop", False, "recording: begin again at the end; stamps jump back then"),
+    Parameter("loop", False, "recording: begin again at the end; time goes on"),
     Parameter(
         "start_time",
         0.0,
@@ -87,6 +88,7 @@ class KinectSkeleton(GraphNode):
             given["key_file"],
             given["least_delay"],
         )
+        self.ros_time = RosTime()
         self.source = open_source(given["backend"], settings)
         self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
         self.thread = threading.Thread(target=self.publish_frames, daemon=True)
@@ -100,16 +102,19 @@ class KinectSkeleton(GraphNode):
                 frame = self.source.read(timeout=0.2)
                 if frame is None:
                     continue
-                publish(frame.skeletons)
+                publish(frame)
         except Exception as error:  # whatever the library of a sensor raises
             if self.context.ok():  # not closed while it was being read
                 self.failed(error)
 
-    def publish_frame(self, skeletons: tuple[Skeleton, ...]) -> None:
+    def publish_frame(self, frame: RecordedFrame) -> None:
         """One message; a frame of which none can be made is left out."""
-        stamp_ns, message = skeletons[0].stamp_ns, encode_skeletons(skeletons)
-        # the network's stamps are ROS time, those of a recording of any
-        if self.values["backend"] != "network" or not self.is_stale(self.output.topic_name, stamp_ns):
+        skeletons = frame.skeletons
+        stamp_ns = self.ros_time.stamp(skeletons[0].stamp_ns, frame.received_ns)
+        if stamp_ns != skeletons[0].stamp_ns:
+            skeletons = tuple(replace(each, stamp_ns=stamp_ns) for each in skeletons)
+        message = encode_skeletons(skeletons)
+        if not self.is_stale(self.output.topic_name, stamp_ns):
             self.send(self.output, message, stamp_ns)
 
     def failed(self, error: Exception) -> None:

@@ -41,7 +41,6 @@ from body_tracking.parameters import Parameter, Value
 from body_tracking.recording.qos import LATCHED
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.robot.calibration import CalibrationQuality
-from body_tracking.robot.clock import AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
 from body_tracking.robot.mapping import TRAJECTORY, MappingError, load
 from body_tracking.sensors import check_sensor_name
@@ -52,22 +51,6 @@ PARAMETERS = (
     BODY,
     SENSORS,
     Parameter("rate", 100.0, "commands per second", unit="Hz", min=10.0, max=1000.0),
-    Parameter(
-        "clock",
-        AUTO_CLOCK,
-        "by which angles are stamped: ros, or a sensor's own that need not show the time of day, as a Kinect's; auto: "
-        "decided once, by the first angles: a sensor's where stamps count from a start (less than a year) and ROS time "
-        "does not, else ros",
-        choices=(AUTO_CLOCK, ROS_CLOCK, SENSOR_CLOCK),
-    ),
-    Parameter(
-        "delay",
-        0.05,
-        "with a sensor's clock: from capture to here of the quickest angles, which cannot be measured here",
-        unit="s",
-        min=0.0,
-        max=1.0,
-    ),
     RELIABLE,
 )
 
@@ -92,7 +75,7 @@ class RobotCommands(GraphNode):
         self.body = graph.check_body(given["body"])
         self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         self.mapping = load(Path(given["mapping"]).expanduser(), {name: angle_names(name) for name in ALL_CONVENTIONS})
-        self.follower = Follower(self.mapping, 1.0 / given["rate"], given["clock"], given["delay"])
+        self.follower = Follower(self.mapping, 1.0 / given["rate"])
         self.follower.watch_sensors(self.sensors)
 
     def start(self) -> None:

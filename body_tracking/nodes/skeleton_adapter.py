@@ -20,6 +20,7 @@ from body_tracking.parameters import Parameter
 from body_tracking.recording.qos import SENSOR_DATA
 from body_tracking.sensors import check_sensor_name, optical_frame
 from body_tracking.sensors.azure import bodies_of
+from body_tracking.sensors.ros_time import RosTime
 from body_tracking.skeleton import TrackingState
 
 PARAMETERS = (
@@ -56,6 +57,7 @@ class SkeletonAdapter(GraphNode):
         self.joint_state = TrackingState[given["state"].upper()]
         self.topic: str = self.resolve_topic_name(given["topic"])
         self.heard: float | None = None
+        self.ros_time = RosTime()
         self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
         self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
@@ -67,6 +69,7 @@ class SkeletonAdapter(GraphNode):
         stamp_ns, ids, points = markers_to_points(message)
         if self.monitor.message_in(self.topic, stamp_ns):
             self.log_seldom("jump", f"{self.topic}: time jumped back", period_s=1.0)
+        stamp_ns = self.ros_time.stamp(stamp_ns, self.arrived_ns)
         skeletons = bodies_of(ids, points, stamp_ns, self.frame_id, self.joint_state)
         if skeletons:
             self.send(self.output, encode_skeletons(skeletons), stamp_ns, sent_ns)

@@ -1,4 +1,4 @@
-"""The recording of one rig, whatever the namespace in which it was made."""
+"""The recording of one rig, whatever the namespace in which it was made and the clocks by which its sensors stamp."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from pathlib import Path
 
 from body_tracking import names
 from body_tracking.recording.rosbag2 import BagReader, RawMessage
+from body_tracking.recording.stamps import RecordedStamps
 
 
 class RigReader(BagReader):
-    """A bag whose topics have the names that they have in the root namespace.
+    """A bag whose topics have the names that they have in the root namespace, and whose header stamps are ROS time.
 
-    Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one that the rig
-    has too.
+    Stamps by a sensor's own clock are related to the log, see :mod:`body_tracking.recording.stamps`, when messages are
+    first read. Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one
+    that the rig has too.
 
     Attributes:
         namespace: in which the rig was recorded; ``/`` too where the bag holds several rigs.
@@ -27,9 +29,12 @@ class RigReader(BagReader):
         self._recorded = {topic or name: name for topic, name in found}
         self._names = {name: topic for topic, name in self._recorded.items()}
         self.topics = {topic: self.topics[name] for topic, name in sorted(self._recorded.items())}
+        self._stamps: RecordedStamps | None = None
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None) -> Iterator[RawMessage]:
-        """As of :class:`BagReader`, by the names in :attr:`topics`."""
+        """As of :class:`BagReader`, by the names in :attr:`topics` and stamped in ROS time."""
+        if self._stamps is None:
+            self._stamps = RecordedStamps(self.files, self._names)
         wanted = self._names if topics is None else {self._recorded[each] for each in topics if each in self._recorded}
         for message in super().messages(wanted, start_ns):
-            yield message._replace(topic=self._names[message.topic])
+            yield self._stamps.in_ros_time(message._replace(topic=self._names[message.topic]))

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from mcap.writer import Writer
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
@@ -48,6 +49,20 @@ BAG_MESSAGES = BagMessages(_STORE.types)
 def is_known(type_name: str) -> bool:
     """Whether the definition of a message type, such as ``sensor_msgs/msg/PointCloud2``, is at hand."""
     return type_name in _STORE.types
+
+
+def first_field(type_name: str) -> tuple[str, str, bool]:
+    """Name and message type of the first field of a message type, and whether it is a sequence of these.
+
+    The type is empty for a number or a string, and for a message type that is unknown.
+    """
+    fields: list[Any] = list(_STORE.fielddefs[type_name][1]) if is_known(type_name) else []
+    if not fields:
+        return "", "", False
+    name, (node, what) = fields[0]
+    sequence = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+    inner, kind = what[0] if sequence else (node, what)
+    return str(name), str(kind) if inner == Nodetype.NAME else "", sequence
 
 
 def serialize(message: Any) -> bytes:

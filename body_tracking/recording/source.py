@@ -1,4 +1,4 @@
-"""A recording in place of a live sensor: its frames come when they came then."""
+"""A recording in place of a live sensor: its frames come when they came then, as if they were captured now."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, deserialize
+from body_tracking.recording.stamps import RecordedClock
 from body_tracking.sensors import RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.sensors.csv_recording import sensor_column
 from body_tracking.sensors.live import SourceError, SourceSettings, register
@@ -30,7 +33,8 @@ class RecordingSource:
     """Plays one sensor of a recording (CSV, NTU RGB+D, bag) in real time.
 
     The recording's zero is the receipt of its first frame of any sensor, so that the sensors of one recording, each
-    played by a process of its own with the same ``start_time``, stay in step.
+    played by a process of its own with the same ``start_time``, stay in step. A frame is stamped with the time at which
+    it plays minus its delay then (see :mod:`body_tracking.recording.stamps`); in a loop, time goes on.
 
     Args:
         settings: ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time`` count.
@@ -49,7 +53,9 @@ class RecordingSource:
         self._wanted = settings.recorded_sensor or settings.sensor
         self._counters: Counter[str] = Counter()
         self._closed = threading.Event()
-        self._frames = _frames(Path(settings.file), self._wanted)
+        self._file = Path(settings.file)
+        self._clock = None if _is_bag(self._file) else _clock(_frames(self._file, self._wanted))
+        self._frames = _frames(self._file, self._wanted)
         self._zero_ns: int | None = None
         self._last_ns = 0
         self._rounds_ns = 0
@@ -91,16 +97,30 @@ class RecordingSource:
             self._closed.wait(max(0, min(due_ns, deadline_ns) - now_ns) / NANOSECONDS)
             if due_ns > deadline_ns:
                 return None
-            frame, self._next = self._next, self._advance()
+            frame = self._now(self._next)
+            self._next = self._advance()
             return frame
         self._closed.wait(timeout)
         return None
 
     def _due_ns(self, frame: RecordedFrame) -> int:
         """Wall time at which a frame of the present round plays."""
+        return self._wall_ns(frame.received_ns)
+
+    def _wall_ns(self, recorded_ns: int) -> int:
+        """Wall time of an instant of the present round, nanoseconds."""
         assert self._zero_ns is not None
-        elapsed = self._rounds_ns + frame.received_ns - self._zero_ns
+        elapsed = self._rounds_ns + recorded_ns - self._zero_ns
         return self._start_ns + round(elapsed / self._settings.rate)
+
+    def _now(self, frame: RecordedFrame) -> RecordedFrame:
+        """A frame under the sensor's name, with its times as if it were captured and received now."""
+        name, stamp_ns = self._settings.sensor, frame.skeletons[0].stamp_ns
+        if self._clock is not None:
+            stamp_ns = self._clock.to_ros(stamp_ns, frame.received_ns)
+        stamp_ns = self._wall_ns(stamp_ns)
+        skeletons = [replace(each, stamp_ns=stamp_ns, frame_id=optical_frame(name)) for each in frame.skeletons]
+        return RecordedFrame(name, self._due_ns(frame), tuple(skeletons))
 
     def _skip_rounds(self, late_ns: int) -> None:
         """Leave out whole rounds at once, once it is known how long one takes."""
@@ -116,24 +136,30 @@ class RecordingSource:
                     self._zero_ns = received_ns
                 self._last_ns = max(self._last_ns, received_ns)
                 if frame is not None:
-                    return self._named(frame)
+                    return frame
             if not self._settings.loop or self._zero_ns is None:
                 return None
             self._rounds_ns += self._last_ns - self._zero_ns + LOOP_GAP_NS
-            self._frames = _frames(Path(self._settings.file), self._wanted)
+            self._frames = _frames(self._file, self._wanted)
         return None
 
-    def _named(self, frame: RecordedFrame) -> RecordedFrame:
-        name = self._settings.sensor
-        if frame.sensor == name:
-            return frame
-        skeletons = tuple(replace(skeleton, frame_id=optical_frame(name)) for skeleton in frame.skeletons)
-        return RecordedFrame(name, frame.received_ns, skeletons)
+
+def _is_bag(path: Path) -> bool:
+    return path.is_dir() or path.suffix == ".mcap"
+
+
+def _clock(frames: Iterator[tuple[int, RecordedFrame | None]]) -> RecordedClock | None:
+    """The clock of a sensor's stamps against that of receipt; None without frames."""
+    times = sorted((received_ns, frame.skeletons[0].stamp_ns) for received_ns, frame in frames if frame is not None)
+    if not times:
+        return None
+    log_ns, stamps_ns = np.array(times, dtype=np.int64).T
+    return RecordedClock(stamps_ns, log_ns)
 
 
 def _frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None]]:
     """Receipt of every frame of a recording, and the frame itself if it is of the wanted sensor."""
-    if path.is_dir() or path.suffix == ".mcap":
+    if _is_bag(path):
         yield from _bag_frames(path, sensor)
         return
     # What does not name its sensors itself is of the wanted one.

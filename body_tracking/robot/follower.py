@@ -15,13 +15,13 @@ States and what leads from one to the next (times by the mapping's ``SafetyLimit
   did not go where it was sent, the command is where the robot stands.
 
 A fault is any of: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although
-somebody goes on saying what is to be expected; angles older than ``max_age``, stamped in the future or by another clock
-than at the start; angles of another convention than the mapping's, or with other names; angles of two publishers; an
-angle that is not finite, that no body has, or that is less certain than allowed; no good calibration; a robot that is
-silent or not where it was sent; commands that came to a standstill themselves. Each is told by name. These stop at
-once, without holding: another publisher of the commands, a robot beyond its limits, a standstill of ``STANDSTILL``.
+somebody goes on saying what is to be expected; angles older than ``max_age``, or stamped in the future; angles of
+another convention than the mapping's, or with other names; angles of two publishers; an angle that is not finite, that
+no body has, or that is less certain than allowed; no good calibration; a robot that is silent or not where it was sent;
+commands that came to a standstill themselves. Each is reported by name. These stop at once, without holding: another
+publisher of the commands, a robot beyond its limits, a standstill of ``STANDSTILL``.
 
-Nothing in here looks at a clock. Two times are given: ``now_ns`` in the clock of the stamps (which may stand still or
+Nothing in here looks at a clock. Two times are given: ``now_ns`` in ROS time, as stamps are (it may stand still or
 jump), and ``steady_ns``, which never does. This is no safety-rated function.
 """
 
@@ -37,7 +37,6 @@ from body_tracking.clocks import jumped_back
 from body_tracking.errors import BodyTrackingError
 from body_tracking.kinematics.angles import JointAngles
 from body_tracking.robot.calibration import CalibrationWatch
-from body_tracking.robot.clock import ANOTHER_CLOCK_NS, AUTO_CLOCK, StampClock
 from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
 from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
@@ -50,6 +49,9 @@ STANDSTILL = 2.0
 
 _AHEAD = 0.05
 """Seconds by which stamps may be in the future: clocks that are kept together differ by less."""
+
+_OTHER_CLOCK = 10.0
+"""Seconds from now beyond which a stamp hardly is ROS time."""
 
 _SETTLING_NS = NANOSECONDS
 """After ROS time jumped back, angles are not used for so long: some are still of the time before."""
@@ -141,7 +143,6 @@ class Follower:
     Args:
         mapping: of the robot.
         period: seconds between two commands. A fault that would be one by the next command is one now.
-        clock, delay: by which clock angles are stamped; see :class:`StampClock`.
 
     Attributes:
         state: what it does now.
@@ -152,7 +153,7 @@ class Follower:
         FollowerError: ``silence`` is not longer than the period, or the point of a trajectory nearer than that.
     """
 
-    def __init__(self, mapping: RobotMapping, period: float, clock: str = AUTO_CLOCK, delay: float = 0.05) -> None:
+    def __init__(self, mapping: RobotMapping, period: float) -> None:
         if period >= mapping.safety.silence:
             raise FollowerError(
                 f"{mapping.robot}: silence {mapping.safety.silence:g} s is no more than the period {period:g} s"
@@ -168,7 +169,6 @@ class Follower:
         self._limits = mapping.safety
         self._period = period
         self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
-        self._clock = StampClock(clock, delay)
         self._ros_ns = self._settled_ns = 0
         self._angles: JointAngles | None = None
         self._heard_ns = 0
@@ -212,7 +212,6 @@ class Follower:
         elif last_ns is not None and angles.stamp_ns <= last_ns:
             return jumped  # late, or the same again: no news
         self._wrong = ""
-        self._clock.note(angles.stamp_ns, now_ns, steady_ns)
         columns = (angles.position, angles.velocity, angles.position_stddev, angles.velocity_stddev)
         self._angles = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._places] for each in columns))
         self._heard_ns = steady_ns
@@ -251,9 +250,7 @@ class Follower:
         self._others = problem
 
     def enable(self) -> None:
-        """A person says that the robot may move: it stands at ``home``, or where it was left, and clocks are right.
-
-        By which clock angles are stamped is decided anew.
+        """A person says that the robot may move: it stands at ``home``, or where it was left.
 
         Raises:
             FollowerError: the robot is not stopped.
@@ -261,7 +258,6 @@ class Follower:
         if self.state != State.STOPPED:
             raise FollowerError(f"the robot is not stopped: {self.state}")
         self.enabled = True
-        self._clock.reset()
 
     def hear_robot(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
         """Take note of how the robot stands.
@@ -294,12 +290,11 @@ class Follower:
         self._known_since_ns[:] = -1
 
     def _ros_time(self, now_ns: int, steady_ns: int) -> bool:
-        """Whether ROS time jumped back, as where a recording begins again: the clock of the stamps is decided anew."""
+        """Whether ROS time jumped back, as where a recording begins again."""
         jumped = jumped_back(now_ns, self._ros_ns)
         self._ros_ns = now_ns
         if jumped:
             self.time_jumped_back()
-            self._clock.reset()
             self._settled_ns = steady_ns + _SETTLING_NS
         return jumped
 
@@ -352,7 +347,7 @@ class Follower:
         if angles is None:
             unknown = np.full(len(mapping.angles), np.inf)
             return _Expected(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
-        age = self._clock.age_ns(angles.stamp_ns, now_ns) / NANOSECONDS
+        age = (now_ns - angles.stamp_ns) / NANOSECONDS
         wait = max(age, 0.0)
         ahead = min(wait, self._limits.prediction)
         with np.errstate(invalid="ignore"):  # infinite and NaN say that something is not known
@@ -402,8 +397,7 @@ class Follower:
             said = (
                 f"{age:.2f} s old, limit {limits.max_age:g} s" if age > 0.0 else f"stamped {-age:.2f} s in the future"
             )
-            other = abs(age) * NANOSECONDS > ANOTHER_CLOCK_NS
-            return f"angles are {said}" + (", or by another clock than at the start" if other else "")
+            return f"angles are {said}" + (", or not in ROS time" if abs(age) > _OTHER_CLOCK else "")
         needed = ~expected.known & ~self.mapping.alone
         if needed.any():
             return self._unknown(int(needed.argmax()), angles, expected)

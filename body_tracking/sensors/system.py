@@ -128,7 +128,7 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "kinect_skeleton",
-            "what one sensor sees, in `<sensor>_optical_frame` and its own clock: a point per joint, SDK order; fields "
+            "what one sensor sees, in `<sensor>_optical_frame`: a point per joint, SDK order; fields "
             "`x y z` float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` "
             "uint16",
         ),
@@ -138,15 +138,15 @@ SYSTEM = System(
             LATCHED,
             "calibration",
             "the pose of each sensor's optical frame in `world`, one message per sensor; holds from its stamp on (0: "
-            "always), in the reference sensor's clock",
+            "always), by the stamps of the reference sensor",
         ),
         TopicSpec(
             graph.CALIBRATION_CLOCK,
             TIME_REFERENCE,
             LATCHED,
             "calibration",
-            "per other sensor (`source`): what its clock shows (`time_ref`) when the reference sensor's shows the "
-            "stamp; holds from the stamp on",
+            "per other sensor (`source`): what it stamps (`time_ref`) when the reference sensor stamps with the "
+            "header's stamp; holds from there on",
         ),
         TopicSpec(
             graph.TF_STATIC,
@@ -160,8 +160,8 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "fusion",
-            "the person in `world`, in the reference sensor's clock; in addition covariance `xx xy xz yy yz zz`; with "
-            "`subject: all` everybody, with the person's number in `body`",
+            "the person in `world`, by the stamps of the reference sensor; in addition covariance `xx xy xz yy yz zz`; "
+            "with `subject: all` everybody, with the person's number in `body`",
         ),
     ),
     services=(

@@ -330,6 +330,18 @@ def test_a_saved_calibration_holds_until_a_better_one() -> None:
         assert_allclose(update.result.poses["kinect2"].translation, first.poses["kinect2"].translation, atol=1e-9)
 
 
+@pytest.mark.parametrize("offset", [-1e9, -21.3, 6.0])
+def test_a_clock_that_was_saved_when_stamps_were_no_ros_time_is_never_used(offset: float) -> None:
+    saved = saved_after()
+    clocks = saved.clocks | {"kinect2": ClockModel(round(offset * NANOSECONDS), 25.0, 47 * NANOSECONDS)}
+    calibration = OnlineCalibration(("kinect1", "kinect2"))
+    calibration.load(CalibrationResult(saved.reference, saved.poses, clocks, saved.quality))
+    held = calibration.current_update().result
+    assert held.clocks["kinect2"].offset == 0.0
+    assert_allclose(held.poses["kinect2"].translation, saved.poses["kinect2"].translation)
+    assert any("kinect2: its saved clock is " in event and event.endswith("left out") for event in calibration.events)
+
+
 def test_a_saved_clock_of_another_session_is_not_believed() -> None:
     calibration, _ = run(stream(20.0, offset=-30.0), saved=saved_after())
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -62,13 +63,17 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
 # --- other cameras
 
 
+START = int(time.time())
+"""Stamps are ROS time."""
+
+
 def markers(stamp: int, bodies: tuple[int, ...] = (3,)) -> MarkerArray:
     """As Microsoft's driver fills them."""
     array = MarkerArray()
     for body in bodies:
         for joint in AzureJoint:
             marker = Marker(id=100 * body + joint, type=Marker.SPHERE, action=Marker.ADD)
-            marker.header.stamp.sec, marker.header.frame_id = stamp, "depth_camera_link"
+            marker.header.stamp.sec, marker.header.frame_id = START + stamp, "depth_camera_link"
             place = marker.pose.position
             place.x, place.y, place.z = 0.01 * joint, 0.1 * body, 2.0
             array.markers.append(marker)
@@ -99,7 +104,7 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
         first, second = (cloud_to_skeletons(cloud) for cloud in clouds)
         assert [skeleton.body for skeleton in first] == [3, 4]
         assert [skeleton.body for skeleton in second] == [3]
-        assert to_nanoseconds(clouds[0].header.stamp) == 7_000_000_000
+        assert to_nanoseconds(clouds[0].header.stamp) == (START + 7) * 1_000_000_000
         assert clouds[0].header.frame_id == "azure_optical_frame"
         np.testing.assert_allclose(first[1].positions[Joint.HEAD], [0.26, 0.4, 2.0], atol=1e-6)
         assert (first[0].states == TrackingState.TRACKED).all()

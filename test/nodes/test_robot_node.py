@@ -21,7 +21,6 @@ from running import BAG, RELIABLE, ROOT, Running, environment, stop  # noqa: E40
 from sensor_msgs.msg import JointState  # noqa: E402
 from simulated_arm import SimulatedArm  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
 from body_tracking import graph  # noqa: E402
@@ -29,8 +28,9 @@ from body_tracking.cdr import encode_angles  # noqa: E402
 from body_tracking.kinematics.conventions import angles_of  # noqa: E402
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
-from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds, to_time  # noqa: E402
 from body_tracking.messages.model import joint_state_to_model  # noqa: E402
+from body_tracking.nodes.common import ROS  # noqa: E402
 from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
 from body_tracking.recording.qos import SENSOR_DATA  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize  # noqa: E402
@@ -154,12 +154,33 @@ class PlayedRobots(Robots):
         self.bag = folder / "angles"
         write_angles(self.bag)
         self.start("calibration", sensors="[kinect1]", use_sim_time=True)
-        # One goes by the wall clock and stamps its commands by it; the other by /clock, which ends with the player.
-        self.command("two_joint_arm", body=BODIES["two_joint_arm"])
+        # One goes by the wall clock and stamps its commands by it: its person's angles are stamped anew. The other goes
+        # by /clock, which ends with the player.
+        self.offset_ns, self.last_ns = 0, 0
+        played, live = BODIES["two_joint_arm"], "live"
+        for name in (graph.joint_states_topic, graph.joint_states_stddev_topic):
+            publisher = self.node.create_publisher(JointState, name(live), RELIABLE)
+            self.node.create_subscription(JointState, name(played), self._relay(publisher, played, live), RELIABLE)
+        self.command("two_joint_arm", body=live)
         self.command("iiwa7", body=BODIES["iiwa7"], use_sim_time=True)
+
+    def _relay(self, publisher: Any, played: str, live: str) -> Any:
+        """The angles of a person of the bag as those of one who is seen now."""
+
+        def on_angles(message: JointState) -> None:
+            stamp_ns = to_nanoseconds(message.header.stamp)
+            if not self.last_ns or stamp_ns < self.last_ns - NANOSECONDS:  # the bag begins, again
+                self.offset_ns = time.time_ns() - LATENCY_NS - stamp_ns
+            self.last_ns = stamp_ns
+            message.header.stamp = to_time(stamp_ns + self.offset_ns, ROS)
+            message.name = [f"{name.removesuffix(played)}{live}" for name in message.name]
+            publisher.publish(message)
+
+        return on_angles
 
     def play(self) -> None:
         """Start the sensor."""
+        self.last_ns = 0
         self.start("bag_player", bag=self.bag, loop=True, wait_for_subscribers=f"['{SENSOR}:3']", wait_timeout=60.0)
 
     def robot(self, robot: str) -> dict[str, str]:
@@ -200,11 +221,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     with PlayedRobots(tmp_path_factory.mktemp("robots")) as robots:
         killed, quiet = [], []
         reasons: dict[str, list[str]] = {robot: [] for robot in BODIES}
-        for number in range(2):
-            if number:
-                # by the wall clock, the sensor's clock begins anew: a person says that this is right
-                answer = robots.call(Trigger, "/two_joint_arm_commands/enable", Trigger.Request())
-                assert answer.success, answer.message
+        for _ in range(2):
             robots.play()
             killed.append(robots.kill_while_moving())
             followed = len(robots.arms["iiwa7"].told)

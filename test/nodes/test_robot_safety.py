@@ -229,16 +229,19 @@ def test_angles_of_ros_time_are_stale_however_old_they_are_at_the_start(bench: B
     robot.until_it_follows()
 
 
-def test_another_clock_than_at_the_start_stops_the_robot(bench: Bench) -> None:
+def test_stamps_by_another_clock_stop_the_robot(bench: Bench) -> None:
     robot = bench.robot("clock")
     robot.until_it_follows()
     robot.age = time.time() - 40.0  # from now on stamps count from a start, as a Kinect's do
     robot.angle = 1.5
-    robot.until_it_says("stopped", "another clock than at the start")
+    robot.until_it_says("stopped", "not in ROS time")
     assert robot.is_told_nothing()
     assert max(robot.commands) < 0.6
-    # a person says that this is as it should be
+    # nor can a person make it follow them
     assert robot.enable().success
+    robot.until_it_says("stopped", "not in ROS time")
+    assert robot.is_told_nothing()
+    robot.age = 0.0
     robot.until_it_follows()
 
 

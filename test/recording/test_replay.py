@@ -32,6 +32,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording import forked
 from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
+from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.kinect import KinectErrors
@@ -278,7 +279,7 @@ def test_the_command_ends_with_what_it_did(wave: Path, tmp_path: Path, command: 
 
 
 def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: Command) -> None:
-    with BagReader(BAG) as bag:
+    with RigReader(BAG) as bag:
         transforms = [deserialize(TRANSFORM, raw.cdr) for raw in bag.messages([graph.TRUE_CALIBRATION])]
         references = [deserialize(TIME_REFERENCE, raw.cdr) for raw in bag.messages([graph.TRUE_CLOCK])]
     poses, clocks = map(transform_to_pose, transforms), list(map(time_reference_to_clock, references))

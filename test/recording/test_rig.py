@@ -38,7 +38,7 @@ def named(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
 
 
 def test_a_reader_gives_the_names_of_the_root_namespace(wave: Path, named: Path) -> None:
-    with RigReader(named) as rig, BagReader(wave) as reader, BagReader(named) as recorded:
+    with RigReader(named) as rig, RigReader(wave) as reader, BagReader(named) as recorded:
         assert (rig.namespace, rig.topics) == ("/lab/left", reader.topics)
         assert list(rig.messages()) == list(reader.messages())
         wanted = [graph.skeleton_topic("kinect2")]

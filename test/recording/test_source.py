@@ -6,64 +6,84 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from body_tracking.errors import BodyTrackingError
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.recording.source import RecordingSource
-from body_tracking.sensors.live import SkeletonSource, SourceSettings, backends, open_source
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.sensors import RecordedFrame
+from body_tracking.sensors.live import SourceSettings, backends, open_source
+from body_tracking.skeleton import JOINT_NAMES, NANOSECONDS
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
 
-def stamps_in_bag(sensor: str) -> list[int]:
+def times_in_bag(sensor: str) -> list[tuple[int, int]]:
+    """Capture and receipt of each frame, nanoseconds since the beginning of the bag."""
     topic = f"/{sensor}/skeleton"
-    with BagReader(BAG) as reader:
-        kind = reader.topics[topic].type_name
-        return [cloud_to_skeletons(deserialize(kind, message.cdr))[0].stamp_ns for message in reader.messages([topic])]
+    with RigReader(BAG) as reader:
+        kind, zero_ns = reader.topics[topic].type_name, reader.start_ns
+        frames = [
+            (cloud_to_skeletons(deserialize(kind, raw.cdr))[0], raw.log_time_ns) for raw in reader.messages([topic])
+        ]
+        return [(skeleton.stamp_ns - zero_ns, log_ns - zero_ns) for skeleton, log_ns in frames]
 
 
-def test_every_frame_comes_in_order_and_then_the_end_or_again() -> None:
-    stamps = stamps_in_bag("kinect2")
+def played(frame: RecordedFrame | None) -> tuple[int, int]:
+    assert frame is not None
+    return frame.skeletons[0].stamp_ns, frame.received_ns
+
+
+def test_every_frame_comes_in_order_and_then_the_end() -> None:
+    start_ns = time.time_ns()
     source = open_source("recording", SourceSettings("kinect2", file=str(BAG), rate=100.0))
-    assert read(source, len(stamps)) == stamps
-    assert source.read(1.0) is None and source.ended
+    got = []
+    while not source.ended:
+        frame = source.read(1.0)
+        if frame is not None:
+            got.append(played(frame))
+            assert frame.received_ns <= time.time_ns()
+    zero_ns = got[0][1] - round(times_in_bag("kinect2")[0][1] / 100.0)
+    assert start_ns <= zero_ns
+    expected = [[zero_ns + time_ns / 100.0 for time_ns in times] for times in times_in_bag("kinect2")]
+    np.testing.assert_allclose(np.array(got) - zero_ns, np.array(expected) - zero_ns, rtol=0.0, atol=1e3)
+    assert source.read(0.0) is None
     assert not source.counters
-    source = RecordingSource(SourceSettings("kinect2", file=str(BAG), rate=100.0, loop=True))
-    assert read(source, len(stamps) + 5) == stamps + stamps[:5]
-    assert not source.ended
-
-
-def read(source: SkeletonSource, count: int) -> list[int]:
-    """The stamps of so many frames."""
-    frames = [source.read(1.0) for _ in range(count)]
-    return [frame.skeletons[0].stamp_ns for frame in frames if frame is not None]
 
 
 def test_frames_are_due_when_they_were_received_then() -> None:
-    start = time.time() + 0.2
+    start = time.time() + 3.0
     sources = [
         RecordingSource(SourceSettings(name, file=str(BAG), start_time=start)) for name in ("kinect1", "kinect2")
     ]
-    with BagReader(BAG) as reader:
-        zero_ns = reader.start_ns
-    for source in sources:
-        frame = source.read(2.0)
-        assert frame is not None
+    for name, source in zip(("kinect1", "kinect2"), sources, strict=True):
+        stamp_ns, received_ns = played(source.read(10.0))
+        captured, received = (start + time_ns / NANOSECONDS for time_ns in times_in_bag(name)[0])
+        assert stamp_ns / NANOSECONDS == pytest.approx(captured, abs=1e-5)
+        assert received_ns / NANOSECONDS == pytest.approx(received, abs=1e-5)
         # Never early; how late is the machine's affair.
-        assert time.time() >= start + (frame.received_ns - zero_ns) / NANOSECONDS - 1e-3
+        assert time.time() >= received - 1e-3
 
 
 def test_one_that_is_started_again_goes_on_where_it_should_be() -> None:
-    source = RecordingSource(SourceSettings("kinect1", file=str(BAG), start_time=time.time() - 5.0))
-    frame = source.read(2.0)
-    assert frame is not None
-    with BagReader(BAG) as reader:
-        position = (frame.received_ns - reader.start_ns) / NANOSECONDS
-    assert position > 4.0
+    start = time.time() - 5.0
+    source = RecordingSource(SourceSettings("kinect1", file=str(BAG), start_time=start))
+    assert played(source.read(2.0))[1] / NANOSECONDS - start > 4.0
     assert source.counters["left out, late"] > 100
+
+
+def test_a_loop_begins_again_and_time_goes_on() -> None:
+    source = RecordingSource(SourceSettings("kinect1", file=str(BAG), rate=100.0, loop=True))
+    stamps = np.array([stamp_ns for stamp_ns, _ in times_in_bag("kinect1")])
+    got = np.array([played(source.read(1.0))[0] for _ in range(len(stamps) + 5)])
+    first, second = got[: len(stamps)], got[len(stamps) :]
+    np.testing.assert_allclose(first - first[0], (stamps - stamps[0]) / 100.0, atol=1e3)
+    np.testing.assert_allclose(second - second[0], first[:5] - first[0], atol=1e3)
+    assert second[0] > first[-1]
+    assert not source.ended
 
 
 def test_another_name_may_be_given() -> None:
@@ -80,6 +100,22 @@ def test_real_recordings_play(shared_data: Path) -> None:
         source = RecordingSource(SourceSettings(sensor, file=str(file), rate=100.0))
         frames = [source.read(1.0) for _ in range(20)]
         assert all(frame is not None and frame.sensor == sensor for frame in frames)
+
+
+def test_frames_of_a_file_with_another_clock_are_stamped_as_captured_now(tmp_path: Path) -> None:
+    """By the same rule as those of a bag: the quickest frame is captured when it plays, the others before that."""
+    columns = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
+    late = [0.02, 0.0, 0.05, 0.01, 0.0, 0.03]
+    rows = [
+        ",".join([f"{40.0 + k / 30:.6f}", f"{1e9 + k / 30 + each:.6f}", *["1.0"] * len(columns)])
+        for k, each in enumerate(late)
+    ]
+    file = tmp_path / "own_clock.csv"
+    file.write_text("\n".join([",".join(["stamp", "received", *columns]), *rows, ""]))
+    source = RecordingSource(SourceSettings("kinect1", file=str(file)))
+    frames = [played(source.read(1.0)) for _ in late]
+    np.testing.assert_allclose([(came - stamp) / NANOSECONDS for stamp, came in frames], late, atol=1e-5)
+    np.testing.assert_allclose(np.diff([stamp for stamp, _ in frames]), NANOSECONDS / 30, atol=1e4)
 
 
 def test_closing_ends_a_read_in_another_thread() -> None:
