@@ -98,7 +98,7 @@ def test_a_recording_comes_through_as_it_is_and_the_sender_survives_the_receiver
         if frame is not None:
             recorded[frame.skeletons[0].positions.astype(np.float32).tobytes()] = frame.skeletons[0]
     for frames in (first, second):
-        # exactly the recorded skeletons, and their stamps as far from each other as there (100 times as fast)
+        # exactly the recorded skeletons, and their stamps as far from each other as there, 100 times as fast
         own = [recorded[frame.skeletons[0].positions.astype(np.float32).tobytes()] for frame in frames]
         for frame, each in zip(frames, own, strict=True):
             np.testing.assert_array_equal(frame.skeletons[0].states, each.states)
