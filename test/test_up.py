@@ -327,8 +327,8 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
     assert graph_up.process.returncode == 0, graph_up.text()
     with BagReader(tmp_path / "recording") as reader:
-        reader.verify()
-        assert reader.topics[ANGLES].count > 200
+        assert reader.whole and reader.topics[ANGLES].count > 200
+        assert sum(1 for _ in reader.messages([ANGLES])) == reader.topics[ANGLES].count
     stamps = sorted(angles_in(tmp_path / "recording", ANGLES))
     with BagReader(BAG) as reader:
         first_ns, last_ns = reader.start_ns, reader.end_ns
