@@ -30,26 +30,26 @@ from body_tracking import (  # noqa: E402
     graph,
     systems,
 )
-from body_tracking.calibration.result import CalibrationResult, SensorQuality  # noqa: E402
 from body_tracking.calibration.storage import save  # noqa: E402
-from body_tracking.cdr import decode_skeletons  # noqa: E402
-from body_tracking.filters.roles import ROLES  # noqa: E402
-from body_tracking.fusion.subject import ALL, PeopleParameters  # noqa: E402
-from body_tracking.messages.base import to_nanoseconds  # noqa: E402
-from body_tracking.messages.diagnostics import statuses  # noqa: E402
-from body_tracking.node_parameters import parameters_for  # noqa: E402
-from body_tracking.parameters import (  # noqa: E402
+from body_tracking.core.parameters import (  # noqa: E402
     SECTION,
     ParameterError,
     Value,
 )
+from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS  # noqa: E402
+from body_tracking.messages.base import to_nanoseconds  # noqa: E402
+from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
+from body_tracking.messages.diagnostics import statuses  # noqa: E402
+from body_tracking.node_parameters import parameters_for  # noqa: E402
+from body_tracking.pipeline.people import ALL, PeopleParameters  # noqa: E402
+from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.simulation.bags import write_bag  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, lanes, simulate  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS  # noqa: E402
 from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402

@@ -18,11 +18,11 @@ import numpy as np
 import viser
 from viser import uplot
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
-from body_tracking.node_status import NodeStatus
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import Skeleton
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.system import Layer, load
-from body_tracking.skeleton import Skeleton
 from body_tracking.viewing.colours import (
     BODY,
     FILTERED,

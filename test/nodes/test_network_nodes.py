@@ -21,10 +21,10 @@ from running import RELIABLE, ROOT, Running, environment, free_port, stop  # noq
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
+from body_tracking.core.skeleton import Joint, TrackingState  # noqa: E402
+from body_tracking.kinect.azure import AzureJoint  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
-from body_tracking.sensors.azure import AzureJoint  # noqa: E402
-from body_tracking.skeleton import Joint, TrackingState  # noqa: E402
 
 NO_NAMESPACES = 77
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import JOINT_NAMES, NANOSECONDS
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.kinect.live import SourceSettings, backends, open_source
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording import source as source_of_file
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.recording.source import RecordingSource
-from body_tracking.sensors import RecordedFrame
-from body_tracking.sensors.live import SourceSettings, backends, open_source
-from body_tracking.skeleton import JOINT_NAMES, NANOSECONDS
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
