@@ -25,11 +25,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from body_tracking import (  # noqa: E402
-    cli,
-    graph,
-    systems,
-)
+from body_tracking import cli, systems  # noqa: E402
 from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.core.parameters import (  # noqa: E402
     SECTION,
@@ -42,6 +38,7 @@ from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.node_parameters import parameters_for  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.pipeline.people import ALL, PeopleParameters  # noqa: E402
 from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402

@@ -123,7 +123,6 @@ class Replay:
 
     def __init__(self, args: argparse.Namespace) -> None:
         try:
-            importlib.import_module("body_tracking.recording.source")  # registers the backend
             live: Any = importlib.import_module("body_tracking.kinect.live")
             self._kinect: Any = importlib.import_module("body_tracking.kinect.axes")
             errors: Any = importlib.import_module("body_tracking.core.errors")

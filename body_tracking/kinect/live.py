@@ -15,6 +15,7 @@ from typing import Protocol
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.kinect_protocol import DEFAULT_PORT
+from body_tracking.pipeline.system import load
 
 
 class SourceError(BodyTrackingError):
@@ -81,12 +82,11 @@ class SkeletonSource(Protocol):
 Opener = Callable[[SourceSettings], SkeletonSource]
 
 ENTRY_POINTS = "body_tracking.backends"
-_BACKENDS: dict[str, Opener] = {}
-
-
-def register(name: str, opener: Opener) -> None:
-    """Make a backend of this package known under a name."""
-    _BACKENDS[name] = opener
+_BACKENDS = {
+    "network": "body_tracking.kinect.network:NetworkSource",
+    "recording": "body_tracking.recording.source:RecordingSource",
+}
+"""Those of this package; a process loads the one that it opens."""
 
 
 def backends() -> tuple[str, ...]:
@@ -103,10 +103,12 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
     """
     if backend not in backends():
         raise SourceError(f"unknown backend {backend!r}, expected one of {', '.join(backends())}")
+    opener: Opener
     if backend in _BACKENDS:
-        return _BACKENDS[backend](settings)
+        opener = load(_BACKENDS[backend])
+        return opener(settings)
     try:
-        opener: Opener = entry_points(group=ENTRY_POINTS)[backend].load()
+        opener = entry_points(group=ENTRY_POINTS)[backend].load()
         return opener(settings)
     except BodyTrackingError:
         raise

@@ -26,7 +26,7 @@ from body_tracking.core.sources import RecordedFrame, check_sensor_name, optical
 from body_tracking.kinect import kinect_protocol as protocol
 from body_tracking.kinect.axes import camera_space_to_optical
 from body_tracking.kinect.kinect_protocol import ClockTimes, Header, ProtocolError
-from body_tracking.kinect.live import SourceError, SourceSettings, register
+from body_tracking.kinect.live import SourceError, SourceSettings
 from body_tracking.kinect.remote_clock import CaptureClock, RoundTrips
 
 Address: TypeAlias = tuple[str, int]
@@ -365,6 +365,3 @@ def _key(settings: SourceSettings) -> bytes:
             "'key_file' (kinect_sender --make-key FILE makes one)"
         )
     return protocol.NO_KEY
-
-
-register("network", NetworkSource)

@@ -14,7 +14,7 @@ import numpy as np
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.core.sources import RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.kinect.csv_recording import sensor_column
-from body_tracking.kinect.live import SourceError, SourceSettings, register
+from body_tracking.kinect.live import SourceError, SourceSettings
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
@@ -182,6 +182,3 @@ def _bag_frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | 
                 continue  # as a sensor that missed a frame
             yield message.log_time_ns, RecordedFrame(sensor, message.log_time_ns, skeletons)
         yield reader.end_ns, None
-
-
-register("recording", RecordingSource)

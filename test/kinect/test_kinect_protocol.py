@@ -181,4 +181,4 @@ def test_it_needs_nothing_but_an_old_pythons_standard_library() -> None:
                 modules = [str(statement.module)]
             for module in modules:
                 known = module.partition(".")[0] in sys.stdlib_module_names
-                assert known or (name, module) == ("kinect_sender", "body_tracking.core.sources"), module
+                assert known or (name, module) == ("kinect_sender", "body_tracking.kinect"), module
