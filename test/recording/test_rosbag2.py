@@ -551,3 +551,18 @@ def test_a_full_disk_is_an_error_and_costs_nothing_written_before(tmp_path):
     assert "bag_0.mcap" in text
     found = read(tmp_path / "bag")
     assert len(found) == int(count) > 10 and found == messages(int(count))
+
+
+@pytest.mark.parametrize("velocities", [0, 2])
+@pytest.mark.parametrize("efforts", [0, 2])
+@pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "abcde"])
+def test_joint_states_of_ros_are_read_whatever_they_leave_out(name: str, velocities: int, efforts: int) -> None:
+    serialization = pytest.importorskip("rclpy.serialization")
+    from sensor_msgs.msg import JointState
+
+    message = JointState(name=[name, "b"], position=[1.0, 2.0])
+    message.velocity, message.effort = [3.0] * velocities, [4.0] * efforts
+    read = deserialize("sensor_msgs/msg/JointState", bytes(serialization.serialize_message(message)))
+    assert read.name == message.name
+    for field in ("position", "velocity", "effort"):
+        assert getattr(read, field).tolist() == list(getattr(message, field))

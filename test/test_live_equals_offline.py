@@ -1,0 +1,158 @@
+"""What the live graph publishes is what ``replay`` writes: every topic, for every filter and shipped recording.
+
+Knows no node: what the two have in common is compared, whatever publishes it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from body_tracking import cli
+from body_tracking.core.parameters import SECTION
+from body_tracking.core.times import NANOSECONDS
+from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.pipeline import graph
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import deserialize
+from draws import ALL
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from test_up import Up
+
+BAGS = Path(__file__).resolve().parent.parent / "bags"
+SAME = 1e-4
+"""Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
+to the last bit while both have the same number of BLAS threads; with another number sums round differently (4e-5)."""
+PATIENT = {"activation_delay": 5.0, "max_wait": 1.0, "order_wait": 1.0, "predict_after": 1000.0}
+"""On a machine with much else to do messages get lost and are sent again: a node may lag behind by so much and gives
+the same as offline."""
+LATE = re.compile(r"late( ticks| frames)?|missed|lost .+|late_frames")
+"""Counters of a node that say that a message came too late for its results to be those of an offline run."""
+OTHERS = {graph.DIAGNOSTICS_TOPIC, graph.CLOCK_TOPIC}
+
+
+def parameters(folder: Path, **more: object) -> Path:
+    """A parameters file for all nodes."""
+    file = folder / "parameters.yaml"
+    file.write_text(yaml.safe_dump({"/**": {SECTION: {**PATIENT, **more}}}))
+    return file
+
+
+def numbers(message: Any) -> Iterator[float]:
+    """All numbers in a message, and texts as the numbers of their bytes."""
+    if dataclasses.is_dataclass(message):
+        for each in dataclasses.fields(message):
+            if each.name != "__msgtype__":
+                yield from numbers(getattr(message, each.name))
+    elif isinstance(message, str):
+        yield from message.encode()
+    elif isinstance(message, (list, tuple)) or (isinstance(message, np.ndarray) and message.dtype != np.uint8):
+        for each in message:
+            yield from numbers(each)
+    elif isinstance(message, np.ndarray):  # points and matrices are single precision numbers
+        yield from np.frombuffer(message.tobytes()[: message.nbytes // 4 * 4], np.float32).astype(float).tolist()
+    else:
+        yield float(message)
+
+
+def published(bag: Path, without: set[str]) -> dict[str, dict[int, list[list[float]]]]:
+    """All messages of each topic, by their stamps."""
+    found: dict[str, dict[int, list[list[float]]]] = {}
+    with RigReader(bag) as reader:
+        topics = {name: info.type_name for name, info in reader.topics.items() if name not in without}
+        for raw in reader.messages(topics):
+            message = deserialize(topics[raw.topic], raw.cdr)
+            stamp_ns = to_nanoseconds(message.header.stamp) if hasattr(message, "header") else 0
+            found.setdefault(raw.topic, {}).setdefault(stamp_ns, []).append(list(numbers(message)))
+    return found
+
+
+def differences(live: Path, offline: Path, without: set[str], share: float = 0.0, within: float = SAME) -> list[str]:
+    """Where the messages of two recordings are not the same in more than this share of a topic; empty for nowhere."""
+    one, other = published(live, without), published(offline, without)
+    assert one.keys() & other.keys(), (one.keys(), other.keys())
+    found = [f"{topic}: not live" for topic in other.keys() - one.keys()]
+    for topic in one.keys() & other.keys():
+        mine, theirs = one[topic], other[topic]
+        apart = [
+            stamp
+            for stamp in sorted(mine.keys() | theirs.keys())
+            if len(mine.get(stamp, ())) != len(theirs.get(stamp, ()))
+            or not all(
+                len(a) == len(b) and np.allclose(a, b, rtol=0.0, atol=within, equal_nan=True)
+                for a, b in zip(mine[stamp], theirs[stamp], strict=True)
+            )
+        ]
+        if len(apart) > share * len(theirs):
+            first = (apart[0] - min(theirs)) / NANOSECONDS
+            found.append(f"{topic}: {len(apart)} of {len(theirs)} stamps, the first after {first:.3f} s")
+    return found
+
+
+def late_messages(bag: Path) -> list[str]:
+    """What the diagnostics in a recording say of messages that came too late, or not at all."""
+    found: dict[str, str] = {}
+    with RigReader(bag) as reader:
+        kind = reader.topics[graph.DIAGNOSTICS_TOPIC].type_name
+        for raw in reader.messages([graph.DIAGNOSTICS_TOPIC]):
+            for status in statuses(deserialize(kind, raw.cdr)):
+                found |= {
+                    f"{status.node}: {name}": value for name, value in status.values.items() if LATE.fullmatch(name)
+                }
+    return [f"{name} {value}" for name, value in found.items() if value != "0"]
+
+
+def recorded(folder: Path, name: str, *arguments: str | Path) -> Path:
+    """A recording of the live graph."""
+    live = folder / name
+    graph_up = Up(folder, *arguments, "--record", live, "--reliable")
+    try:
+        assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=150.0), graph_up.text()
+        assert graph_up.process.returncode == 0, graph_up.text()
+    finally:
+        graph_up.close()
+    return live
+
+
+def inputs(bag: Path) -> set[str]:
+    with RigReader(bag) as reader:
+        return set(reader.topics)
+
+
+CASES = [
+    ("wave", DEFAULT_FILTER),
+    ("wave", "ekf"),
+    *((bag.name, each) for bag in sorted(BAGS.iterdir()) for each in FILTERS),
+]
+
+
+@pytest.mark.parametrize(("name", "filter_name"), CASES if ALL else CASES[:2])
+def test_a_recording_gives_the_same_live_and_offline(
+    tmp_path: Path, wave: Path, name: str, filter_name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bag = wave if name == "wave" else BAGS / name
+    file = parameters(tmp_path)
+    arguments = ("--filter", filter_name, "--params-file", file)
+    assert cli.main(["replay", str(bag), "-o", str(tmp_path / "offline"), *map(str, arguments)]) == 0
+    said: list[object] = []
+    for rate in ("1", "0.5", "0.25"):
+        # a graph that says that messages came too late plays the bag once more, and slower; one that differs without
+        # saying so is wrong
+        live = recorded(tmp_path, f"live_{rate}", "--bag", bag, "--rate", rate, *arguments)
+        found = differences(live, tmp_path / "offline", inputs(bag) | OTHERS)
+        if not found:
+            return
+        said.append((rate, found, late_messages(live)))
+        assert late_messages(live), said
+    raise AssertionError(said)
