@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,7 +53,9 @@ def parameters(folder: Path, **more: object) -> Path:
 
 def numbers(message: Any) -> Iterator[float]:
     """All numbers in a message, and texts as the numbers of their bytes."""
-    if dataclasses.is_dataclass(message):
+    if hasattr(message, "nanosec"):  # seconds
+        yield message.sec + message.nanosec / NANOSECONDS
+    elif dataclasses.is_dataclass(message):
         for each in dataclasses.fields(message):
             if each.name != "__msgtype__":
                 yield from numbers(getattr(message, each.name))
@@ -155,4 +159,53 @@ def test_a_recording_gives_the_same_live_and_offline(
             return
         said.append((rate, found, late_messages(live)))
         assert late_messages(live), said
+    raise AssertionError(said)
+
+
+def played_to_the_end(folder: Path, number: int, *arguments: str | Path) -> Path:
+    """A recording of a live graph whose sensors are files, which ends when these do."""
+    live = folder / f"live_{number}"
+    graph_up = Up(folder, *arguments, "--record", live, "--reliable")
+    try:
+        assert graph_up.until(lambda: len(graph_up.received) > 100, timeout=60.0), graph_up.text()
+        count = 0
+        while len(graph_up.received) > count:
+            count = len(graph_up.received)
+            graph_up.until(lambda: False, timeout=1.0)
+        graph_up.process.send_signal(signal.SIGINT)
+        assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=60.0), graph_up.text()
+    finally:
+        graph_up.close()
+    return live
+
+
+def frames(bag: Path) -> dict[str, int]:
+    with RigReader(bag) as reader:
+        return {name: reader.topics[name].count for name in map(graph.skeleton_topic, graph.DEFAULT_SENSORS)}
+
+
+@pytest.mark.alone
+def test_files_in_place_of_sensors_give_what_a_replay_of_their_recording_gives(tmp_path: Path, wave: Path) -> None:
+    """In real time, without a bag's clock."""
+    calibration = tmp_path / "calibration.yaml"
+    assert cli.main(["calibrate", str(wave), "-o", str(calibration)]) == 0
+    said: list[object] = []
+    for number in range(4):
+        file = parameters(tmp_path, file=str(wave))
+        shutil.copy(calibration, tmp_path / "live.yaml")  # the graph writes its estimate into it
+        arguments = ("--sensors", ",".join(graph.DEFAULT_SENSORS), "--params-file", file)
+        live = played_to_the_end(tmp_path, number, *arguments, "--calibration", tmp_path / "live.yaml")
+        if frames(live) != frames(wave):  # files do not wait for a recorder that is late
+            said.append((frames(live), frames(wave)))
+            continue
+        offline = tmp_path / f"offline_{number}"
+        words = ("--calibration", calibration, "--params-file", parameters(tmp_path))
+        assert cli.main(["replay", str(live), "-o", str(offline), *map(str, words)]) == 0
+        # what was loaded is published when a node starts: live before the first frame, offline with it, so that two or
+        # three frames at the beginning differ, and the stamp of what was loaded
+        apart = differences(live, offline, OTHERS, share=0.02)
+        found = [each for each in apart if not each.startswith(graph.CALIBRATION_CLOCK)]
+        if not found:
+            return
+        said.append(found)
     raise AssertionError(said)
