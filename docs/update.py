@@ -71,7 +71,9 @@ def topics() -> str:
     """Every topic of the graph, in a table per group of publishers."""
     ungrouped = {topic.publisher for topic in systems.TOPICS} - {name for group in GROUPS.values() for name in group}
     if ungrouped:
-        raise SystemExit(f"GROUPS in {Path(__file__).name} has no place for the topics of {', '.join(sorted(ungrouped))}")
+        raise SystemExit(
+            f"GROUPS in {Path(__file__).name} has no place for the topics of {', '.join(sorted(ungrouped))}"
+        )
     parts = []
     for heading, publishers in GROUPS.items():
         rows = [
