@@ -81,6 +81,7 @@ lint: $(STAMP) ## formatting, lint and types
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+	$(BIN)/lint-imports
 
 # Two minutes the first time; a step of its own, since it would count as time of the tests that need it.
 ros2-workspace: ## the real ros2 for test/ros2, where its sources are present

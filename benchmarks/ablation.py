@@ -36,18 +36,18 @@ import numpy as np
 from accuracy import TEN, Run, run_ours
 from real_pairs import reversals, skeletons
 
+from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint
 from body_tracking.evaluation.metrics import Curve, wrapped
 from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion
-from body_tracking.graph import FILTERED
 from body_tracking.kinematics import posture
-from body_tracking.measurement import left_right_axes
+from body_tracking.pipeline.graph import FILTERED
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import SHIPPED, write_bag
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint
 
 ALL = "all mechanisms"
 _SHOULDERS, _HIPS = (

@@ -35,21 +35,21 @@ from common import Mean
 from offline_graph import OfflineGraph
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
-from body_tracking import graph
-from body_tracking.cdr import decode_skeletons, encode_skeletons
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors, wrapped
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinect.occlusion import obstruction
+from body_tracking.kinect.simulated import KinectErrors, parameters
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
+from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings
-from body_tracking.simulation.kinect import KinectErrors, parameters
 from body_tracking.simulation.layouts import NUMBERS, layout
-from body_tracking.simulation.occlusion import obstruction
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.repertoire import MOTIONS, make_movement
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 
 TEN = Schlagenhauf26().joints
 ONE, FUSED, DEFAULT, OURS = "one sensor", "fused", f"default ({DEFAULT_FILTER})", "ekf"

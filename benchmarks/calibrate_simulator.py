@@ -29,14 +29,14 @@ from scipy.signal import butter, filtfilt
 from thesis_pipeline import LKF2, run_thesis
 
 from body_tracking.calibration.rigid import rigid_registration
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, grid, known
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.simulation.kinect import KinectErrors, read_errors
-from body_tracking.simulation.kinect_joints import ANATOMICAL
+from body_tracking.kinect.simulated import KinectErrors, read_errors
+from body_tracking.kinect.simulated_joints import ANATOMICAL
 from body_tracking.simulation.layouts import around, layout
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
 E1_MOTIONS = ("two_handed_wave", "slow_down", "torso_twist")
 E1: dict[Joint, tuple[float, float, float]] = {
@@ -365,7 +365,7 @@ PAGE = common.ROOT / "docs" / "simulator.md"
 PAIRS = "## Real and simulated pairs"
 _HEAD = """# How like real sensors the simulated ones are
 
-The simulated Kinect v2 (`body_tracking/simulation/kinect_sensor.py`, its parameters in `config/simulator.yaml`) was set
+The simulated Kinect v2 (`body_tracking/kinect/simulated_sensor.py`, its parameters in `config/simulator.yaml`) was set
 before any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real
 pairs, the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
 

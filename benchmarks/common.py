@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.stats import t as student
 
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("BODY_TRACKING_DATA", ROOT.parent / "shared" / "data"))

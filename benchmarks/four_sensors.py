@@ -33,14 +33,14 @@ import live
 import numpy as np
 import psutil
 
-from body_tracking import graph
-from body_tracking.sensors import RecordedFrame
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.kinect.simulated import KinectErrors
+from body_tracking.pipeline import graph
 from body_tracking.simulation import scene
 from body_tracking.simulation.bags import write_bag
-from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 FILTER = "ekf"
 LIMIT = 0.30

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from body_tracking.core.skeleton import N_JOINTS, FloatArray
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
@@ -41,7 +42,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import N_JOINTS, FloatArray
 
 NAMES = MODEL.coordinate_names
 OBSERVED = np.array([number for number, name in enumerate(NAMES) if name not in UNOBSERVED])

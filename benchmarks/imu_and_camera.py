@@ -35,20 +35,20 @@ import common
 import numpy as np
 from accuracy import KNOWN
 
+from body_tracking.core import so3
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.fusion.alignment import SensorAlignment
+from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.tracking import rate_variance
-from body_tracking.kinematics import so3
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
-from body_tracking.simulation.kinect import KinectErrors
+from body_tracking.kinect.occlusion import obstruction
+from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.simulation.layouts import around
-from body_tracking.simulation.occlusion import obstruction
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
 HELD_OUT = tuple(motion for motion in MOTIONS if motion not in KNOWN)
 SEGMENTS = ("forearm_left", "forearm_right")

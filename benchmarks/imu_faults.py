@@ -30,18 +30,18 @@ import numpy as np
 from imu_only import ANGLES, Angles, angle_errors, angle_variances, true_configurations
 from offline_graph import OfflineGraph
 
-from body_tracking import graph
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.inertial.simulated import SimulatedImu, Slip, usual_mounting
 from body_tracking.inertial.stage import ImuStage
-from body_tracking.pipeline.codecs import ModelCovariance, ModelState
+from body_tracking.inertial.surroundings import Iron, Surroundings
+from body_tracking.messages.codecs import ModelCovariance, ModelState
+from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.simulation.bags import write_bag
-from body_tracking.simulation.imus import SimulatedImu, Slip, usual_mounting
 from body_tracking.simulation.layouts import Layout, around
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, draw_clock, simulate
-from body_tracking.simulation.surroundings import Iron, Surroundings
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SEGMENTS = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
 FAULTY = "forearm_right"

@@ -26,14 +26,14 @@ from latency import RELAYED, relay_commands
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, PointCloud2
 
-from body_tracking import graph
-from body_tracking.cdr import encode_skeletons
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.messages.base import RosMessages
+from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message
-from body_tracking.simulation.imus import SimulatedImu, usual_mounting
+from body_tracking.pipeline import graph
 from body_tracking.simulation.layouts import layout
 from body_tracking.simulation.scene import START_NS, Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import NANOSECONDS
 from body_tracking.systems import options_of
 
 ROS = RosMessages()

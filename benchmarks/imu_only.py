@@ -28,18 +28,18 @@ import common
 import numpy as np
 from common import rms_deg
 
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.filters.ekf import ExtendedKalmanFilter
 from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.inertial.simulated_errors import IDEAL
 from body_tracking.inertial.tracking import InertialTracker
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.simulation.imu_errors import IDEAL
-from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import TPOSE_S
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, SimulatedRecording, draw_clock, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SEGMENTS = (
     "pelvis",

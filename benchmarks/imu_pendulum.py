@@ -40,9 +40,9 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation, Slerp
 
-from body_tracking.sensors.imu_csv import ImuCsvRecording
-from body_tracking.sensors.imu_orientation import InertialErrors, OrientationEstimator
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.inertial.imu_csv import ImuCsvRecording
+from body_tracking.inertial.imu_orientation import InertialErrors, OrientationEstimator
 
 LINKS = (1, 2, 3)
 TOTAL_BAR, INCLINATION_BAR, JOINT_BAR = 2.0, 1.0, 2.5

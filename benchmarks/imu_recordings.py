@@ -24,6 +24,10 @@ import common
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.alignment import (
     Stream,
     align_in_pose,
@@ -36,13 +40,9 @@ from body_tracking.inertial.alignment import (
 )
 from body_tracking.inertial.angles import SegmentAngles
 from body_tracking.inertial.clock import clock_offset, turning_of_sensor
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS
+from body_tracking.inertial.imu_csv import ImuCsvRecording
+from body_tracking.inertial.mvnx import MvnxFrame, MvnxRecording
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.sensors.imu_csv import ImuCsvRecording
-from body_tracking.sensors.mvnx import MvnxFrame, MvnxRecording
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 MODEL = UpperBody()
 CLOCK_BAR_S, RETURN_BAR_DEG, ANGLE_BAR_DEG = 0.020, 5.0, 3.0

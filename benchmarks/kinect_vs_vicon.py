@@ -34,12 +34,12 @@ import common
 import numpy as np
 from time_warp import Agreement, TimeWarp, compare, estimate_warp
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.metrics import sample
 from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.filters.ekf import ExtendedKalmanFilter
 from body_tracking.filters.smoother import smooth
-from body_tracking.sensors.kinect import camera_space_to_optical
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.kinect.axes import camera_space_to_optical
 
 CLIPS = ("m07_s01_e01", "m07_s01_e02", "m08_s01_e01", "m09_s01_e01", "m10_s01_e01", "m10_s01_e02")
 KINECT_RATE, VICON_RATE = 30.0, 100.0

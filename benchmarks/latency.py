@@ -26,19 +26,19 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState, PointCloud2
 
-from body_tracking import graph
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.qos import RELIABLE
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import TIME_REFERENCE, TRANSFORM, RosMessages
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.supervised import die_with_parent
-from body_tracking.recording.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.skeleton import Skeleton
+from body_tracking.ros.bag_topics import to_profile
+from body_tracking.ros.supervised import die_with_parent
 from body_tracking.systems import options_of
 
 BAG = common.ROOT / "bags" / "tpose_wave"

@@ -29,17 +29,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
-from body_tracking import graph
-from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality
 from body_tracking.calibration.storage import save
-from body_tracking.cdr import encode_skeletons
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.parameters import SECTION, to_ros
+from body_tracking.core.qos import RELIABLE
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.diagnostics import NodeStatus, statuses
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.parameters import SECTION, to_ros
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import Options
-from body_tracking.recording.qos import RELIABLE
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.ros.bag_topics import to_profile
 from body_tracking.systems import nodes_for
 
 STAMP = struct.Struct("<iI")

@@ -31,21 +31,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 
-from body_tracking import graph
-from body_tracking.calibration.offline import calibrate
 from body_tracking.calibration.online import CalibrationParameters
-from body_tracking.calibration.result import SensorPose
-from body_tracking.cdr import decode_skeletons
-from body_tracking.filters.roles import role_of
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.fusion.people import People
-from body_tracking.fusion.subject import ALL, PeopleParameters
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.diagnostics import statuses
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import ALL, PeopleParameters
+from body_tracking.pipeline.roles import role_of
+from body_tracking.recording.calibrate import calibrate
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import sensor_topics
 from body_tracking.recording.rig import RigReader
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, SimulatedRecording, lanes, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.systems import options_of
 
 _TRUNK = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]

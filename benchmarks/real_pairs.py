@@ -25,22 +25,22 @@ from typing import Any
 import common
 import numpy as np
 
-from body_tracking.calibration.offline import calibrate, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters
-from body_tracking.calibration.result import CalibrationResult
-from body_tracking.cdr import decode_skeletons
+from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.sensor_poses import CalibrationResult
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.fusion.alignment import SensorAlignment
-from body_tracking.graph import CALIBRATION, FILTERED, FUSED
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.measurement import left_right_axes
 from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.pipeline.graph import CALIBRATION, FILTERED, FUSED
+from body_tracking.recording.calibrate import calibrate, relative_yaw
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay, sensor_topics, skeletons_of
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import deserialize
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}
 """Relative yaw of kinect2 to kinect1 in Kinect camera axes, degrees."""

@@ -34,6 +34,7 @@ import common
 import numpy as np
 from honesty import NAMES, OBSERVED, all_runs, new_filter
 
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
@@ -51,7 +52,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint
 
 GOOD = 2.0
 """Seconds of good data at the end."""

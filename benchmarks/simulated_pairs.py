@@ -50,19 +50,19 @@ from calibrate_simulator import PAGE, PAIRS
 from real_pairs import NOMINAL, PEOPLE, paired
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.offline import WHOLE
 from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult
-from body_tracking.clocks import ClockModel
-from body_tracking.measurement import body_heading, left_right_axes, viewing_angle
-from body_tracking.sensors import RecordedFrame
-from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.simulation.kinect_sensor import Misreading, SimulatedKinect
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.measurement import body_heading, left_right_axes, viewing_angle
+from body_tracking.core.sensor_poses import CalibrationResult
+from body_tracking.core.skeleton import MIRROR, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.kinect.csv_recording import CsvRecording
+from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.recording.calibrate import WHOLE
 from body_tracking.simulation.layouts import Layout, around
 from body_tracking.simulation.people import Person, joints
 from body_tracking.simulation.repertoire import make_movement
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, draw_clock
-from body_tracking.skeleton import MIRROR, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
 
 SENSORS = ("kinect1", "kinect2")
 PLACES = ("front", "other")

@@ -43,10 +43,11 @@ from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from body_tracking import dds, graph
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.skeleton import FloatArray
+from body_tracking.ros import dds
 
 GROWTH = 0.05
 """Of private memory, from the second minute to the last tenth."""

@@ -14,15 +14,15 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.calibration.result import level_pose
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, still_pose_registration
+from body_tracking.core.sensor_poses import level_pose
+from body_tracking.core.skeleton import FloatArray, Skeleton, TrackingState
+from body_tracking.core.sources import RecordedFrame
 from body_tracking.filters import make_filter
 from body_tracking.filters.schlagenhauf import SCHLAGENHAUF_EKF
 from body_tracking.filters.thesis import THESIS_LKF1, THESIS_LKF2
 from body_tracking.fusion.weights import thesis_text
-from body_tracking.sensors import RecordedFrame
-from body_tracking.skeleton import FloatArray, Skeleton, TrackingState
 
 LKF1: Final = "thesis LKF1"
 LKF2: Final = "thesis LKF2"

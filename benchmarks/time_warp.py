@@ -17,8 +17,8 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import sample
-from body_tracking.skeleton import FloatArray
 
 INTERVALS = 4
 """Of linearly changing rate; one more than this are the degrees of freedom besides the offset."""

@@ -39,22 +39,22 @@ import hosts
 import live
 import numpy as np
 
-from body_tracking import graph
-from body_tracking.cdr import decode_skeletons
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.qos import SENSOR_DATA
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, to_nanoseconds
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize
 from body_tracking.simulation import scene
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, Setup, SimulatedRecording
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SETTLE = 4.0
 """Seconds in which person and noise become known; what is compared comes after."""
@@ -136,7 +136,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     link, before = options.link, SETTLE + options.seconds
     names = [sensor.pose.sensor for sensor in recording.sensors]
     key = folder / "key"
-    sender = [sys.executable, "-m", "body_tracking.sensors.kinect_sender"]
+    sender = [sys.executable, "-m", "body_tracking.kinect.kinect_sender"]
     subprocess.run([*sender, "--make-key", str(key)], check=True, stdout=subprocess.DEVNULL)
     begun = time.monotonic()
     subprocess.run([*sender, "--replay", str(folder / "bag"), "--sensor", "nobody"], stderr=subprocess.DEVNULL)

@@ -33,7 +33,7 @@ import numpy as np
 import psutil
 from playwright.sync_api import sync_playwright
 
-from body_tracking import graph
+from body_tracking.pipeline import graph
 
 LIMIT = 1.10
 PATIENCE_MS = 180e3

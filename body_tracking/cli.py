@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
 
 if TYPE_CHECKING:
     from body_tracking.pipeline.system import Command

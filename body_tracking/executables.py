@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
-from body_tracking.signals import ENDING, hold_signals, release_signals
+from body_tracking.core.signals import ENDING, hold_signals, release_signals
 
 
 def start(name: str) -> None:
@@ -26,7 +26,7 @@ def start(name: str) -> None:
     if importlib.util.find_spec(f"body_tracking.nodes.{name}") is not None:
         main = importlib.import_module(f"body_tracking.nodes.{name}").main
     else:  # of a system that another package brings
-        main = importlib.import_module("body_tracking.nodes.host").host_of(name)
+        main = importlib.import_module("body_tracking.ros.host").host_of(name)
     imported.set()
     main()
 
@@ -47,7 +47,7 @@ def command(module: str) -> int:
     return code
 
 
-_COMMANDS = {"body_tracking": "cli", "kinect_sender": "sensors.kinect_sender"}
+_COMMANDS = {"body_tracking": "cli", "kinect_sender": "kinect.kinect_sender"}
 
 
 def __getattr__(name: str) -> Callable[[], int | None]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from body_tracking.parameters import (
+from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
     Value,

@@ -16,8 +16,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from body_tracking import graph
-from body_tracking.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
+from body_tracking.core.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
     Options,
@@ -175,7 +175,7 @@ def with_file(options: Options, file: Path | None) -> Options:
 
 def bodies_of(options: Options) -> tuple[str, ...]:
     """The ids of those who may be tracked, of several people; empty with one subject."""
-    from body_tracking.fusion.subject import ALL, MAX_PEOPLE
+    from body_tracking.pipeline.people import ALL, MAX_PEOPLE
 
     return graph.bodies(int(str(options["people"])) or MAX_PEOPLE) if options["subject"] == ALL else ()
 

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from body_tracking import cli, systems
-from body_tracking.filters.roles import ROLES
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import Qos
+from body_tracking.kinect import simulated as kinect
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.parameters import Parameter, Value
-from body_tracking.recording.qos import Qos
-from body_tracking.simulation import kinect
+from body_tracking.pipeline.roles import ROLES
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = ROOT / "docs" / "reference.md"

@@ -11,9 +11,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from body_tracking import systems
-from body_tracking.parameters import Value, to_ros
+from body_tracking.core.parameters import Value, to_ros
 from body_tracking.pipeline.system import NodeSpec, Option
-from body_tracking.up import CANNOT_START, UpError, all_parameters, arguments_from, options_for
+from body_tracking.ros.up import CANNOT_START, UpError, all_parameters, arguments_from, options_for
 
 OPTIONS = [option for option in systems.OPTIONS.values() if not option.hidden]
 TRUTH = {"true": True, "1": True, "false": False, "0": False}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.simulation.random_people import MODEL
-from body_tracking.skeleton import FloatArray, IntArray
 
 
 def hand_columns(side: str) -> IntArray:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
-from body_tracking import dds
+from body_tracking.ros import dds
 from draws import ALL
 
 ROOT = Path(__file__).resolve().parent.parent

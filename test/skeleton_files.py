@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from body_tracking.skeleton import JOINT_NAMES
+from body_tracking.core.skeleton import JOINT_NAMES
 
 COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
 FIRST_ID = 72057594037944738

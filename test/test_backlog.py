@@ -6,8 +6,8 @@ from collections import Counter
 
 import pytest
 
-from body_tracking.backlog import AT_ONCE, INTERVAL, MAX_AGE, TARGET, Backlog, Sequences, Standstill
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.ros.backlog import AT_ONCE, INTERVAL, MAX_AGE, TARGET, Backlog, Sequences, Standstill
 
 PERIOD_NS = NANOSECONDS // 30
 TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")

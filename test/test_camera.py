@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.camera import Camera, CameraError
+from body_tracking.core.camera import Camera, CameraError
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
-from body_tracking.skeleton import FloatArray
 
 MATRIX = np.array([[364.7, 0.0, 257.2], [0.0, 365.1, 207.4], [0.0, 0.0, 1.0]])
 LENSES = {

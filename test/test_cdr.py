@@ -7,13 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.core import so3
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import MAX_STAMP_NS, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import IMAGE, IMU, SEGMENTS, MessageError
+from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
 from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.model import (
     covariance_to_image,
@@ -24,9 +26,7 @@ from body_tracking.messages.model import (
     segments_to_joint_state,
 )
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
-from body_tracking.orientation import SegmentOrientation
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
-from body_tracking.skeleton import MAX_STAMP_NS, Skeleton
 
 MODEL = UpperBody()
 CLOUD, STATES = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/JointState"

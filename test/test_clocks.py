@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.clocks import (
+from body_tracking.core.clocks import (
     JUMP_BACK_NS,
     ClockModel,
     LeastDelay,
@@ -16,7 +16,7 @@ from body_tracking.clocks import (
     fit_clock,
     jumped_back,
 )
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.core.skeleton import NANOSECONDS
 
 STAMPS = st.integers(0, 2_000_000_000 * NANOSECONDS)
 

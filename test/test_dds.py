@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from body_tracking import dds
+from body_tracking.ros import dds
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 OTHERS = ("ROS_LOCALHOST_ONLY", "FASTDDS_BUILTIN_TRANSPORTS", "ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")

@@ -11,9 +11,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from body_tracking import graph
-from body_tracking.cdr import decode_skeletons
 from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from domains import domain
 

@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 import yaml
 
-from body_tracking import graph, systems
-from body_tracking.errors import BodyTrackingError
+from body_tracking import systems
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import ParameterError
 from body_tracking.filters import FILTERS
-from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.node_parameters import parameters_for
-from body_tracking.parameters import ParameterError
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rosbag2 import is_known
 from body_tracking.robot.system import convention_of

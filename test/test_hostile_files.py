@@ -17,15 +17,15 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, McapRecord, Schema, Statistics
 
-from body_tracking import files
 from body_tracking.calibration import storage
-from body_tracking.errors import BodyTrackingError
-from body_tracking.parameters import read_file
+from body_tracking.core import files
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import read_file
+from body_tracking.kinect.csv_recording import CsvRecording
+from body_tracking.kinect.ntu import NtuRecording
 from body_tracking.recording.mcap_file import MAGIC
 from body_tracking.recording.rosbag2 import METADATA, BagError, BagReader
 from body_tracking.robot import mapping
-from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.sensors.ntu import NtuRecording
 from draws import some
 
 BAG = Path(__file__).resolve().parent.parent / "bags" / "tpose_wave"

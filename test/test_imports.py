@@ -10,9 +10,9 @@ import sys
 HEAVY = {"numpy", "scipy", "rclpy", "matplotlib", "rosbags"}
 ABSENT = {
     "cli": HEAVY,
-    "up": {"scipy", "matplotlib", "rclpy"},
+    "ros.up": {"scipy", "matplotlib", "rclpy"},
     "nodes.joint_angles": {"scipy", "matplotlib", "filterpy"},
-    "nodes.graph_monitor": {"scipy", "matplotlib"},
+    "ros.graph_monitor": {"scipy", "matplotlib"},
     "nodes.bag_player": {"scipy", "matplotlib"},
     "nodes.bag_recorder": {"scipy", "matplotlib"},
     "nodes.robot_commands": {"scipy", "matplotlib"},
@@ -25,7 +25,7 @@ ABSENT = {
 
 
 def test_the_help_and_modules_that_many_processes_import_leave_out_what_they_do_not_use() -> None:
-    modules = list(ABSENT) if importlib.util.find_spec("rclpy") else ["cli", "up"]
+    modules = list(ABSENT) if importlib.util.find_spec("rclpy") else ["cli", "ros.up"]
     steps = "".join(
         f"import body_tracking.{module}; {'body_tracking.cli.parser().format_help(); ' if module == 'cli' else ''}"
         f"found[{module!r}] = sorted(sys.modules); "

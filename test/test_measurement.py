@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR, body_heading, joint_stddev, viewing_angle
-from body_tracking.skeleton import MIRROR, Joint
+from body_tracking.core.measurement import BASE_STDDEV, INFERRED_FACTOR, body_heading, joint_stddev, viewing_angle
+from body_tracking.core.skeleton import MIRROR, Joint
 from walkers import TRACKED, about_y, walk
 
 BODY = walk(np.zeros(1))[0]

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import level_pose
-from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.imu import ImuSample, ImuSampleError
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.sensor_poses import level_pose
+from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
 from body_tracking.messages.base import (
@@ -28,14 +30,12 @@ from body_tracking.messages.base import (
 )
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
-from body_tracking.messages.markers import Markers
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
-from body_tracking.node_status import NodeStatus
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
-from body_tracking.sensors.imu import ImuSample, ImuSampleError
-from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.viewing.colours import INFERRED, PALETTE
+from body_tracking.viewing.markers import Markers
 from body_tracking.viewing.shapes import ELLIPSOID_RADIUS, ellipsoids, figure, frustum
 
 

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking import graph, names
-from body_tracking.names import NamespaceError, check_namespace, relative, resolved, rig_namespace, within
+from body_tracking.core import names
+from body_tracking.core.names import NamespaceError, check_namespace, relative, resolved, rig_namespace, within
+from body_tracking.pipeline import graph
 
 PART = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,5}", fullmatch=True)
 NAMESPACE = st.lists(PART, max_size=3).map(lambda parts: f"/{'/'.join(parts)}")

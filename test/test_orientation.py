@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from body_tracking.orientation import OrientationError, SegmentOrientation
+from body_tracking.core.orientation import OrientationError, SegmentOrientation
 
 GOOD: dict[str, Any] = {
     "stamp_ns": 1,

@@ -16,7 +16,8 @@ from xml.etree import ElementTree
 import pytest
 
 import body_tracking
-from body_tracking import graph, systems
+from body_tracking import systems
+from body_tracking.pipeline import graph
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
@@ -277,3 +278,10 @@ def test_links_in_the_documentation_lead_somewhere() -> None:
         for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
             if "://" not in link:
                 assert (page.parent / link).exists(), f"{page.name} links to {link}"
+
+
+def test_a_module_over_500_lines_says_why() -> None:
+    for path in (ROOT / "body_tracking").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if text.count("\n") > 500:
+            assert "Over 500 lines: " in (ast.get_docstring(ast.parse(text)) or ""), path

@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.parameters import (
+from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
     as_yaml,

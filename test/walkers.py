@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.simulation.people import Person, joints
 from body_tracking.simulation.repertoire import END_S, TPOSE_S, make_movement
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 

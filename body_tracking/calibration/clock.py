@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import correlate1d, minimum_filter1d
 
-from body_tracking.clock_correlation import STEP, Series, correlate
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray
+from body_tracking.calibration.clock_correlation import STEP, Series, correlate
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 
 RECEIPT_PRIOR = 0.05
 """Standard deviation of what the times of receipt say of an offset, seconds: sensors deliver after different delays.

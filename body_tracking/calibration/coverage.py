@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from body_tracking.calibration.pairwise import Pairs
-from body_tracking.measurement import body_heading
-from body_tracking.skeleton import N_JOINTS, FloatArray, IntArray, Joint
+from body_tracking.core.measurement import body_heading
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, IntArray, Joint
 
 PLACE_SIZE = 0.3
 """Side of a place on the floor, metres."""

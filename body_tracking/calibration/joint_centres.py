@@ -29,6 +29,8 @@ and from the elbow on, ``d`` besides is times, with the elbow bent by ``beta``,
 
 as a camera takes a bent elbow to be elsewhere: the same Kinect has the same person's elbow bent more by 7 degrees, not
 less by 13, where it is bent by 67.
+
+Over 500 lines: one estimator with its derivation; its steps share their notation.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from body_tracking.calibration.still_pose import is_t_pose
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 
 _J = Joint
 _TRUNK = (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER)

@@ -3,6 +3,8 @@
 Everything is a function of the stamps: an estimate at reference time T uses what was captured up to T minus
 ``settle_time`` and holds from T plus ``activation_delay``, so that a live run and an offline one, in which messages
 arrive a little earlier or later, give the same numbers.
+
+Over 500 lines: one state machine from first frame to published pose; the estimators that it uses are beside it.
 """
 
 from __future__ import annotations
@@ -15,21 +17,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
+from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
 from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
-from body_tracking.calibration.result import (
+from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
+from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
+from body_tracking.core.clocks import ClockModel, jumped_back
+from body_tracking.core.measurement import joint_stddev
+from body_tracking.core.sensor_poses import (
     CalibrationResult,
     SensorPose,
     SensorQuality,
     level_pose,
 )
-from body_tracking.calibration.rigid import CalibrationError
-from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
-from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
-from body_tracking.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
-from body_tracking.clocks import ClockModel, jumped_back
-from body_tracking.measurement import joint_stddev
-from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
+from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
 """Seconds of reference time between remembered pairs: frames closer together err alike."""

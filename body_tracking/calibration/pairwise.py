@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
-from body_tracking.measurement import body_heading
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint
+from body_tracking.core.measurement import body_heading
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint
 
 MIDLINE: IntArray = np.array(
     [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD], dtype=np.intp

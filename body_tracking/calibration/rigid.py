@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
 
 
 class CalibrationError(BodyTrackingError):

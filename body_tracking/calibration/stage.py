@@ -6,16 +6,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load, save
-from body_tracking.fusion.subject import SubjectSelector
-from body_tracking.names import TF_STATIC
-from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.pipeline.codecs import Clock, Pose, Poses, SensorClock
+from body_tracking.core.names import TF_STATIC
+from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.core.qos import LATCHED, Qos
+from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.shared import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, sensors_of, skeleton_input
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.recording.qos import LATCHED, Qos
 
 _LEVEL = "world would tilt or move under everyone who uses it"
 _MEMORY = "the frames remembered so far were chosen by it"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
-from body_tracking.skeleton import BoolArray, FloatArray, Joint, TrackingState
+from body_tracking.core.skeleton import BoolArray, FloatArray, Joint, TrackingState
 
 FRAMES = 50
 """Frames in the average, as in the thesis ("less than two seconds")."""

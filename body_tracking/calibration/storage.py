@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from body_tracking import files
-from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
-from body_tracking.clocks import ClockModel
-from body_tracking.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
+from body_tracking.core import files
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality
+from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 
 MAX_DRIFT_PPM = 10_000.0
 """A clock that is a hundredth faster than another is no drift but a damaged number; NTP slews by 500 ppm at most."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from body_tracking.calibration.pairwise import PairEstimate, Pairs, estimate, same_sense
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
-from body_tracking.skeleton import MIRROR, BoolArray, FloatArray
+from body_tracking.core.skeleton import MIRROR, BoolArray, FloatArray
 
 Pose = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,) metres, sensor to reference."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.files import open_regular
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import open_regular
+from body_tracking.core.skeleton import FloatArray
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}

@@ -8,6 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.calibration.clock import correlate_clocks
+from body_tracking.core.skeleton import (
+    JOINT_NAMES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
 from body_tracking.evaluation.metrics import (
     Alignment,
     AngleErrors,
@@ -30,16 +40,6 @@ from body_tracking.evaluation.metrics import (
 )
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Recorded, true_angles
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.skeleton import (
-    JOINT_NAMES,
-    N_JOINTS,
-    NANOSECONDS,
-    BoolArray,
-    FloatArray,
-    Joint,
-    Skeleton,
-    TrackingState,
-)
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 MAX_GAP = 0.15

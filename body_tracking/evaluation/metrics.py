@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, IntArray
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.skeleton import BONES, BoolArray, FloatArray, IntArray
 
 RATE = 100.0
 """Hz, the marker system's rate, to which the thesis interpolates (section 5.7.1)."""

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evaluation
 from body_tracking.evaluation.metrics import angle_errors
 from body_tracking.evaluation.reading import Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
-from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
 _COLUMNS, _INSTANTS = 4, 6

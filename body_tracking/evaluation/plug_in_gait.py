@@ -53,10 +53,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from body_tracking.core.files import open_regular
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
 from body_tracking.evaluation.c3d import MarkerError, Trial, listed, read_trial
 from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, runs, smooth
-from body_tracking.files import open_regular
-from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")
 ARM_MARKERS = ("SHO", "ELB", "WRA", "WRB")

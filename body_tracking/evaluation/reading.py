@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from body_tracking import graph
-from body_tracking.cdr import decode_skeletons
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Skeleton
 from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
-from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import (
     JOINT_STATE,
@@ -25,11 +24,12 @@ from body_tracking.messages.base import (
     to_nanoseconds,
 )
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Skeleton
 
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50

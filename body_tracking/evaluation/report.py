@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, IntArray, Joint
 from body_tracking.evaluation.comparison import AngleComparison, Comparison, Evaluation
 from body_tracking.evaluation.reading import EvaluationError
-from body_tracking.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, IntArray, Joint
 
 THESIS_JOINTS = (
     *(Joint.SPINE_MID, Joint.SPINE_SHOULDER),

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.kinematics.so3 import skew
-from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint
+from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint
+from body_tracking.core.so3 import skew
 
 _PELVIS = (Joint.SPINE_BASE, Joint.HIP_LEFT, Joint.HIP_RIGHT)
 _THORAX = (

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.pictures import draw
 from body_tracking.evaluation.reading import AngleSeries, read, true_at
 from body_tracking.evaluation.report import Column, Table
-from body_tracking.skeleton import FloatArray
 
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:

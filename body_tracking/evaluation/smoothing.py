@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.optimize import minimize_scalar
 
-from body_tracking.skeleton import BoolArray, FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray
 
 LONGEST_GAP = 0.2
 """Seconds from which on a gap is left open (Schlagenhauf 2017, section 5.6.3)."""

@@ -10,13 +10,13 @@ import importlib
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
-from body_tracking.filters.roles import DEFAULT_FILTER as DEFAULT_FILTER
+from body_tracking.pipeline.roles import DEFAULT_FILTER as DEFAULT_FILTER
 
 if TYPE_CHECKING:
-    from body_tracking.kinematics.estimate import ModelEstimate
+    from body_tracking.core.estimate import ModelEstimate
+    from body_tracking.core.orientation import SegmentOrientation
+    from body_tracking.core.skeleton import Skeleton
     from body_tracking.kinematics.upper_body import UpperBody
-    from body_tracking.orientation import SegmentOrientation
-    from body_tracking.skeleton import Skeleton
 
 _LINEAR: Final = ("linear", "LinearKalmanFilter", "LinearKalmanParameters", "")
 # name: module, class, class of its parameters, prefix of their names where several filters' stand together

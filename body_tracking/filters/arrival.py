@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 
 
 class Arrival(Enum):

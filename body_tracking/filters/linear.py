@@ -26,13 +26,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from body_tracking.calibration.joint_centres import JointCentres
-from body_tracking.errors import BodyTrackingError
-from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.stacked import Stacked
-from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
-from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
-from body_tracking.parameters import check_fields, number_field
-from body_tracking.skeleton import (
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.measurement import BASE_STDDEV, INFERRED_FACTOR
+from body_tracking.core.parameters import check_fields, number_field
+from body_tracking.core.skeleton import (
     BONES,
     N_JOINTS,
     BoolArray,
@@ -41,6 +38,9 @@ from body_tracking.skeleton import (
     Skeleton,
     TrackingState,
 )
+from body_tracking.filters.arrival import Arrival, Arrivals
+from body_tracking.filters.stacked import Stacked
+from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 
 ZERO_VELOCITY = "lkf_zero_velocity"
 CONSTANT_VELOCITY = "lkf_constant_velocity"
@@ -129,7 +129,7 @@ class LinearKalmanParameters:
     measurement_noise_scale: float = number_field(
         1.0,
         "where the skeleton brings no covariance: factor on the standard deviation per joint, tracking "
-        "state and distance of body_tracking.measurement",
+        "state and distance of body_tracking.core.measurement",
         "",
         0.01,
         100.0,

@@ -8,16 +8,16 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from body_tracking import graph
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.qos import Qos
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters.person import FilterSettings, PersonFilter
 from body_tracking.fusion.people import People
-from body_tracking.fusion.subject import ALL, HeldSubject
-from body_tracking.orientation import SegmentOrientation
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import ALL, HeldSubject
 from body_tracking.pipeline.stage import Port
-from body_tracking.recording.qos import Qos
-from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 _AWAY = NANOSECONDS
 """Of somebody who is away from the fused frames for this long, nanoseconds, nothing is kept with several people."""

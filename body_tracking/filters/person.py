@@ -6,35 +6,35 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from body_tracking import graph
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.qos import Qos
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.filters import (
     DEFAULT_FILTER,
     ModelFilter,
     make_filter,
 )
 from body_tracking.filters.prediction import Prediction
-from body_tracking.filters.roles import role_of
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.people import People
-from body_tracking.fusion.subject import PeopleParameters
 from body_tracking.kinematics.codecs import Segments
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.tracking import LengthChanges
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.pipeline.codecs import (
+from body_tracking.messages.codecs import (
     ModelCovariance,
     ModelState,
     ModelStddev,
     Skeletons,
     Text,
 )
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import PeopleParameters
+from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.stage import Port
-from body_tracking.recording.qos import Qos
-from body_tracking.skeleton import Skeleton
 
 DEFAULT_PREDICT_AFTER = 0.1
 """Seconds."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.core.skeleton import NANOSECONDS
 
 PERIOD_NS = round(NANOSECONDS / 30)
 """Nanoseconds between two predicted frames: the rate of a Kinect."""

@@ -18,12 +18,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.linear import FilterError
-from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.measurement import left_right_axes
-from body_tracking.parameters import check_fields, number_field
-from body_tracking.skeleton import (
+from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.parameters import check_fields, number_field
+from body_tracking.core.skeleton import (
     N_JOINTS,
     BoolArray,
     FloatArray,
@@ -32,6 +29,9 @@ from body_tracking.skeleton import (
     Skeleton,
     TrackingState,
 )
+from body_tracking.filters.arrival import Arrival, Arrivals
+from body_tracking.filters.linear import FilterError
+from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 
 SCHLAGENHAUF_EKF = "schlagenhauf_ekf"
 

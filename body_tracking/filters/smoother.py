@@ -19,6 +19,8 @@ other angles it is in 84 % (eight simulated people); forearms and wrists are the
 
 What is an outlier is the filter's affair. A pose that starts anew has no tie to what was before, so that each such
 stretch is smoothed by itself.
+
+Over 500 lines: the recursions forwards and backwards share their state and are read side by side.
 """
 
 from __future__ import annotations
@@ -30,12 +32,12 @@ import numpy as np
 from scipy.linalg import lapack
 
 from body_tracking.calibration.joint_centres import Memory
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.ekf.state import Measurement, State
 from body_tracking.filters.linear import FilterError
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 
 _SECTION = 200
 """Frames between two states that are kept of a recording; those between them are filtered once more."""

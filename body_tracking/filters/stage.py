@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from body_tracking import graph
+from body_tracking.core.orientation import SEGMENT_NUMBER, OrientationError
+from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,
@@ -18,13 +20,12 @@ from body_tracking.filters import (
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
 from body_tracking.fusion.stage import calibration_inputs
-from body_tracking.fusion.subject import PEOPLE, people_from
-from body_tracking.orientation import SEGMENT_NUMBER, OrientationError
-from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.pipeline.codecs import (
+from body_tracking.messages.codecs import (
     Ids,
     Orientation,
 )
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import PEOPLE, people_from
 from body_tracking.pipeline.shared import (
     BODY,
     REFERENCE,
@@ -38,7 +39,6 @@ from body_tracking.pipeline.shared import (
     skeleton_qos,
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 
 FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
 INPUT = Parameter(

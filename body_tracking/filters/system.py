@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from body_tracking import graph
-from body_tracking.messages.types import IMAGE, JOINT_STATE, POINT_CLOUD, SEGMENTS, STRING
-from body_tracking.parameters import Value
+from body_tracking.core.message_types import IMAGE, JOINT_STATE, POINT_CLOUD, SEGMENTS, STRING
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,
@@ -18,7 +19,6 @@ from body_tracking.pipeline.system import (
     asked,
     sensors_and_transport,
 )
-from body_tracking.recording.qos import RELIABLE
 
 
 def _filters() -> Sequence[str]:

@@ -30,10 +30,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from body_tracking.core.parameters import check_fields, number_field
+from body_tracking.core.skeleton import N_JOINTS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.filters.arrival import Arrival, Arrivals
 from body_tracking.filters.linear import FilterError
-from body_tracking.parameters import check_fields, number_field
-from body_tracking.skeleton import N_JOINTS, BoolArray, FloatArray, Skeleton, TrackingState
 
 THESIS_LKF1 = "thesis_lkf1"
 THESIS_LKF2 = "thesis_lkf2"

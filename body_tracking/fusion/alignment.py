@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.measurement import joint_stddev, viewing_angle
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.sides import heading_weights, headings_of, reversed_halves, swap_left_right
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.fusion import WORLD, FusionError
 from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.sides import Sides
-from body_tracking.measurement import joint_stddev, viewing_angle
-from body_tracking.sides import heading_weights, headings_of, reversed_halves, swap_left_right
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 FRESH = 0.1
 """Frames of other sensors count for left and right while they are no further away in time than this, seconds."""
@@ -119,8 +119,8 @@ class SensorAlignment:
 
         Returns:
             The same body at its capture time in the reference's clock, with the covariances of
-            ``body_tracking.measurement`` in all directions alike; joints that are not valid, and those of a body half
-            that is seen across what is believed, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
+            ``core/measurement.py`` in all directions alike; joints that are not valid, and those of a body half that is
+            seen across what is believed, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
         """
         source = self._sensors.get(sensor)
         if source is None:

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.fusion.subject import HOLD
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.pipeline.people import HOLD
 
 _MIDLINE = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK], dtype=np.intp)
 _LEFT = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)

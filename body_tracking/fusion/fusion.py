@@ -4,6 +4,8 @@ The fused skeleton is a function of the stamps alone: one comes out per frame of
 is silent, of another), at that frame's capture time, from each sensor's newest frame captured up to then. A frame
 waits only while another sensor's is due, and then a few milliseconds; so the delay stays small, and what arrives a
 little earlier or later gives the same numbers.
+
+Over 500 lines: one class whose state every step of a frame needs; what can stand alone is in the modules beside it.
 """
 
 from __future__ import annotations
@@ -16,16 +18,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.measurement import joint_stddev, viewing_angle
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.sides import PAIRS
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.rhythm import Rhythm
 from body_tracking.fusion.sides import HOLD, Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
-from body_tracking.measurement import joint_stddev, viewing_angle
-from body_tracking.sides import PAIRS
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 WORLD = "world"
 

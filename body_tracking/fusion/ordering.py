@@ -13,9 +13,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from body_tracking.clocks import JUMP_BACK_NS, jumped_back
+from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.fusion.rhythm import DUE_MARGIN, Rhythm
-from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 SILENCE = 0.2
 """A sensor of which nothing came for longer than this is not waited for, seconds."""

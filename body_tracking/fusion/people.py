@@ -11,17 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import Association
 from body_tracking.fusion.placement import Placement
-from body_tracking.fusion.subject import (
+from body_tracking.pipeline.people import (
     ALL,
     FIRST,
     PeopleParameters,
     SubjectSelector,
 )
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 _PRESENT = round(0.2 * NANOSECONDS)
 """Who was seen this long ago may be chosen, nanoseconds."""

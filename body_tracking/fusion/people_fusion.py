@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.fusion.fusion import WORLD, Fusion, FusionParameters
 from body_tracking.fusion.people import People
-from body_tracking.fusion.subject import ALL, PeopleParameters
-from body_tracking.skeleton import Skeleton
+from body_tracking.pipeline.people import ALL, PeopleParameters
 
 
 class PeopleFusion:

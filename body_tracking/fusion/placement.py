@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
-from body_tracking.skeleton import MAX_STAMP_NS
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import MAX_STAMP_NS
 
 _MOST = 64
 """Poses, and clocks, of one sensor that may wait for their time: a calibration announces one at a time."""

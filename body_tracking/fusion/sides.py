@@ -1,4 +1,4 @@
-"""Which way a person faces, when sensors disagree about left and right (``body_tracking.sides``)."""
+"""Which way a person faces, when sensors disagree about left and right (``body_tracking.core.sides``)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from body_tracking.sides import (
+from body_tracking.core.sides import (
     HALVES,
     PAIRS,
     SAME_SENSE,
@@ -18,7 +18,7 @@ from body_tracking.sides import (
     reversed_halves,
     swap_left_right,
 )
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 _CLOSE = math.sqrt(0.5)
 """Cosine between the headings that two sensors see above which they agree."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-from body_tracking import graph
+from body_tracking.core.parameters import Value, fields_of, parameters_from
+from body_tracking.core.qos import LATCHED
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people_fusion import PeopleFusion
-from body_tracking.fusion.subject import PEOPLE, people_from
-from body_tracking.parameters import Value, fields_of, parameters_from
-from body_tracking.pipeline.codecs import Clock, Pose, Skeletons
+from body_tracking.messages.codecs import Clock, Pose, Skeletons
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import PEOPLE, people_from
 from body_tracking.pipeline.shared import (
     REFERENCE,
     RELIABLE,
@@ -21,8 +23,6 @@ from body_tracking.pipeline.shared import (
     skeleton_qos,
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.recording.qos import LATCHED
-from body_tracking.skeleton import Skeleton
 
 _FIXED = {"turned_hold": "a body that is held reversed is held for as long as was said when it was seen"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.skeleton import FloatArray, TrackingState
+from body_tracking.core.skeleton import FloatArray, TrackingState
 
 
 def thesis_text(states: np.ndarray) -> FloatArray:

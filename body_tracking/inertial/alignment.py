@@ -19,6 +19,8 @@ Delta unknown besides, Laidig, Weygers and Seel, Sensors 22 (2022) 9850):
 It is weighted by what an angular rate is worth at that speed (as Olsson et al., Sensors 20 (2020) 3534, weigh
 samples by their motion), and robust. A sample counts as often as what it leaves is independent of the one before; and
 no movement knows an axis better than the flesh and the person's own joint let it.
+
+Over 500 lines: the inertial issue rewrites headings and alignment.
 """
 
 from __future__ import annotations
@@ -31,10 +33,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray
 
 Pose = Literal["t", "n"]
 

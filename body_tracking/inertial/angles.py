@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.inertial.alignment import AlignmentError
-from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import BoolArray, FloatArray
 
 _UNTOLD = {"elbow": "elbow_carrying", "wrist": "wrist_twist", "clavicle": "clavicle_axial", "neck": "neck_axial"}
 """What the convention does not tell of a joint, by the first word of the angles that it does tell."""

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.inertial.posture import OrientationKinematics
 from body_tracking.kinematics.lengths import SkeletonLengths
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
 
 _BASE_STDDEV, _BASE_UNKNOWN = 0.05, 1.0
 """Metres: of the base where a camera sees it, and where nobody knows."""

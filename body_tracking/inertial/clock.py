@@ -2,7 +2,8 @@
 
 How fast something turns does not depend on where a sensor sits nor on which way it faces, so the magnitudes of angular
 rates are compared: of two sensors, or of a sensor and of a bone that a camera sees. Coarsely by Pearson's correlation
-at every offset of a wide window, finely by :class:`~body_tracking.clock_correlation.ClockFit` over windows of motion.
+at every offset of a wide window, finely by
+:class:`~body_tracking.calibration.clock_correlation.ClockFit` over windows of motion.
 
 An offset is only told where the data decide. Turning is smooth, so that its samples are not independent; the variance
 of the correlation of two series that have nothing to do with each other is (Bartlett 1946)
@@ -22,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import fftconvolve, find_peaks
 
-from body_tracking.clock_correlation import (
+from body_tracking.calibration.clock_correlation import (
     FINE_RANGE,
     PEAK_WIDTH,
     SAMPLE_TIME,
@@ -33,8 +34,8 @@ from body_tracking.clock_correlation import (
     correlate,
     correlation_time,
 )
-from body_tracking.clocks import ClockModel
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 
 WINDOW = 60.0
 """Seconds to either side in which an offset is looked for."""

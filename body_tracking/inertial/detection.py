@@ -25,7 +25,8 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from body_tracking.clock_correlation import STEP, Series
+from body_tracking.calibration.clock_correlation import STEP, Series
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import (
     MOUNTING_STDDEV,
     AlignmentError,
@@ -33,7 +34,6 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, independent_samples
-from body_tracking.skeleton import FloatArray
 
 SEGMENT_STDDEV: Final = float(np.radians(8.0))
 """Radians per axis by which a person's segment is off a pose."""

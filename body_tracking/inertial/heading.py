@@ -29,6 +29,8 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
@@ -36,9 +38,7 @@ from body_tracking.inertial.alignment import (
     across,
     elbow_segment_axes,
 )
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.ranges import RANGES
-from body_tracking.skeleton import FloatArray, Joint
 
 HEADING_WALK: Final = float(np.radians(0.4))
 """Radians per root second of a heading without magnetometer: 3 degrees in a minute, as of 0.05 deg/s of bias."""

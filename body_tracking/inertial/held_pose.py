@@ -8,6 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core.measurement import body_heading
+from body_tracking.core.skeleton import FloatArray, Skeleton
 from body_tracking.inertial.alignment import (
     StillPeriod,
     Stream,
@@ -20,8 +22,6 @@ from body_tracking.inertial.alignment import (
 from body_tracking.inertial.heading import bone_of
 from body_tracking.inertial.parameters import AUTO, POSES
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.measurement import body_heading
-from body_tracking.skeleton import FloatArray, Skeleton
 
 _FACING: Final = float(np.radians(8.0))
 """Radians by which a skeleton's shoulders tell wrongly where a person faces."""

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics.model import SEGMENTS
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
 
 _USUAL: Final = {
     "pelvis": "+z-x",

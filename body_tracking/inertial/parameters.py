@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from body_tracking.core.parameters import number_field
 from body_tracking.inertial.alignment import Pose
-from body_tracking.parameters import number_field
 
 AUTO, T_POSE, ARMS_DOWN = "auto", "t_pose", "arms_down"
 OWN, SHARED, REFERENCE = "own", "shared", "reference"

@@ -16,12 +16,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from body_tracking.core import so3
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import AlignmentError, rotation_vectors
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
-from body_tracking.skeleton import FloatArray
 
 _STEPS = 15
 _ENOUGH = 1e-8

@@ -7,13 +7,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from body_tracking import graph
-from body_tracking.errors import BodyTrackingError
-from body_tracking.fusion.subject import ALL, HOLD, PEOPLE, HeldSubject, SubjectSelector
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker
-from body_tracking.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.pipeline.codecs import Field, Orientation, Reading, Skeletons
+from body_tracking.messages.codecs import Field, Orientation, Reading, Skeletons
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import ALL, HOLD, PEOPLE, HeldSubject, SubjectSelector
 from body_tracking.pipeline.shared import (
     REFERENCE,
     RELIABLE,
@@ -24,8 +26,6 @@ from body_tracking.pipeline.shared import (
     skeleton_qos,
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 SEGMENTS = Parameter(
     "segments",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from body_tracking import graph
-from body_tracking.messages.types import IMU, POINT_CLOUD
+from body_tracking.core.message_types import IMU, POINT_CLOUD
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,

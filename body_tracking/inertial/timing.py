@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from body_tracking.clocks import ReceiptClock, jumped_back
+from body_tracking.core.clocks import ReceiptClock, jumped_back
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.parameters import REFERENCE, SHARED
-from body_tracking.skeleton import NANOSECONDS
 
 _TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
 """Seconds by which transports differ, per root second by which that changes, and that motion tells at best."""

@@ -6,6 +6,8 @@ its clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``)
 
 Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
 all headings drifts, and says so.
+
+Over 500 lines: the inertial issue rewrites tracking and slips.
 """
 
 from __future__ import annotations
@@ -17,9 +19,13 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.clock_correlation import Series
-from body_tracking.clocks import JUMP_BACK_NS, jumped_back
-from body_tracking.errors import BodyTrackingError
+from body_tracking.calibration.clock_correlation import Series
+from body_tracking.core import so3
+from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
@@ -38,11 +44,7 @@ from body_tracking.inertial.mounting import mountings as meant_mountings
 from body_tracking.inertial.parameters import ARMS_DOWN, AUTO, REFERENCE, T_POSE, TrackingParameters
 from body_tracking.inertial.timing import SensorClocks
 from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, WornSensor
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 _STEP_NS = NANOSECONDS // 10
 """How often what changes slowly is looked at."""

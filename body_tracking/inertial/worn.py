@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.clocks import ReceiptClock
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core import so3
+from body_tracking.core.clocks import ReceiptClock
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.imu import ImuSample, ImuWatch
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.alignment import rotation_vectors
-from body_tracking.kinematics import so3
-from body_tracking.sensors.imu import ImuSample, ImuWatch
-from body_tracking.sensors.imu_orientation import OUTAGE_S, OrientationEstimator
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.inertial.imu_orientation import OUTAGE_S, OrientationEstimator
 
 HISTORY_S: Final = 40.0
 """Seconds for which readings are kept."""

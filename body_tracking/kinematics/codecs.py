@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from body_tracking.cdr import encode_segments
-from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.message_types import SEGMENTS
 from body_tracking.kinematics.tracking import segment_poses
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.types import SEGMENTS
-from body_tracking.pipeline.codecs import Codec, Wire
+from body_tracking.messages.cdr import encode_segments
+from body_tracking.messages.codecs import Codec, Wire
 
 
 class Segments(Codec):

@@ -32,14 +32,14 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.angles import JointAngles
-from body_tracking.kinematics.estimate import ModelEstimate
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
 from body_tracking.kinematics.ranges import RANGES
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
-from body_tracking.skeleton import FloatArray, IntArray
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
 

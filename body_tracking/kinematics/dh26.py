@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
 from body_tracking.kinematics.conventions import Chain, Convention, Frame
 from body_tracking.kinematics.euler import EulerAngles
 from body_tracking.kinematics.ranges import RANGES

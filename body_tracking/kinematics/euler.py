@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.skeleton import BoolArray, FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray
 
 _TURN = 2.0 * np.pi
 

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import ModelError
+from body_tracking.core import so3
+from body_tracking.core.body_model import ModelError
+from body_tracking.core.skeleton import BoolArray, FloatArray, Joint
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import BoolArray, FloatArray, Joint
 
 _J = Joint
 _TINY = 1e-9

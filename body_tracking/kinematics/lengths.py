@@ -22,9 +22,9 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core.measurement import BASE_STDDEV, INFERRED_FACTOR
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 from body_tracking.kinematics.upper_body import LENGTHS, UpperBody
-from body_tracking.measurement import BASE_STDDEV, INFERRED_FACTOR
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 
 _BLOCK_NS = NANOSECONDS
 _FEWEST_FRAMES = 4

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.skeleton import FloatArray, IntArray, Joint
+from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 
 TRUNK, LIMB, EXTREMITY = range(3)
 """Joint classes: spine, head, shoulders and hips; elbows and knees; hands and feet from the wrist and ankle on."""

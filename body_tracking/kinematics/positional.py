@@ -48,9 +48,9 @@ import math
 
 import numpy as np
 
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
 from body_tracking.kinematics.motion import joint_densities
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
 
 ANGLE_NAMES: tuple[str, ...] = (
     "trunk_flexion",

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import Linearisation
+from body_tracking.core import so3
+from body_tracking.core.body_model import Linearisation
+from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import BoolArray, FloatArray
 
 STDDEV: dict[str, float] = {
     "lumbar_flexion": 10.0,

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import FloatArray, IntArray
 
 RANGES: dict[str, tuple[float, float]] = {
     "lumbar_flexion": (-35.0, 65.0),

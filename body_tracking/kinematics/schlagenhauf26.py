@@ -23,8 +23,8 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.kinematics.model import Linearisation, ModelError, Posture
-from body_tracking.skeleton import FloatArray, IntArray, Joint
+from body_tracking.core.body_model import Linearisation, ModelError, Posture
+from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 
 _QUARTER = np.pi / 2
 
@@ -188,7 +188,7 @@ _LEVERS: FloatArray = (_TO_END.T[:, :, None] * _TURNED[_BONE_FRAME][:, None, :])
 
 
 class Schlagenhauf26:
-    """Her model; a :class:`~body_tracking.kinematics.model.BodyModel`.
+    """Her model; a :class:`~body_tracking.core.body_model.BodyModel`.
 
     Its points are the ten joints that she measures and compares (section 5.7.2): SpineMid, SpineShoulder and, left
     before right, Shoulder, Elbow, Wrist and HandTip. Each is the end of one segment, in the order of L1 to L10 (table

@@ -6,15 +6,15 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from body_tracking import graph
-from body_tracking.fusion.subject import ALL, PEOPLE, PeopleParameters, people_from
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, state_estimate
-from body_tracking.parameters import Parameter, Value
-from body_tracking.pipeline.codecs import Angles, ModelCovariance, ModelState
+from body_tracking.messages.codecs import Angles, ModelCovariance, ModelState
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import ALL, PEOPLE, PeopleParameters, people_from
 from body_tracking.pipeline.shared import BODY, RELIABLE, result_qos, skeleton_input, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.skeleton import Skeleton
 
 ANGLES = (
     Parameter(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from body_tracking import graph
-from body_tracking.messages.types import JOINT_STATE
-from body_tracking.parameters import Value
+from body_tracking.core.message_types import JOINT_STATE
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,
@@ -18,7 +19,6 @@ from body_tracking.pipeline.system import (
     asked,
     transport,
 )
-from body_tracking.recording.qos import RELIABLE
 
 
 def _conventions() -> Sequence[str]:
@@ -28,7 +28,7 @@ def _conventions() -> Sequence[str]:
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
-    from body_tracking.filters.roles import role_of
+    from body_tracking.pipeline.roles import role_of
 
     role = role_of(options)
     # What nobody asked for is left to joint_angles, which follows the filter while that changes.

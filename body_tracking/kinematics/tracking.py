@@ -11,17 +11,17 @@ from collections import Counter
 
 import numpy as np
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core import so3
+from body_tracking.core.body_model import ModelError
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of, convention
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.inverse import Fit, InverseKinematics
 from body_tracking.kinematics.lengths import SkeletonLengths
-from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.motion import joint_densities
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 
 POSITIONAL = "positional"
 """The convention of :mod:`body_tracking.kinematics.positional`, which needs no model."""

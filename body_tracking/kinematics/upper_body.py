@@ -27,9 +27,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS, Linearisation, ModelError, Posture
-from body_tracking.skeleton import FloatArray, IntArray, Joint
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS, Linearisation, ModelError, Posture
+from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 
 _EYE3 = np.eye(3)
 _X, _Y, _Z = _EYE3

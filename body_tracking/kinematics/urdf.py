@@ -18,11 +18,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.kinematics.conventions import SHOULDER_USUAL, model_names
 from body_tracking.kinematics.ranges import RANGES
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
-from body_tracking.skeleton import FloatArray, Joint
 
 GREATEST_RATE = 30.0
 """rad/s in every joint's limit: the fastest that people turn a joint, but for throwing."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import JOINT_STATE, MessageError, MessageTypes, to_header, to_nanoseconds
-from body_tracking.skeleton import FloatArray
 
 
 def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:

@@ -10,53 +10,53 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.messages.types import (
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import (
     CLOCK as CLOCK,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     DIAGNOSTICS as DIAGNOSTICS,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     FLOAT_ARRAY as FLOAT_ARRAY,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     IMAGE as IMAGE,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     IMU as IMU,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     JOINT_STATE as JOINT_STATE,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     JOINT_TRAJECTORY as JOINT_TRAJECTORY,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     MAGNETIC_FIELD as MAGNETIC_FIELD,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     MARKERS as MARKERS,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     POINT_CLOUD as POINT_CLOUD,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     SEGMENTS as SEGMENTS,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     STRING as STRING,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     TF as TF,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     TIME_REFERENCE as TIME_REFERENCE,
 )
-from body_tracking.messages.types import (
+from body_tracking.core.message_types import (
     TRANSFORM as TRANSFORM,
 )
-from body_tracking.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
+from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
 
 
 class MessageError(BodyTrackingError):
@@ -112,7 +112,7 @@ class BagMessages:
 
 
 def to_nanoseconds(stamp: Any) -> int:
-    """``builtin_interfaces/Time`` to integer nanoseconds, 0 to :data:`~body_tracking.skeleton.MAX_STAMP_NS`.
+    """``builtin_interfaces/Time`` to integer nanoseconds, 0 to :data:`~body_tracking.core.skeleton.MAX_STAMP_NS`.
 
     Raises:
         MessageError: a time that ROS time does not have: negative, or with a second or more of nanoseconds.

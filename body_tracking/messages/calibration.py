@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 from body_tracking.messages.base import (
     TIME_REFERENCE,
     TRANSFORM,
@@ -17,7 +18,6 @@ from body_tracking.messages.base import (
     to_nanoseconds,
     to_time,
 )
-from body_tracking.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 
 
 def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:

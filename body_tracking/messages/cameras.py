@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from body_tracking.camera import MODELS, Camera, CameraError
+from body_tracking.core.camera import MODELS, Camera, CameraError
 from body_tracking.messages.base import MessageError, MessageTypes, to_header
 
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"

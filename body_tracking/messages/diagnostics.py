@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from body_tracking.messages.base import DIAGNOSTICS, MessageTypes, RosMessages, to_header
-from body_tracking.node_status import NodeStatus
+from body_tracking.messages.node_status import NodeStatus
 
 MAX_VALUES, MAX_TEXT = 500, 1000
 """Values of a status, and characters of each text, that are kept of what comes; our nodes tell a tenth of that."""

@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.imu import ImuSample, check_magnetic_field
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import (
     IMU,
     MAGNETIC_FIELD,
@@ -16,9 +19,6 @@ from body_tracking.messages.base import (
     to_nanoseconds,
     to_vector,
 )
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.sensors.imu import ImuSample, check_magnetic_field
-from body_tracking.skeleton import FloatArray
 
 
 def imu_to_message(

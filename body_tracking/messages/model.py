@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.model import BodyModel
+from body_tracking.core.body_model import BodyModel
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import (
     IMAGE,
     JOINT_STATE,
@@ -18,7 +19,6 @@ from body_tracking.messages.base import (
     to_header,
     to_nanoseconds,
 )
-from body_tracking.skeleton import FloatArray
 
 
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import sys
 
+from body_tracking.core.signals import hold_signals
 from body_tracking.executables import start
-from body_tracking.signals import hold_signals
 
 if __name__ == "__main__":
     hold_signals()
-    from body_tracking.nodes.supervised import die_with_parent
+    from body_tracking.ros.supervised import die_with_parent
     from body_tracking.systems import EXECUTABLES, config_text
 
     die_with_parent()

@@ -12,16 +12,16 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from body_tracking import graph
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import RELIABLE, Qos
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.messages.base import to_time
-from body_tracking.nodes.bag_topics import UnknownTypeError, message_class, to_profile
-from body_tracking.nodes.common import ROS, STEADY, GraphNode, run
-from body_tracking.parameters import Parameter, Value
+from body_tracking.pipeline import graph
 from body_tracking.recording.player import Playback
-from body_tracking.recording.qos import RELIABLE, Qos
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.ros.bag_topics import UnknownTypeError, message_class, to_profile
+from body_tracking.ros.node import ROS, STEADY, GraphNode, run
 
 PARAMETERS = (
     Parameter("bag", "", "the bag: a folder, or a single mcap file"),

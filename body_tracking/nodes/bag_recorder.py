@@ -15,14 +15,15 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
-from body_tracking import graph, names
-from body_tracking.errors import BodyTrackingError
-from body_tracking.graph import is_model_covariance
-from body_tracking.nodes.bag_topics import from_profile, message_class, to_profile
-from body_tracking.nodes.common import STEADY, GraphNode, run
-from body_tracking.parameters import Parameter, Value
-from body_tracking.recording.qos import LATCHED, Qos, request_for
+from body_tracking.core import names
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import LATCHED, Qos, request_for
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.graph import is_model_covariance
 from body_tracking.recording.rosbag2 import BagError, BagWriter
+from body_tracking.ros.bag_topics import from_profile, message_class, to_profile
+from body_tracking.ros.node import STEADY, GraphNode, run
 
 PARAMETERS = (
     Parameter(

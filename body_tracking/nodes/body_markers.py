@@ -12,19 +12,19 @@ from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from body_tracking import graph
-from body_tracking.calibration.result import SensorPose
+from body_tracking.core.parameters import Parameter
+from body_tracking.core.qos import LATCHED, LATEST, RELIABLE
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import Skeleton
+from body_tracking.core.sources import check_sensor_name
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.calibration import transform_to_pose
-from body_tracking.messages.markers import Markers, segments_to_transforms
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import BODY, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
-from body_tracking.parameters import Parameter
-from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
-from body_tracking.sensors import check_sensor_name
-from body_tracking.skeleton import Skeleton
+from body_tracking.pipeline import graph
+from body_tracking.ros.bag_topics import to_profile
+from body_tracking.ros.node import BODY, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
 from body_tracking.viewing.colours import FILTERED, FUSED, UNCERTAINTY, sensor_colours
+from body_tracking.viewing.markers import Markers, segments_to_transforms
 from body_tracking.viewing.shapes import ellipsoids, figure, frustum, in_world
 
 try:  # not on PyPI

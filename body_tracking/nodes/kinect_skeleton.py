@@ -12,16 +12,14 @@ from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 
-import body_tracking.recording.source
-import body_tracking.sensors.network  # noqa: F401  (both register their backends)
-from body_tracking import graph
-from body_tracking.cdr import encode_skeletons
-from body_tracking.errors import BodyTrackingError
-from body_tracking.nodes.common import RELIABLE, GraphNode, run
-from body_tracking.parameters import Parameter
-from body_tracking.sensors import RecordedFrame, check_sensor_name
-from body_tracking.sensors.live import SourceSettings, backends, described, open_source
-from body_tracking.sensors.ros_time import RosTime
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Parameter
+from body_tracking.core.sources import RecordedFrame, check_sensor_name
+from body_tracking.kinect.live import SourceSettings, backends, described, open_source
+from body_tracking.kinect.ros_time import RosTime
+from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.pipeline import graph
+from body_tracking.ros.node import RELIABLE, GraphNode, run
 
 _DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0

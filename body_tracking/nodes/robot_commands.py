@@ -28,23 +28,23 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from body_tracking import graph
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import LATCHED
+from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.core.skeleton import Skeleton
+from body_tracking.core.sources import check_sensor_name
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.messages.angles import joint_states_to_angles
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import BODY, RELIABLE, ROS, SENSORS, STEADY, GraphNode, run
-from body_tracking.parameters import Parameter, Value
-from body_tracking.recording.qos import LATCHED
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.pipeline import graph
 from body_tracking.robot.calibration import CalibrationQuality
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
 from body_tracking.robot.mapping import TRAJECTORY, MappingError, load
-from body_tracking.sensors import check_sensor_name
-from body_tracking.skeleton import Skeleton
+from body_tracking.ros.bag_topics import to_profile
+from body_tracking.ros.node import BODY, RELIABLE, ROS, SENSORS, STEADY, GraphNode, run
 
 PARAMETERS = (
     Parameter("mapping", "", "the robot's mapping file; see docs/robots.md"),

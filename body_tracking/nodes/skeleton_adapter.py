@@ -11,17 +11,17 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from body_tracking import graph
-from body_tracking.cdr import encode_skeletons
+from body_tracking.core.parameters import Parameter
+from body_tracking.core.qos import SENSOR_DATA
+from body_tracking.core.skeleton import TrackingState
+from body_tracking.core.sources import check_sensor_name, optical_frame
+from body_tracking.kinect.azure import bodies_of
+from body_tracking.kinect.ros_time import RosTime
+from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.skeletons import markers_to_points
-from body_tracking.nodes.bag_topics import to_profile
-from body_tracking.nodes.common import RELIABLE, GraphNode, run
-from body_tracking.parameters import Parameter
-from body_tracking.recording.qos import SENSOR_DATA
-from body_tracking.sensors import check_sensor_name, optical_frame
-from body_tracking.sensors.azure import bodies_of
-from body_tracking.sensors.ros_time import RosTime
-from body_tracking.skeleton import TrackingState
+from body_tracking.pipeline import graph
+from body_tracking.ros.bag_topics import to_profile
+from body_tracking.ros.node import RELIABLE, GraphNode, run
 
 PARAMETERS = (
     Parameter("sensor", "azure1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),

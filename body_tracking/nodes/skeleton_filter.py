@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from body_tracking.filters.stage import FilterStage
-from body_tracking.nodes.common import run
-from body_tracking.nodes.host import StageNode
+from body_tracking.ros.host import StageNode
+from body_tracking.ros.node import run
 
 PARAMETERS = FilterStage.PARAMETERS
 

@@ -25,28 +25,30 @@ from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2
 from std_srvs.srv import Trigger
 
-from body_tracking import graph, names, systems
-from body_tracking.calibration.result import SensorPose
-from body_tracking.cdr import decode_skeletons
-from body_tracking.errors import BodyTrackingError
+from body_tracking import systems
+from body_tracking.core import names
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Parameter
+from body_tracking.core.qos import LATCHED, LATEST, RELIABLE
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.core.sources import check_sensor_name
 from body_tracking.filters import FILTERS
-from body_tracking.filters.roles import ROLES
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
+from body_tracking.messages.node_status import NodeStatus, note_statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.node_status import NodeStatus, note_statuses
-from body_tracking.nodes.bag_topics import message_class, to_profile
-from body_tracking.nodes.common import BODY, SENSORS, GraphNode, deserialized, run
-from body_tracking.nodes.wire import WIRE
-from body_tracking.parameters import Parameter
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import load
-from body_tracking.recording.qos import LATCHED, LATEST, RELIABLE
-from body_tracking.sensors import check_sensor_name
-from body_tracking.skeleton import FloatArray, Skeleton
+from body_tracking.ros.bag_topics import message_class, to_profile
+from body_tracking.ros.node import BODY, SENSORS, GraphNode, deserialized, run
+from body_tracking.ros.wire import WIRE
 from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.snapshot import PageError, Seen, Snapshot
 

@@ -6,9 +6,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from body_tracking.clocks import jumped_back
-from body_tracking.errors import BodyTrackingError
-from body_tracking.pipeline.codecs import Wire
+from body_tracking.core.clocks import jumped_back
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.messages.codecs import Wire
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _LOOKS = 2

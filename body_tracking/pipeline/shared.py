@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from body_tracking import graph
-from body_tracking.parameters import Parameter, Value
-from body_tracking.pipeline.codecs import Skeletons
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.core.qos import Qos
+from body_tracking.core.sources import check_sensor_name
+from body_tracking.messages.codecs import Skeletons
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Port
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
-from body_tracking.recording.qos import Qos
-from body_tracking.sensors import check_sensor_name
 
 RELIABLE = Parameter(
     "reliable",
@@ -45,7 +45,7 @@ REFERENCE = Parameter(
 
 FRAMES_KEPT = 16
 """Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
-that is too slow for them drops the oldest (:mod:`body_tracking.backlog`)."""
+that is too slow for them drops the oldest (:mod:`body_tracking.ros.backlog`)."""
 
 
 def names_in(value: Value) -> tuple[str, ...]:

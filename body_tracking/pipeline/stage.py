@@ -1,6 +1,6 @@
 """A stage: what one node does, without ROS.
 
-A node hosts a stage (:mod:`body_tracking.nodes.host`), and the offline runner hosts the same stages
+A node hosts a stage (:mod:`body_tracking.ros.host`), and the offline runner hosts the same stages
 (:mod:`body_tracking.pipeline.offline`); both decode what a stage takes and encode what it returns.
 """
 
@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-from body_tracking.parameters import Parameter, Value
-from body_tracking.pipeline.codecs import Codec
-from body_tracking.recording.qos import Qos
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import Qos
+from body_tracking.messages.codecs import Codec
 
 
 class Now(NamedTuple):

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, TypeAlias
 
-from body_tracking.parameters import Value, matches
-from body_tracking.recording.qos import Qos
+from body_tracking.core.parameters import Value, matches
+from body_tracking.core.qos import Qos
 
 Options: TypeAlias = Mapping[str, Value]
 """The value of every :class:`Option`, by its name."""

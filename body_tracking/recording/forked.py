@@ -16,11 +16,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from body_tracking import graph
-from body_tracking.parameters import Value
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import Qos
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.system import Place
-from body_tracking.recording.qos import Qos
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remove_file
 from body_tracking.systems import NODES, stage_class
 

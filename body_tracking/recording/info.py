@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.recording.qos import Qos
+from body_tracking.core.qos import Qos
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.recording.rosbag2 import BagReader, TopicInfo, recover
-from body_tracking.skeleton import NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)

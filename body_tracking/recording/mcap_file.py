@@ -28,9 +28,9 @@ from mcap.records import Channel, Chunk, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.files import open_regular
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import open_regular
+from body_tracking.core.skeleton import NANOSECONDS
 
 MAGIC: bytes = MCAP0_MAGIC
 LIBRARY = "body_tracking"

@@ -9,8 +9,8 @@ import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.recording.rosbag2 import BagError, BagReader, RawMessage
-from body_tracking.skeleton import NANOSECONDS
 
 _BATCH = 200  # messages at once at most, so that a pause takes effect while the player is catching up
 _LOOP_GAP_NS = 10_000_000  # between the end and the beginning: a bag of one instant must not spin

@@ -16,26 +16,26 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from body_tracking import graph
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.storage import load
-from body_tracking.cdr import decode_skeletons
-from body_tracking.clocks import jumped_back
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.clocks import jumped_back
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
-from body_tracking.fusion.subject import PeopleParameters, SubjectSelector
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.messages.base import POINT_CLOUD
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_parameters import parameters_for as parameters_of_nodes
-from body_tracking.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.pipeline.people import PeopleParameters, SubjectSelector
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage, deserialize
-from body_tracking.skeleton import NANOSECONDS, Skeleton
 from body_tracking.systems import (
     STAGES,
     add_options,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from body_tracking import names
+from body_tracking.core import names
 from body_tracking.recording.rosbag2 import BagReader, RawMessage
 from body_tracking.recording.stamps import RecordedStamps
 

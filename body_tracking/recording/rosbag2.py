@@ -3,6 +3,8 @@
 Messages stay the CDR bytes that they are on the wire; :func:`serialize` and :func:`deserialize` convert where somebody
 wants to look inside. Layout: https://github.com/ros2/rosbag2 (metadata version 9) and the ``ros2`` profile of
 https://mcap.dev/spec/registry. All times are integer nanoseconds.
+
+Over 500 lines: reader, writer and metadata of one format, which must agree.
 """
 
 from __future__ import annotations
@@ -23,13 +25,13 @@ from mcap.writer import Writer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from body_tracking.files import FileError, FileLimitError, load_yaml, open_regular, read_text
+from body_tracking.core import qos as quality
+from body_tracking.core.files import FileError, FileLimitError, load_yaml, open_regular, read_text
+from body_tracking.core.qos import Qos
 from body_tracking.messages.base import BagMessages
-from body_tracking.recording import qos as quality
 from body_tracking.recording.mcap_file import LIBRARY, McapFile
 from body_tracking.recording.mcap_file import BagError as BagError
 from body_tracking.recording.mcap_repair import finish
-from body_tracking.recording.qos import Qos
 
 METADATA = "metadata.yaml"
 MAX_WAITING_BYTES = 1 << 28

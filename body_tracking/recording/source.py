@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.core.sources import RecordedFrame, check_sensor_name, optical_frame
+from body_tracking.kinect.csv_recording import sensor_column
+from body_tracking.kinect.live import SourceError, SourceSettings
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import CSV_SUFFIXES, open_recording
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, deserialize
 from body_tracking.recording.stamps import RecordedClock
-from body_tracking.sensors import RecordedFrame, check_sensor_name, optical_frame
-from body_tracking.sensors.csv_recording import sensor_column
-from body_tracking.sensors.live import SourceError, SourceSettings, register
-from body_tracking.skeleton import NANOSECONDS
 
 LATE_NS = 500_000_000
 """A frame this late is left out: a node that was started again goes on where the recording is by now."""
@@ -84,7 +84,7 @@ class RecordingSource:
         self._closed.set()
 
     def read(self, timeout: float) -> RecordedFrame | None:
-        """See :class:`body_tracking.sensors.live.SkeletonSource`."""
+        """See :class:`body_tracking.kinect.live.SkeletonSource`."""
         deadline_ns = time.time_ns() + round(timeout * NANOSECONDS)
         while self._next is not None and not self._closed.is_set():
             due_ns = self._due_ns(self._next)
@@ -182,6 +182,3 @@ def _bag_frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | 
                 continue  # as a sensor that missed a frame
             yield message.log_time_ns, RecordedFrame(sensor, message.log_time_ns, skeletons)
         yield reader.end_ns, None
-
-
-register("recording", RecordingSource)

@@ -23,12 +23,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from body_tracking import graph
+from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray, IntArray
+from body_tracking.kinect.ros_time import OTHER_CLOCK_NS
 from body_tracking.messages.base import TIME_REFERENCE
+from body_tracking.pipeline import graph
 from body_tracking.recording.mcap_file import BagError, McapFile
 from body_tracking.recording.rosbag2 import RawMessage, deserialize, first_field, serialize
-from body_tracking.sensors.ros_time import OTHER_CLOCK_NS
-from body_tracking.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray, IntArray
 
 SAME_CLOCK_NS: Final = NANOSECONDS // 10
 """Sensors whose median differences from the log are this close share a clock: their stamps keep their distances."""

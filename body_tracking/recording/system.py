@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from body_tracking import graph
-from body_tracking.messages.types import CLOCK
-from body_tracking.parameters import Value
+from body_tracking.core.message_types import CLOCK
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     Command,
     NodeSpec,
@@ -18,7 +19,6 @@ from body_tracking.pipeline.system import (
     System,
     TopicSpec,
 )
-from body_tracking.recording.qos import RELIABLE
 
 
 def _recorded(parameters: Mapping[str, Value], topics: Iterable[str]) -> Iterable[str]:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.robot.mapping import SafetyLimits
-from body_tracking.skeleton import NANOSECONDS
 
 SILENCE = 5.0
 """Seconds after which what was said once a second is no longer taken to hold."""

@@ -33,13 +33,13 @@ from enum import StrEnum
 
 import numpy as np
 
-from body_tracking.clocks import jumped_back
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.clocks import jumped_back
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.robot.calibration import CalibrationWatch
 from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
 ROBOT_SILENCE = 0.5
 """Seconds without a word of the robot's own state after which it is taken to be away."""

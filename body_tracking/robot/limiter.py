@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray
 
 
 class Limiter:

@@ -40,9 +40,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from body_tracking import files
-from body_tracking.errors import BodyTrackingError
-from body_tracking.parameters import (
+from body_tracking.core import files
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
     Value,
@@ -51,7 +51,7 @@ from body_tracking.parameters import (
     number_field,
     parameters_from,
 )
-from body_tracking.skeleton import BoolArray, FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray
 
 TRAJECTORY, ARRAY = "joint_trajectory", "float64_multi_array"
 HOLD_ROBOT, HOLD_JOINT = "hold_robot", "hold_joint"

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from body_tracking import graph
-from body_tracking.messages.types import JOINT_TRAJECTORY
-from body_tracking.parameters import Value
+from body_tracking.core.message_types import JOINT_TRAJECTORY
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,
@@ -19,7 +20,6 @@ from body_tracking.pipeline.system import (
     TopicSpec,
     sensors_and_transport,
 )
-from body_tracking.recording.qos import RELIABLE
 
 
 def _takes(parameters: Mapping[str, Value], topics: Iterable[str]) -> Iterable[str]:

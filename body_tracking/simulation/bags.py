@@ -17,18 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
-from body_tracking import graph
-from body_tracking.cdr import encode_angles, encode_skeletons
+from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.kinect.simulated import KinectErrors, read_errors
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
+from body_tracking.messages.cdr import encode_angles, encode_skeletons
 from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
 from body_tracking.messages.model import estimate_to_joint_state
-from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.pipeline import graph
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
-from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
-from body_tracking.simulation.kinect import KinectErrors, read_errors
 from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
@@ -44,7 +45,6 @@ from body_tracking.simulation.scene import (
     lanes,
     simulate,
 )
-from body_tracking.skeleton import NANOSECONDS
 
 SHIPPED: dict[str, str] = {
     "tpose_wave": "two_handed_wave",

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.simulation.postures import HANGING, NAMES, mirrored, posture
-from body_tracking.skeleton import FloatArray
 
 
 def _nothing() -> FloatArray:

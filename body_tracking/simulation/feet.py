@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.kinematics.trajectories import Moves
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.postures import PELVIS_QUATERNION, at
-from body_tracking.simulation.trajectories import Moves
-from body_tracking.skeleton import FloatArray
 
 _STANCE = 0.055
 """Of the stature: half the distance of the ankles of somebody who stands."""

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray
 
 DISTANCE: Final = 2.0
 """Metres from the person to the sensors (thesis 5.2.2)."""

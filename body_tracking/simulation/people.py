@@ -14,11 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.kinect.occlusion import Capsules
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.simulation.occlusion import Capsules
-from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 MODEL: Final = UpperBody()
 """The body from the pelvis upwards."""
@@ -253,7 +253,7 @@ def joints(person: Person, course: Course) -> FloatArray:
     """Where the 25 joints are.
 
     Returns:
-        (n, 25, 3) metres in the course's frame, in the order of :class:`~body_tracking.skeleton.Joint`.
+        (n, 25, 3) metres in the course's frame, in the order of :class:`~body_tracking.core.skeleton.Joint`.
 
     Raises:
         PeopleError: an ankle is further from its hip than the leg is long.

@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.kinematics.ranges import SHOULDER_SWING, SHOULDER_TWIST, Ranges
 from body_tracking.simulation.people import MODEL
-from body_tracking.skeleton import FloatArray, IntArray
 
 _MIDDLE = (
     "pelvis_flexion",

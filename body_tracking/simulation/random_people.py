@@ -15,12 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.ranges import Ranges
-from body_tracking.simulation.people import MODEL
-from body_tracking.simulation.postures import FROM_CENTRE, PELVIS_QUATERNION, SHOULDER_QUATERNIONS
-from body_tracking.simulation.trajectories import WAVE_BAND, Moves, Waves
-from body_tracking.skeleton import (
+from body_tracking.core import so3
+from body_tracking.core.skeleton import (
     N_JOINTS,
     NANOSECONDS,
     BoolArray,
@@ -30,6 +26,10 @@ from body_tracking.skeleton import (
     Skeleton,
     TrackingState,
 )
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.trajectories import WAVE_BAND, Moves, Waves
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.postures import FROM_CENTRE, PELVIS_QUATERNION, SHOULDER_QUATERNIONS
 
 _RANGES: Final = Ranges(MODEL)
 _NAMES: Final = MODEL.coordinate_names[6:]

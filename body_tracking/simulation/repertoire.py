@@ -15,8 +15,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.kinematics.trajectories import Moves, Waves, eased, minimum_jerk
 from body_tracking.simulation.exercises import EXERCISES, Exercise, normal
 from body_tracking.simulation.feet import Feet, Steps, carried, standing
 from body_tracking.simulation.people import Course, Person
@@ -31,8 +33,6 @@ from body_tracking.simulation.postures import (
     posture,
 )
 from body_tracking.simulation.random_people import RandomMotion
-from body_tracking.simulation.trajectories import Moves, Waves, eased, minimum_jerk
-from body_tracking.skeleton import FloatArray
 
 TPOSE_S = 3.0
 """Seconds of T-pose at the beginning."""

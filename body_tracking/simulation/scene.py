@@ -11,20 +11,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.clocks import ClockModel
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.model import Posture
+from body_tracking.core.body_model import Posture
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, IntArray, Skeleton, TrackingState
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.inertial.simulated import ImuSamples, Motion, SimulatedImu
+from body_tracking.inertial.surroundings import Surroundings
+from body_tracking.kinect.simulated import KinectErrors
+from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.kinematics.upper_body import PARENTS
-from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.imus import ImuSamples, Motion, SimulatedImu
-from body_tracking.simulation.kinect import KinectErrors
-from body_tracking.simulation.kinect_sensor import Misreading, SimulatedKinect
 from body_tracking.simulation.layouts import Layout, layout
 from body_tracking.simulation.people import MODEL, Course, Person, joints
 from body_tracking.simulation.repertoire import Movement, make_movement
-from body_tracking.simulation.surroundings import Surroundings
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, IntArray, Skeleton, TrackingState
 
 WORLD: Final = "world"
 START_NS: Final = 40 * NANOSECONDS

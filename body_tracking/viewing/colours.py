@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.skeleton import TrackingState
+from body_tracking.core.skeleton import TrackingState
 
 Colour = tuple[int, int, int]
 ColourArray = NDArray[np.uint8]

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.clocks import jumped_back
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.core.clocks import jumped_back
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
 
 BAND: Final = 1.959963984540054
 """Half the width of a band with 95 % of a normal distribution, in standard deviations."""

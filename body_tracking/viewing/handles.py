@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 import viser
 
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.viewing.colours import Colour, ColourArray, linear
 from body_tracking.viewing.shapes import figure
 from body_tracking.viewing.snapshot import Seen

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import socket
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from io import StringIO
@@ -17,11 +18,11 @@ import numpy as np
 import viser
 from viser import uplot
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.kinematics import so3
-from body_tracking.node_status import NodeStatus
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import Skeleton
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.system import Layer, load
-from body_tracking.skeleton import Skeleton
 from body_tracking.viewing.colours import (
     BODY,
     FILTERED,
@@ -46,6 +47,9 @@ from body_tracking.viewing.status import table
 
 PLOTS: Final = 4
 """Angles that are plotted at a time."""
+_STOP_S: Final = 2.0
+"""Time that the server has to stop, seconds."""
+
 POINTS: Final = 200
 """Points of a plotted curve at most: about one per two pixels."""
 
@@ -127,9 +131,11 @@ class Page:
         return len(self._server.get_clients())
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop serving; a server that does not stop is left behind, its threads are daemons."""
         with redirect_stdout(StringIO()):
-            self._server.stop()
+            stopping = threading.Thread(target=self._server.stop, daemon=True)
+            stopping.start()
+            stopping.join(_STOP_S)
 
     # --- the scene
 

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.skeleton import BONES, MAX_RANGE, BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import BONES, MAX_RANGE, BoolArray, FloatArray, IntArray, Joint, Skeleton
 from body_tracking.viewing.colours import Colour, ColourArray, joint_colours
 
 ELLIPSOID_RADIUS: Final = 2.7954834829151074

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from body_tracking.calibration.result import SensorPose
-from body_tracking.errors import BodyTrackingError
-from body_tracking.skeleton import FloatArray, Skeleton
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray, Skeleton
 
 
 class PageError(BodyTrackingError):

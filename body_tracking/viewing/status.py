@@ -6,7 +6,7 @@ import html
 from collections.abc import Mapping
 from typing import Final
 
-from body_tracking.node_status import NodeStatus
+from body_tracking.messages.node_status import NodeStatus
 
 FRESH: Final = 3.0
 """Seconds for which what a node said of itself counts; it says so once a second."""

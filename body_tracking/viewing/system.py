@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from body_tracking import graph
-from body_tracking.messages.types import MARKERS
-from body_tracking.parameters import Value
+from body_tracking.core.message_types import MARKERS
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import NodeSpec, NodeType, Option, Options, Place, System, TopicSpec
-from body_tracking.recording.qos import RELIABLE
 
 
 def _skeletons(parameters: Mapping[str, Value], topics: Iterable[str]) -> Iterable[str]:

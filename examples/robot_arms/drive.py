@@ -30,8 +30,10 @@ from simulated_arm import FloatArray, SimulatedArm
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from body_tracking.errors import BodyTrackingError
-from body_tracking.graph import (
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.pipeline.graph import (
     DEFAULT_BODY,
     DIAGNOSTICS_TOPIC,
     joint_states_stddev_topic,
@@ -39,8 +41,6 @@ from body_tracking.graph import (
     sensors_among,
     skeleton_topic,
 )
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.messages.diagnostics import statuses
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
 

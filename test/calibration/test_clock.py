@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
-from body_tracking.clock_correlation import DRIFT_PRIOR, FINE_RANGE, MIN_STDDEV, ClockFit
-from body_tracking.clocks import ClockModel
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, FINE_RANGE, MIN_STDDEV, ClockFit
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from walkers import walk
 
 

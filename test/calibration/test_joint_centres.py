@@ -21,11 +21,11 @@ from body_tracking.calibration.joint_centres import (
     t_pose_offsets,
     turned,
 )
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.segments import segment_frames
+from body_tracking.kinect.csv_recording import CsvRecording
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from draws import some
 from walkers import performed
 

@@ -14,15 +14,15 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.offline import WHOLE, relative_yaw
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult, SensorQuality
 from body_tracking.calibration.rigid import CalibrationError
-from body_tracking.clocks import ClockModel
-from body_tracking.sensors.csv_recording import CsvRecording
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.kinect.csv_recording import CsvRecording
+from body_tracking.recording.calibrate import WHOLE, relative_yaw
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from draws import draws, some
 from walkers import about_y, frame, walk
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import Pairs, estimate, same_sense, start_from_midline
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
-from body_tracking.skeleton import MIRROR, FloatArray
+from body_tracking.core.skeleton import MIRROR, FloatArray
 from walkers import about_y, walk
 
 ROTATION, TRANSLATION = about_y(-70.0), np.array([2.0, 0.1, 2.2])

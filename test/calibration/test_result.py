@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose
 
-from body_tracking.calibration.result import level_pose
+from body_tracking.core.sensor_poses import level_pose
 
 
 def test_the_reference_sensor_looks_along_x_with_z_up() -> None:

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.simulation.repertoire import make_movement
-from body_tracking.skeleton import FloatArray
 from walkers import ABOUT_FACE, OPTICAL_FROM_LEVEL, PERSON, about_y, performed, walk
 
 TIMES = np.arange(FRAMES) / 30.0

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import load, save
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 
 
 def example(seed: int = 0) -> CalibrationResult:

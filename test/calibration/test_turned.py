@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.pairwise import Pairs
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration, with_sides_swapped
-from body_tracking.skeleton import MIRROR, FloatArray, Joint
+from body_tracking.core.skeleton import MIRROR, FloatArray, Joint
 from walkers import about_y, performed
 
 ROTATION, TRANSLATION = about_y(-45.0), np.array([1.5, 0.1, 0.6])

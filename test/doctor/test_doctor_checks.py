@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from body_tracking import cli
-from body_tracking.doctor import OK, PROBLEM, WARNING, Finding, environment
-from body_tracking.doctor.bags import bag
 from body_tracking.recording.rosbag2 import BagReader, BagWriter
+from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, environment
+from body_tracking.ros.doctor.bags import bag
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 

@@ -11,6 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Joint
 from body_tracking.evaluation.comparison import (
     ALIGNED,
     AS_IT_IS,
@@ -26,12 +29,9 @@ from body_tracking.evaluation.reading import (
     read_truth,
     truth_of_markers,
 )
-from body_tracking.kinematics.angles import JointAngles
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Joint
 
 TWIST = Path(__file__).resolve().parents[2] / "bags" / "tpose_torso_twist"
 TURN = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from body_tracking.cli import main
+from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
 from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.reading import read_estimate, read_markers, read_truth
@@ -21,7 +22,6 @@ from body_tracking.evaluation.report import facts, tables, text
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
-from body_tracking.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from body_tracking import graph
+from body_tracking.core.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
 from body_tracking.evaluation.metrics import (
     Curve,
     MetricsError,
@@ -32,8 +32,8 @@ from body_tracking.evaluation.metrics import (
 )
 from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
 
 TWIST = Path(__file__).resolve().parents[2] / "bags" / "tpose_torso_twist"
 WRIST = Joint.WRIST_LEFT

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.evaluation.c3d import MarkerError
 from body_tracking.evaluation.plug_in_gait import (
     MARKERS,
@@ -27,7 +28,6 @@ from body_tracking.evaluation.plug_in_gait import (
     read_plug_in_gait,
 )
 from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, smooth
-from body_tracking.skeleton import FloatArray, Joint
 
 RATE = 100.0
 RADIUS = 0.007

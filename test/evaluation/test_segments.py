@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking import graph
+from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint
 from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint
 
 TWIST = Path(__file__).resolve().parents[2] / "bags" / "tpose_torso_twist"
 TRUNK = ("SPINE", "NECK", "HEAD", "SHOULDER", "HIP")

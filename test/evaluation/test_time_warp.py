@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import sample
-from body_tracking.skeleton import FloatArray
 from draws import draws
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))

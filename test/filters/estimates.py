@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from numpy.testing import assert_allclose
 
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.filters.ekf import ExtendedKalmanFilter
-from body_tracking.kinematics.estimate import ModelEstimate
 
 
 def known(estimator: ExtendedKalmanFilter) -> ModelEstimate:

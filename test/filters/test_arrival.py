@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 
 POSITIONS, STATES = np.zeros((N_JOINTS, 3)), np.zeros(N_JOINTS, dtype=np.uint8)
 

@@ -13,12 +13,22 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bent_hands import hand_columns, turned_over
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import (
+    MIRROR,
+    N_JOINTS,
+    NANOSECONDS,
+    FloatArray,
+    IntArray,
+    Joint,
+    Skeleton,
+    TrackingState,
+)
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.measurement import BASE_STDDEV
 from body_tracking.simulation.random_people import (
     ARMS,
     EVERYTHING,
@@ -33,16 +43,6 @@ from body_tracking.simulation.random_people import (
     capture_times,
     observe,
     truth_of,
-)
-from body_tracking.skeleton import (
-    MIRROR,
-    N_JOINTS,
-    NANOSECONDS,
-    FloatArray,
-    IntArray,
-    Joint,
-    Skeleton,
-    TrackingState,
 )
 from draws import draws
 

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.parameters import check_all, fields_of, parameters_from
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,
@@ -23,9 +26,6 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.linear import LINEAR_MODELS, FilterError
 from body_tracking.filters.prediction import PERIOD_NS, Prediction
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.parameters import check_all, fields_of, parameters_from
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 from walkers import TRACKED, performed
 
 
@@ -74,7 +74,7 @@ def test_parameters_out_of_range_are_refused(parameters: type, name: str) -> Non
 
 def test_the_names_alone_cost_no_scipy() -> None:
     """Every node reads the table of the graph, and should start soon."""
-    code = "import sys, body_tracking.graph; assert not {'scipy.stats', 'filterpy'} & set(sys.modules)"
+    code = "import sys, body_tracking.pipeline.graph; assert not {'scipy.stats', 'filterpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 

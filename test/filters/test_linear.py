@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 from scipy.stats import chi2
 
+from body_tracking.core.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.filters.linear import (
     CONSTANT_VELOCITY,
     LINEAR_MODELS,
@@ -23,7 +24,6 @@ from body_tracking.filters.linear import (
     LinearKalmanParameters,
 )
 from body_tracking.kinematics.motion import joint_densities
-from body_tracking.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from draws import draws
 from walkers import TRACKED
 

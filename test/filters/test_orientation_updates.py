@@ -15,15 +15,16 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.stats import binom
 
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.ekf import sources as orientation
 from body_tracking.filters.ekf.priors import _HELD_STDDEV, _LIMIT_STDDEV
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.simulation.random_people import (
     MODEL,
     START_NS,
@@ -36,7 +37,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from draws import draws
 
 NAMES = MODEL.coordinate_names

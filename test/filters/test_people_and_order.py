@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from body_tracking import graph
-from body_tracking.calibration.result import level_pose
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.sensor_poses import level_pose
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import FilterSettings, PersonFilter
-from body_tracking.fusion.subject import ALL, PeopleParameters
-from body_tracking.kinematics.model import SEGMENTS
-from body_tracking.orientation import SegmentOrientation
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import ALL, PeopleParameters
 from body_tracking.simulation.random_people import (
     MODEL,
     START_NS,
@@ -27,7 +28,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import NANOSECONDS, Skeleton
 
 SENSORS = ("kinect1", "kinect2")
 DELAYS = 0.02, 0.045

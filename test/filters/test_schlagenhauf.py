@@ -10,10 +10,10 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.filters.schlagenhauf import SchlagenhaufKalmanFilter, SchlagenhaufParameters
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.simulation.bags import SHIPPED
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from walkers import TRACKED, performed
 
 FRAME_NS = NANOSECONDS // 30

@@ -10,11 +10,12 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.filters import smoother
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter, sensor_errors
 from body_tracking.filters.linear import FilterError
 from body_tracking.filters.smoother import FixedLagSmoother, Smoothed, smooth
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     ARMS,
@@ -29,7 +30,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from draws import draws
 
 Recording = list[tuple[str, Skeleton]]

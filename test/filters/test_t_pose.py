@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from body_tracking.calibration.joint_centres import LEARNT, turned
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import FloatArray, Joint, Skeleton
 from body_tracking.filters import SkeletonFilter, make_filter, smoother
 from body_tracking.filters.ekf import EkfParameters
 from body_tracking.filters.smoother import Smoothed, smooth
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.skeleton import FloatArray, Joint, Skeleton
 from draws import draws
 from walkers import TRACKED, frame, performed
 

@@ -8,9 +8,9 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import solve_discrete_are
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.filters import make_filter
 from body_tracking.filters.thesis import THESIS_LKF1, THESIS_LKF2, ThesisLkf1, ThesisLkf2
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from walkers import TRACKED
 
 FRAME_NS = NANOSECONDS // 30

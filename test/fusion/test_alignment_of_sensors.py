@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from two_kinects import FRAME, OFFSET_NS, POSES, truth
 
-from body_tracking.calibration.result import level_pose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.measurement import joint_stddev
+from body_tracking.core.sensor_poses import level_pose
+from body_tracking.core.skeleton import MIRROR, NANOSECONDS, Joint, Skeleton
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.fusion import FusionError
-from body_tracking.measurement import joint_stddev
-from body_tracking.skeleton import MIRROR, NANOSECONDS, Joint, Skeleton
 from walkers import frame
 
 

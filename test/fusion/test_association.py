@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.core.skeleton import MIRROR, NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import HOLD, Association, torso_distances, torso_points
-from body_tracking.skeleton import MIRROR, NANOSECONDS, FloatArray, Skeleton
 from walkers import performed
 
 FIGURE = performed("standing_still", np.zeros(1))[0]

@@ -15,12 +15,12 @@ from numpy.testing import assert_allclose
 from two_kinects import FRAME, OFFSET, OFFSET_NS, POSES, truth
 
 from body_tracking.calibration.online import OnlineCalibration
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.fusion.fusion import Fusion, FusionError, FusionParameters
 from body_tracking.fusion.sides import HOLD
-from body_tracking.measurement import left_right_axes
-from body_tracking.sensors.csv_recording import CsvRecording
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.kinect.csv_recording import CsvRecording
 from draws import draws, some
 from walkers import TRACKED, about_y, frame
 

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.rhythm import PATIENCE
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, Skeleton
 
 MS = 1_000_000
 PERIOD = 33 * MS

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
+from body_tracking.core.sides import PAIRS
+from body_tracking.core.skeleton import NANOSECONDS, Joint
 from body_tracking.fusion.sides import LEAST_HOLD, Sides
-from body_tracking.sides import PAIRS
-from body_tracking.skeleton import NANOSECONDS, Joint
 
 HOLD = 1.0
 ROUND = math.pi

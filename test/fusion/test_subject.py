@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from body_tracking.fusion.subject import HeldSubject, SubjectSelector
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
+from body_tracking.pipeline.people import HeldSubject, SubjectSelector
 
 
 def body(number: int, distance: float, state: int = 2) -> Skeleton:

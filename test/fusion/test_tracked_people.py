@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import SensorPose, level_pose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose, level_pose
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.fusion.fusion import Fusion
 from body_tracking.fusion.people import People, Slots
 from body_tracking.fusion.people_fusion import PeopleFusion
-from body_tracking.fusion.subject import ALL, FIRST, NEAREST, PeopleParameters
-from body_tracking.skeleton import NANOSECONDS, Skeleton
+from body_tracking.pipeline.people import ALL, FIRST, NEAREST, PeopleParameters
 from walkers import ABOUT_FACE, frame, performed
 
 SENSORS = ("kinect1", "kinect2")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.result import SensorPose, level_pose
-from body_tracking.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.sensor_poses import SensorPose, level_pose
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from walkers import OPTICAL_FROM_LEVEL, about_y, walk
 
 FRAME = 1 / 30

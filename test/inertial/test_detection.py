@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from body_tracking.clock_correlation import Series
+from body_tracking.calibration.clock_correlation import Series
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import AlignmentError, pose_covariance, pose_rotations, yaw
 from body_tracking.inertial.clock import turning
 from body_tracking.inertial.detection import (
@@ -18,10 +20,8 @@ from body_tracking.inertial.detection import (
     likelihood_by_motion,
     likelihood_by_pose,
 )
-from body_tracking.kinematics import so3
+from body_tracking.inertial.simulated import usual_mounting
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.simulation.imus import usual_mounting
-from body_tracking.skeleton import FloatArray
 
 MODEL = UpperBody()
 WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")

@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.inertial.alignment import (
     Alignment,
     AlignmentError,
@@ -18,8 +20,6 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.inertial.heading import HeadingTracker, bone_of
-from body_tracking.kinematics import so3
-from body_tracking.skeleton import FloatArray, Joint
 
 ARM = ("upper_arm_left", "forearm_left")
 SEEDS = st.integers(0, 2**32 - 1)

@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import (
     Alignment,
     AlignmentError,
@@ -24,9 +26,7 @@ from body_tracking.inertial.alignment import (
     wrapped,
     yaw,
 )
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import FloatArray
 
 MODEL = UpperBody()
 WORN = ("pelvis", "upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")

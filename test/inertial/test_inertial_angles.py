@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.core import so3
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.inertial.angles import SegmentAngles
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.conventions import angles_of
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.simulation.random_people import RandomMotion
 

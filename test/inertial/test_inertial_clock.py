@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from body_tracking.clock_correlation import Series
+from body_tracking.calibration.clock_correlation import Series
+from body_tracking.core import so3
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.clock import clock_offset, turning, turning_of_bone, turning_of_sensor
-from body_tracking.kinematics import so3
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 
 
 def moved(times: FloatArray, seed: int) -> FloatArray:

@@ -10,19 +10,19 @@ import pytest
 from scipy.stats import binom
 from worn_people import FOREARMS, MODEL, Fed, feed, recorded, sensor
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.inertial.alignment import pose_rotations, rotation_vectors
 from body_tracking.inertial.mounting import mounting, mountings
 from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.simulated import Slip, usual_mounting
 from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, Told
 from body_tracking.inertial.worn import ReceiptClock
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.simulation.imus import Slip, usual_mounting
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 SECONDS = 22.0
 """Of people who reach out in all directions: about the shortest that there is."""

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.inertial.posture import OrientationKinematics
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.simulation.random_people import RandomMotion
-from body_tracking.skeleton import FloatArray
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths()

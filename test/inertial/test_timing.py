@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from body_tracking.clocks import ReceiptClock
+from body_tracking.core.clocks import ReceiptClock
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.parameters import OWN, REFERENCE, SHARED
 from body_tracking.inertial.timing import SensorClocks
-from body_tracking.skeleton import NANOSECONDS
 
 OFFSETS = st.integers(-(10**12), 10**12)
 SENSORS = ("forearm_left", "forearm_right")

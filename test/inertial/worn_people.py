@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.measurement import joint_stddev
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.tracking import InertialTracker
-from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.measurement import joint_stddev
-from body_tracking.orientation import SegmentOrientation
-from body_tracking.sensors.imu import ImuSample
-from body_tracking.simulation.imus import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import START_NS, Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton
 
 MODEL = UpperBody()
 FOREARMS = ("forearm_left", "forearm_right")

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.conventions import (
     ANYWHERE,
     CONVENTIONS,
@@ -17,13 +20,10 @@ from body_tracking.kinematics.conventions import (
     angles_of,
     segment_quaternions,
 )
-from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
-from body_tracking.skeleton import FloatArray
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths()

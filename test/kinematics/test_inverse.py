@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from bent_hands import hand_columns, turned_over
+from body_tracking.core.body_model import ModelError
+from body_tracking.core.skeleton import BONES as SKELETON_BONES
+from body_tracking.core.skeleton import BoolArray, FloatArray, Joint
 from body_tracking.kinematics.inverse import InverseKinematics
-from body_tracking.kinematics.model import ModelError
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
-from body_tracking.skeleton import BONES as SKELETON_BONES
-from body_tracking.skeleton import BoolArray, FloatArray, Joint
 from draws import draws, some
 
 INVERSE = InverseKinematics(MODEL)

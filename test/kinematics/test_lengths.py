@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from body_tracking.cdr import decode_skeletons
-from body_tracking.graph import FUSED
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint
 from body_tracking.kinematics.lengths import LengthEstimate, SegmentLengths, SkeletonLengths, proportions
 from body_tracking.kinematics.upper_body import LENGTHS
-from body_tracking.measurement import BASE_STDDEV
+from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.pipeline.graph import FUSED
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson, capture_times, truth_of
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint
 
 POINTS = MODEL.joints
 EVERY = np.ones(len(POINTS), dtype=bool)

@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose
 from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import MIRROR, N_JOINTS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, JOINT_CLASSES, joint_densities
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.skeleton import MIRROR, N_JOINTS, FloatArray, Joint, Skeleton, TrackingState
 
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 UP, FORWARD, LEFT = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.ranges import RANGES, SHOULDER_SWING, SHOULDER_TWIST, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.skeleton import FloatArray
 
 MODEL = UpperBody()
 RANGE = Ranges(MODEL)

@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from body_tracking.kinematics.model import ModelError
+from body_tracking.core.body_model import ModelError
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.skeleton import FloatArray
 
 LENGTHS = np.array([0.24, 0.26, 0.18, 0.32, 0.25, 0.17, 0.19, 0.33, 0.26, 0.16])
 TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from body_tracking.kinematics import so3
-from body_tracking.skeleton import FloatArray
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
 
 _DIRECTIONS = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: np.linalg.norm(v) > 0.1)
 # near 0 and near pi, where formulas divide by small numbers, as well as in between

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.conventions import ConventionError, angles_of
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.tracking import (
     ALL_CONVENTIONS,
@@ -19,7 +20,6 @@ from body_tracking.kinematics.tracking import (
     segment_poses,
 )
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
-from body_tracking.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths(1.82) * (1.0 + 0.05 * np.sin(np.arange(21)))

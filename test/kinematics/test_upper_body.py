@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS, ModelError
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS, ModelError
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
-from body_tracking.skeleton import FloatArray, Joint
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths()

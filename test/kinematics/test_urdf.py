@@ -8,14 +8,14 @@ import numpy as np
 import pinocchio
 import pytest
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.kinematics.conventions import angles_of, model_names
-from body_tracking.kinematics.estimate import ModelEstimate
-from body_tracking.kinematics.model import SEGMENTS
 from body_tracking.kinematics.ranges import RANGES, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.kinematics.urdf import UrdfError, urdf
-from body_tracking.skeleton import FloatArray, Joint
 
 MODEL = UpperBody()
 NAMES = model_names(MODEL)

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from body_tracking.graph import PARENT_VARIABLE
+from body_tracking.pipeline.graph import PARENT_VARIABLE
 from body_tracking.systems import EXECUTABLES
 
 _FORKING = multiprocessing.get_context("forkserver")

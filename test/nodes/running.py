@@ -22,11 +22,11 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from body_tracking.graph import PARENT_VARIABLE, skeleton_topic
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.pipeline.graph import PARENT_VARIABLE, skeleton_topic
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.skeleton import Skeleton
 from domains import domain
 from spinning import spin_until
 
@@ -163,7 +163,7 @@ class Running:
     def replay(self, name: str, port: int) -> subprocess.Popen[bytes]:
         """Send ``BAG`` to a port of this machine, again and again."""
         words = ("--loop", "--replay", BAG, "--to", f"127.0.0.1:{port}")
-        return self.start_module(name, "body_tracking.sensors.kinect_sender", *words)
+        return self.start_module(name, "body_tracking.kinect.kinect_sender", *words)
 
     def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
         """Until nodes have found who is to hear them.

@@ -26,9 +26,9 @@ from running import Running  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking.graph import MODEL_COVARIANCE  # noqa: E402
+from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
-from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA  # noqa: E402
+from body_tracking.pipeline.graph import MODEL_COVARIANCE  # noqa: E402
 from body_tracking.recording.rosbag2 import (  # noqa: E402
     BAG_MESSAGES,
     BagError,

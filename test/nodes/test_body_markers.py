@@ -14,14 +14,14 @@ from running import RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.calibration.result import level_pose  # noqa: E402
+from body_tracking.core.qos import LATCHED  # noqa: E402
+from body_tracking.core.sensor_poses import level_pose  # noqa: E402
+from body_tracking.core.skeleton import N_JOINTS, Skeleton  # noqa: E402
 from body_tracking.messages.base import RosMessages  # noqa: E402
 from body_tracking.messages.calibration import pose_to_transform  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
-from body_tracking.nodes.bag_topics import to_profile  # noqa: E402
-from body_tracking.recording.qos import LATCHED  # noqa: E402
-from body_tracking.skeleton import N_JOINTS, Skeleton  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 
 ROS = RosMessages()
 

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from running import Running, environment
 
-from body_tracking.signals import signals_held
+from body_tracking.core.signals import signals_held
 
 NODES = ("calibration", "joint_angles", "skeleton_filter", "fusion")
 

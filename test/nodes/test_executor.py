@@ -16,8 +16,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  #
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking.nodes.common import STEADY  # noqa: E402
-from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.node import STEADY  # noqa: E402
 from domains import domain  # noqa: E402
 
 

@@ -13,11 +13,11 @@ import pytest
 pytest.importorskip("rclpy")
 from running import environment
 
-from body_tracking import graph
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
-from body_tracking.skeleton import NANOSECONDS
 
 MOST_S, LATEST_S = 1.0, 10.0
 """From capture to the log, as a rule and on a machine with much else to do."""

@@ -12,7 +12,7 @@ from node_process import NodeProcess
 from running import environment
 
 from body_tracking import systems
-from body_tracking.parameters import check_all, read_file
+from body_tracking.core.parameters import check_all, read_file
 
 
 @pytest.mark.parametrize("executable", systems.EXECUTABLES)

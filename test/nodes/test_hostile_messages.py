@@ -27,18 +27,18 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.calibration.result import level_pose  # noqa: E402
-from body_tracking.clocks import ClockModel  # noqa: E402
+from body_tracking.core.clocks import ClockModel  # noqa: E402
+from body_tracking.core.sensor_poses import level_pose  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 from body_tracking.kinematics.tracking import angle_names  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds  # noqa: E402
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
-from body_tracking.nodes.common import STEADY, GraphNode, RCLError  # noqa: E402
-from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, Skeleton  # noqa: E402
+from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.node import STEADY, GraphNode, RCLError  # noqa: E402
 from draws import draws  # noqa: E402
 
 ROS = RosMessages()

@@ -16,17 +16,18 @@ from running import RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, TrackingState  # noqa: E402
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.imus import message_to_orientation  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
+from body_tracking.recording.rig import RigReader  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, deserialize  # noqa: E402
 from body_tracking.simulation.bags import write_bag  # noqa: E402
-from body_tracking.simulation.imus import SimulatedImu, usual_mounting  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, simulate  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, FloatArray, TrackingState  # noqa: E402
 
 # A graph that tracks by inertial sensors keeps pace with a recording or loses by it.
 pytestmark = pytest.mark.alone
@@ -86,7 +87,7 @@ class Wrists(Running):
     def truth(self) -> tuple[FloatArray, list[dict[str, float]]]:
         """Stamps in seconds, and the model's coordinates by name."""
         stamps, values = [], []
-        with BagReader(self.bag) as reader:
+        with RigReader(self.bag) as reader:
             for raw in reader.messages([graph.TRUE_MODEL_STATE]):
                 state = deserialize("sensor_msgs/msg/JointState", raw.cdr)
                 stamps.append(to_nanoseconds(state.header.stamp) / NANOSECONDS)

@@ -15,9 +15,10 @@ from running import BAG, Running
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from body_tracking import graph, systems
+from body_tracking import systems
+from body_tracking.core.parameters import ParameterError
 from body_tracking.kinematics.tracking import angle_names
-from body_tracking.parameters import ParameterError
+from body_tracking.pipeline import graph
 
 PARAMETERS: dict[str, dict[str, object]] = {
     "joint_angles": {},

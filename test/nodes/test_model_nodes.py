@@ -19,13 +19,13 @@ from running import BAG, LATCHED, RELIABLE, Running  # noqa: E402
 from sensor_msgs.msg import Image, JointState, MultiDOFJointState, PointCloud2, TimeReference  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, Joint, Skeleton, TrackingState  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.model import image_to_covariance, joint_state_to_model  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, Joint, Skeleton, TrackingState  # noqa: E402
 
 MODEL = UpperBody()
 SENSORS = ("kinect1", "kinect2")

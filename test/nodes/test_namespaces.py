@@ -15,11 +15,9 @@ from running import BAG, ROOT, Running  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking import (  # noqa: E402
-    graph,
-    names,
-    systems,
-)
+from body_tracking import systems  # noqa: E402
+from body_tracking.core import names  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
 

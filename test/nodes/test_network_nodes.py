@@ -21,10 +21,10 @@ from running import RELIABLE, ROOT, Running, environment, free_port, stop  # noq
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
+from body_tracking.core.skeleton import Joint, TrackingState  # noqa: E402
+from body_tracking.kinect.azure import AzureJoint  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
-from body_tracking.sensors.azure import AzureJoint  # noqa: E402
-from body_tracking.skeleton import Joint, TrackingState  # noqa: E402
 
 NO_NAMESPACES = 77
 
@@ -63,7 +63,6 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
 # --- other cameras
 
 
-START = int(time.time())
 """Stamps are ROS time."""
 
 
@@ -73,7 +72,7 @@ def markers(stamp: int, bodies: tuple[int, ...] = (3,)) -> MarkerArray:
     for body in bodies:
         for joint in AzureJoint:
             marker = Marker(id=100 * body + joint, type=Marker.SPHERE, action=Marker.ADD)
-            marker.header.stamp.sec, marker.header.frame_id = START + stamp, "depth_camera_link"
+            marker.header.stamp.sec, marker.header.frame_id = stamp, "depth_camera_link"
             place = marker.pose.position
             place.x, place.y, place.z = 0.01 * joint, 0.1 * body, 2.0
             array.markers.append(marker)
@@ -91,20 +90,21 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
 
         assert running.until(lambda: told().get("") == "no message on /k4a/body_tracking_data yet", 60.0)
         assert running.until(lambda: publisher.get_subscription_count() == 1, 30.0)
-        two_times = MarkerArray(markers=markers(5).markers + markers(6, (4,)).markers)
-        unknown = markers(5)
+        now = int(time.time())  # a stamp a minute old is of another clock
+        two_times = MarkerArray(markers=markers(now - 3).markers + markers(now - 2, (4,)).markers)
+        unknown = markers(now - 3)
         unknown.markers[0].id = 199
-        gone = markers(8, (3, 4))
+        gone = markers(now, (3, 4))
         for marker in gone.markers[32:]:
             marker.action = Marker.DELETE
-        sent: list[Any] = [MarkerArray(), two_times, unknown, markers(7, (3, 4)), gone]
+        sent: list[Any] = [MarkerArray(), two_times, unknown, markers(now - 1, (3, 4)), gone]
         for message in sent:
             publisher.publish(message)
         assert running.until(lambda: len(clouds) == 2, 30.0), told()
         first, second = (cloud_to_skeletons(cloud) for cloud in clouds)
         assert [skeleton.body for skeleton in first] == [3, 4]
         assert [skeleton.body for skeleton in second] == [3]
-        assert to_nanoseconds(clouds[0].header.stamp) == (START + 7) * 1_000_000_000
+        assert to_nanoseconds(clouds[0].header.stamp) == (now - 1) * 1_000_000_000
         assert clouds[0].header.frame_id == "azure_optical_frame"
         np.testing.assert_allclose(first[1].positions[Joint.HEAD], [0.26, 0.4, 2.0], atol=1e-6)
         assert (first[0].states == TrackingState.TRACKED).all()

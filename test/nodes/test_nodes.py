@@ -21,15 +21,15 @@ from running import BAG, LATCHED, RELIABLE, Running, environment, recorded, refu
 from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.calibration.result import level_pose  # noqa: E402
 from body_tracking.calibration.storage import load  # noqa: E402
-from body_tracking.cdr import decode_skeletons  # noqa: E402
+from body_tracking.core.sensor_poses import level_pose  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds, to_time  # noqa: E402
 from body_tracking.messages.calibration import pose_to_transform  # noqa: E402
+from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rig import RigReader  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 
 ROS = RosMessages()
 FRAME_NS = 33_333_333
@@ -290,8 +290,8 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
 CAMERA = """
 import numpy as np
 
-from body_tracking.sensors import RecordedFrame
-from body_tracking.skeleton import Skeleton
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.core.skeleton import Skeleton
 
 
 class Camera:
@@ -371,7 +371,7 @@ def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
 
 NEVER_LEAVES = """\
 import threading
-from body_tracking.nodes import common, main
+from body_tracking.ros import node as common, main
 
 class Stuck(common.GraphNode):
     NAME = "stuck"

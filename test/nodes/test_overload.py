@@ -14,10 +14,10 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 
-from body_tracking.cdr import encode_skeletons  # noqa: E402
-from body_tracking.nodes.common import RELIABLE, GraphNode  # noqa: E402
-from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
-from body_tracking.skeleton import Skeleton  # noqa: E402
+from body_tracking.core.skeleton import Skeleton  # noqa: E402
+from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
+from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.node import RELIABLE, GraphNode  # noqa: E402
 from domains import domain  # noqa: E402
 
 TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")

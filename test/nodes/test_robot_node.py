@@ -23,20 +23,20 @@ from simulated_arm import SimulatedArm  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.cdr import encode_angles  # noqa: E402
+from body_tracking.core.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
+from body_tracking.core.qos import SENSOR_DATA  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray  # noqa: E402
 from body_tracking.kinematics.conventions import angles_of  # noqa: E402
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds, to_time  # noqa: E402
+from body_tracking.messages.cdr import encode_angles  # noqa: E402
 from body_tracking.messages.model import joint_state_to_model  # noqa: E402
-from body_tracking.nodes.common import ROS  # noqa: E402
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
-from body_tracking.recording.qos import SENSOR_DATA  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.robot.follower import State  # noqa: E402
 from body_tracking.robot.mapping import RobotMapping, load  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, FloatArray  # noqa: E402
+from body_tracking.ros.node import ROS  # noqa: E402
 
 SENSOR = graph.skeleton_topic("kinect1")
 LATENCY_NS = 20_000_000

@@ -20,15 +20,15 @@ from sensor_msgs.msg import JointState, PointCloud2  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.cdr import encode_skeletons  # noqa: E402
-from body_tracking.kinematics.angles import JointAngles  # noqa: E402
+from body_tracking.core.joint_angles import JointAngles  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton  # noqa: E402
 from body_tracking.kinematics.tracking import angle_names  # noqa: E402
 from body_tracking.messages.angles import angles_to_joint_states  # noqa: E402
-from body_tracking.nodes.common import ROS  # noqa: E402
-from body_tracking.nodes.executor import LeanExecutor  # noqa: E402
+from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Skeleton  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.node import ROS  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
 

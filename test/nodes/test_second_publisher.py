@@ -20,20 +20,20 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from running import RELIABLE, environment, stop  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.cdr import encode_skeletons  # noqa: E402
+from body_tracking.core.qos import LATCHED  # noqa: E402
+from body_tracking.core.skeleton import Skeleton  # noqa: E402
+from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
-from body_tracking.node_status import NodeStatus  # noqa: E402
+from body_tracking.messages.node_status import NodeStatus  # noqa: E402
 from body_tracking.nodes.bag_recorder import BagRecorder  # noqa: E402
-from body_tracking.nodes.bag_topics import to_profile  # noqa: E402
 from body_tracking.nodes.body_markers import BodyMarkers  # noqa: E402
 from body_tracking.nodes.calibration import CalibrationNode  # noqa: E402
 from body_tracking.nodes.fusion import FusionNode  # noqa: E402
-from body_tracking.nodes.graph_monitor import GraphMonitor  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402
 from body_tracking.nodes.skeleton_filter import SkeletonFilterNode  # noqa: E402
-from body_tracking.recording.qos import LATCHED  # noqa: E402
-from body_tracking.skeleton import Skeleton  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.ros.bag_topics import to_profile  # noqa: E402
+from body_tracking.ros.graph_monitor import GraphMonitor  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
 ROBOT = Path(__file__).resolve().parents[2] / "config" / "robots" / "two_joint_arm.yaml"

@@ -16,10 +16,11 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 from running import RELIABLE, Running, free_port  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from body_tracking import dds, graph  # noqa: E402
-from body_tracking.backlog import MAX_AGE  # noqa: E402
+from body_tracking.core.skeleton import NANOSECONDS  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
-from body_tracking.skeleton import NANOSECONDS  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.ros import dds  # noqa: E402
+from body_tracking.ros.backlog import MAX_AGE  # noqa: E402
 
 STOPPED = 2.5
 """Seconds for which a node is stopped."""

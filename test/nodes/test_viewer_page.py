@@ -27,9 +27,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from running import Running, stop  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 
-from body_tracking import graph  # noqa: E402
-from body_tracking.filters.roles import ROLES  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
+from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.viewing.shapes import figure  # noqa: E402
 

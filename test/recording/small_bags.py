@@ -10,8 +10,8 @@ from unittest.mock import patch
 
 from mcap.writer import CompressionType, Writer
 
+from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording import rosbag2
-from body_tracking.recording.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, serialize
 
 TOPICS: dict[str, tuple[str, Qos]] = {

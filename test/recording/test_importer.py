@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from body_tracking.cli import main
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import JOINT_NAMES, Skeleton
+from body_tracking.inertial.mvnx import MvnxRecording
 from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.info import bag_info
 from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.sensors.mvnx import MvnxRecording
-from body_tracking.skeleton import JOINT_NAMES, Skeleton
 from draws import some
 from skeleton_files import COORDINATES, FIRST_ID, csv_row, skeleton_text, write_csv
 

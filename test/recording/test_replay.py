@@ -19,15 +19,18 @@ import numpy as np
 import psutil
 import pytest
 
-from body_tracking import cli, graph
-from body_tracking.errors import BodyTrackingError
+from body_tracking import cli
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import ParameterError
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM, to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.parameters import ParameterError
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording import forked
 from body_tracking.recording.forked import Downstream, ForkedDownstream
@@ -35,9 +38,7 @@ from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.simulation.bags import write_bag
-from body_tracking.simulation.kinect import KinectErrors
 from body_tracking.simulation.scene import Setup, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from draws import some
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from body_tracking import cli, graph, names
-from body_tracking.doctor import PROBLEM
-from body_tracking.doctor.bags import bag as examined
+from body_tracking import cli
+from body_tracking.core import names
+from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, RawMessage
+from body_tracking.ros.doctor import PROBLEM
+from body_tracking.ros.doctor.bags import bag as examined
 
 
 def copied(bag: Path, folder: Path, *namespaces: str) -> Path:

@@ -22,8 +22,8 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from small_bags import TOPICS, Stored, message, messages, read, write
 
-from body_tracking.recording import qos as quality
-from body_tracking.recording.qos import INFINITE_NS, Qos
+from body_tracking.core import qos as quality
+from body_tracking.core.qos import INFINITE_NS, Qos
 from body_tracking.recording.rosbag2 import (
     BAG_MESSAGES,
     BagError,

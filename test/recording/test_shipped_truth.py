@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.reading import Tracked, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import SHIPPED
-from body_tracking.skeleton import FloatArray
 from draws import some
 
 _BAGS = Path(__file__).resolve().parents[2] / "bags"

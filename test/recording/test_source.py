@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from body_tracking.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import JOINT_NAMES, NANOSECONDS
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.kinect.live import SourceSettings, backends, open_source
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.recording import source as source_of_file
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.recording.source import RecordingSource
-from body_tracking.sensors import RecordedFrame
-from body_tracking.sensors.live import SourceSettings, backends, open_source
-from body_tracking.skeleton import JOINT_NAMES, NANOSECONDS
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
@@ -37,7 +38,13 @@ def played(frame: RecordedFrame | None) -> tuple[int, int]:
     return frame.skeletons[0].stamp_ns, frame.received_ns
 
 
-def test_every_frame_comes_in_order_and_then_the_end() -> None:
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No frame is left out, however busy the machine is."""
+    monkeypatch.setattr(source_of_file, "LATE_NS", 1000 * NANOSECONDS)
+
+
+def test_every_frame_comes_in_order_and_then_the_end(patient: None) -> None:
     start_ns = time.time_ns()
     source = open_source("recording", SourceSettings("kinect2", file=str(BAG), rate=100.0))
     got = []
@@ -75,7 +82,7 @@ def test_one_that_is_started_again_goes_on_where_it_should_be() -> None:
     assert source.counters["left out, late"] > 100
 
 
-def test_a_loop_begins_again_and_time_goes_on() -> None:
+def test_a_loop_begins_again_and_time_goes_on(patient: None) -> None:
     source = RecordingSource(SourceSettings("kinect1", file=str(BAG), rate=100.0, loop=True))
     stamps = np.array([stamp_ns for stamp_ns, _ in times_in_bag("kinect1")])
     got = np.array([played(source.read(1.0))[0] for _ in range(len(stamps) + 5)])

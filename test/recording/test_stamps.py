@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from body_tracking import graph
+from body_tracking.core.qos import SENSOR_DATA
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
 from body_tracking.messages.base import TIME_REFERENCE
 from body_tracking.messages.calibration import time_reference_to_clock
-from body_tracking.recording.qos import SENSOR_DATA
+from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize, serialize
 from body_tracking.recording.stamps import RecordedClock
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray
 
 ROOT = Path(__file__).resolve().parents[2]
 EPOCH_NS = 1_750_000_000 * NANOSECONDS

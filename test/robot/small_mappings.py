@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.kinematics.angles import JointAngles
+from body_tracking.core.joint_angles import JointAngles
 from body_tracking.robot.mapping import RobotMapping, parse
 
 ANGLES = {"positional": ("shoulder_elevation_left", "shoulder_plane_left", "elbow_flexion_left"), "isb": ("neck",)}

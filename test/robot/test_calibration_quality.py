@@ -7,8 +7,8 @@ import math
 import pytest
 
 from body_tracking.calibration.online import OnlineCalibration
-from body_tracking.calibration.result import CalibrationResult, SensorQuality, level_pose
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality, level_pose
 from body_tracking.robot.calibration import CalibrationQuality
 
 

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_mappings import content, mapping, seen
 
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.robot.calibration import CalibrationQuality
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
-from body_tracking.skeleton import NANOSECONDS
 
 PERIOD = 0.01
 PERIOD_NS = round(PERIOD * NANOSECONDS)

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from small_mappings import ANGLES, content, mapping
 
+from body_tracking.core.parameters import parameters_from
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
-from body_tracking.parameters import parameters_from
 from body_tracking.robot.mapping import MappingError, SafetyLimits, load
 
 ROOT = Path(__file__).resolve().parents[2]

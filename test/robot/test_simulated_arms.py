@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from simulated_arm import SimulatedArm
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate
 from body_tracking.kinematics.upper_body import UpperBody

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sensor_msgs.msg import JointState
 from tools import NO_DAEMON, Tools
 
-from body_tracking import graph
-from body_tracking.names import WHOLE_DOMAIN
+from body_tracking.core.names import WHOLE_DOMAIN
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
 
 ANGLES = graph.joint_states_topic("body1")

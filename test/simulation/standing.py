@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.simulation.occlusion import Capsules
-from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.kinect.occlusion import Capsules
 
 _MIDDLE = {"SPINE_BASE": 0.95, "SPINE_MID": 1.2, "SPINE_SHOULDER": 1.45, "NECK": 1.52, "HEAD": 1.66}
 _SIDE = {

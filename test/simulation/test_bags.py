@@ -13,12 +13,15 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 
-from body_tracking import graph
-from body_tracking.calibration.result import SensorPose
 from body_tracking.cli import main
-from body_tracking.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
+from body_tracking.kinect.simulated import KinectErrors, errors_as_yaml, parameters, read_errors
+from body_tracking.kinect.simulated_sensor import RATE
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.measurement import left_right_axes
 from body_tracking.messages.base import (
     IMU,
     JOINT_STATE,
@@ -31,16 +34,13 @@ from body_tracking.messages.base import (
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.model import joint_state_to_model
 from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.simulation.bags import SHIPPED, shipped, write_bag
-from body_tracking.simulation.imus import SimulatedImu, usual_mounting
-from body_tracking.simulation.kinect import KinectErrors, errors_as_yaml, parameters, read_errors
-from body_tracking.simulation.kinect_sensor import RATE
 from body_tracking.simulation.layouts import DISTANCE
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import TPOSE_S
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, Setup, SimulatedRecording, simulate
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 SENSORS = ("kinect1", "kinect2")

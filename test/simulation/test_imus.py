@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import cumulative_trapezoid
 
-from body_tracking.clocks import ClockModel
-from body_tracking.kinematics import so3
-from body_tracking.kinematics.model import SEGMENTS
-from body_tracking.simulation.imu_errors import (
+from body_tracking.core import so3
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.inertial.simulated import ImuSamples, Motion, Mounting, SimulatedImu, Slip, usual_mounting
+from body_tracking.inertial.simulated_errors import (
     CONSUMER,
     GOOD,
     IDEAL,
@@ -22,11 +24,9 @@ from body_tracking.simulation.imu_errors import (
     ImuErrors,
     ImuSimulationError,
 )
-from body_tracking.simulation.imus import ImuSamples, Motion, Mounting, SimulatedImu, Slip, usual_mounting
+from body_tracking.inertial.surroundings import Iron, Surroundings
+from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
-from body_tracking.simulation.surroundings import Iron, Surroundings
-from body_tracking.simulation.trajectories import minimum_jerk
-from body_tracking.skeleton import NANOSECONDS, FloatArray
 from draws import some
 
 UP = np.array([0.0, 0.0, 1.0])

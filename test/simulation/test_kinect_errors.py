@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from standing import HANGING, flesh, placed, standing
 
-from body_tracking.calibration.result import SensorPose, level_pose
-from body_tracking.clocks import ClockModel
-from body_tracking.sensors import RecordedFrame
-from body_tracking.simulation.kinect import (
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose, level_pose
+from body_tracking.core.skeleton import BONES, MIRROR, NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.kinect.occlusion import Capsules
+from body_tracking.kinect.simulated import (
     KinectErrors,
     SimulatedKinectError,
     errors_as_yaml,
     parameters,
     read_errors,
 )
-from body_tracking.simulation.kinect_joints import DEPTH_PATTERN, SLOW_SCALE, WHITE_SCALE
-from body_tracking.simulation.kinect_sensor import ALONG_RAY, Misreading, SimulatedKinect
-from body_tracking.simulation.occlusion import Capsules
-from body_tracking.skeleton import BONES, MIRROR, NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.kinect.simulated_joints import DEPTH_PATTERN, SLOW_SCALE, WHITE_SCALE
+from body_tracking.kinect.simulated_sensor import ALONG_RAY, Misreading, SimulatedKinect
 
 POSE = level_pose("kinect1")
 PLACE = np.array([2.0, 0.0, -1.1])

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from standing import placed, standing
 
-from body_tracking.calibration.result import SensorPose, level_pose
+from body_tracking.core.sensor_poses import SensorPose, level_pose
+from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.simulation.layouts import DISTANCE, NUMBERS, Layout, LayoutError, around, layout
-from body_tracking.skeleton import FloatArray, Joint
 
 ANGLES = st.floats(-np.pi, np.pi)
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from standing import HANGING, flesh, placed, standing
 
-from body_tracking.simulation.occlusion import Capsules, obstruction
-from body_tracking.skeleton import MIRROR, FloatArray, Joint
+from body_tracking.core.skeleton import MIRROR, FloatArray, Joint
+from body_tracking.kinect.occlusion import Capsules, obstruction
 
 OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """World axes into those of a sensor that looks along x."""

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.skeleton import Joint
 from body_tracking.simulation.people import MODEL, SEXES, Course, PeopleError, Person, joints
-from body_tracking.skeleton import Joint
 
 seeds = st.integers(0, 2**32 - 1)
 SIDES = (Joint.HIP_LEFT, Joint.HIP_RIGHT)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from body_tracking.core.skeleton import NANOSECONDS, Joint, TrackingState
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.random_people import (
     ARMS,
@@ -23,7 +24,6 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from body_tracking.skeleton import NANOSECONDS, Joint, TrackingState
 from draws import draws
 
 POINT = {Joint(joint): number for number, joint in enumerate(MODEL.joints)}

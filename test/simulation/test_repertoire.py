@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from body_tracking.core.skeleton import BONES, FloatArray, Joint
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.simulation.people import MODEL, SEXES, Course, Person, joints
 from body_tracking.simulation.repertoire import (
@@ -20,7 +21,6 @@ from body_tracking.simulation.repertoire import (
     RepertoireError,
     make_movement,
 )
-from body_tracking.skeleton import BONES, FloatArray, Joint
 from draws import some
 
 RANGES = Ranges(MODEL)

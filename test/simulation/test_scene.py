@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from body_tracking.simulation.imus import SimulatedImu, usual_mounting
-from body_tracking.simulation.kinect import KinectErrors
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
+from body_tracking.inertial.surroundings import Iron, Surroundings
+from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.simulation.layouts import NUMBERS, around, layout
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import (
@@ -24,8 +26,6 @@ from body_tracking.simulation.scene import (
     lanes,
     simulate,
 )
-from body_tracking.simulation.surroundings import Iron, Surroundings
-from body_tracking.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from draws import draws
 
 SHORT = 12.0

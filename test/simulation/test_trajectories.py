@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from body_tracking.simulation.trajectories import Moves, Waves, eased, minimum_jerk
+from body_tracking.kinematics.trajectories import Moves, Waves, eased, minimum_jerk
 
 
 @given(st.floats(0.5, 30.0), st.floats(0.05, 0.5))

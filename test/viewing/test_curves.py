@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from body_tracking.skeleton import NANOSECONDS
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice
 
 NAMES = ("elbow_flexion_left", "trunk_axial")

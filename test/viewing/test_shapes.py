@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from body_tracking.calibration.result import level_pose
-from body_tracking.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
+from body_tracking.core.sensor_poses import level_pose
+from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.viewing import shapes
 from body_tracking.viewing.colours import INFERRED, NOT_TRACKED, PALETTE, joint_colours, linear
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from body_tracking.node_status import NodeStatus
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.viewing.status import FRESH, table
 
 VALUES = {"rate out /a": "29.9", "rate out /b": "1.0", "delay median ms": "1.53", "latency median ms": "22.4"}

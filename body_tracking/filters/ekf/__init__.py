@@ -10,7 +10,7 @@ ExtendedKalmanFilter, whose state is a plain vector and whose update inverts wha
 - Measurement noise: a sensor's white noise is read off the third differences of each point over time, in which smooth
   motion all but cancels; no tuning for a sensor. What its points are wrong by for seconds (a joint placed beside the
   anatomical one) is a state of its own that is considered but not estimated (Schmidt 1966), with the deviation of
-  ``body_tracking.measurement`` scaled until the innovations are as large as expected.
+  ``body_tracking.core.measurement`` scaled until the innovations are as large as expected.
 - Lengths are estimated for the first seconds. From then on they are what the distances between points say over many
   poses (``lengths``), and only considered here: what errs for seconds would otherwise be learnt as a length. They are
   brought in every second, until they are known to some millimetres or for a minute, and then stay as they are.

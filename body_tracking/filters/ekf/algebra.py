@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from body_tracking.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray
 
 LINEARISATIONS = 4
 FAR, CLOSE = 0.2, 0.05

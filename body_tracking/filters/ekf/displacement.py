@@ -6,11 +6,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
+from body_tracking.core.body_model import Linearisation
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
-from body_tracking.kinematics.model import Linearisation
-from body_tracking.skeleton import N_JOINTS, FloatArray, Joint
 
 _DIMENSIONS = 3
 _BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0

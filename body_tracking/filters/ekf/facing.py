@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from body_tracking.core.body_model import Posture
+from body_tracking.core.sides import headings_of, reversed_halves, swap_left_right
+from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 from body_tracking.filters.ekf.state import State, StateSpace
-from body_tracking.kinematics.model import Posture
-from body_tracking.sides import headings_of, reversed_halves, swap_left_right
-from body_tracking.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 
 _IMPROBABLE = 20.0
 """Squared normalised distance of the twists of both arms from the middle of their ranges (chi-square with 4 degrees of

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
-from body_tracking.kinematics import so3
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray
 
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""

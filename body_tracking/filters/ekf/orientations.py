@@ -7,6 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from body_tracking.core import so3
+from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, whitening_of
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.motion import Motion
@@ -14,9 +17,6 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sources import PER_SOURCE, about, expect, slipped
 from body_tracking.filters.ekf.state import Measurement, State, StateSpace, single
-from body_tracking.kinematics import so3
-from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
 _AHEAD_OF = 0.8
 """Share of the period of the greatest rate from which on the next orientation counts: clocks jitter."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import VAGUE
 from body_tracking.filters.ekf.state import State, StateSpace
-from body_tracking.kinematics.estimate import ModelEstimate
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
-from body_tracking.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
 
 _INFERRED = np.uint8(TrackingState.INFERRED)
 _UPDATES = 2

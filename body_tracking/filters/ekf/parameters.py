@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 from scipy.special import chdtri
 
+from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.filters.ekf.sources import OrientationParameters
 from body_tracking.filters.linear import T_POSE, FilterError
-from body_tracking.parameters import check_fields, number_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +60,7 @@ class EkfParameters(OrientationParameters):
     offset_scale: float = number_field(
         1.0,
         "distance of the joints' centres by a sensor that states covariances from the anatomical ones, in standard "
-        "deviations of body_tracking.measurement; only a T-pose tells of it, and what it leaves is added to what is "
-        "handed out",
+        "deviations of core/measurement.py; only a T-pose measures it, and what it leaves is added to what goes out",
         "1",
         0.0,
         10.0,

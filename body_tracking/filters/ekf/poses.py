@@ -6,17 +6,17 @@ import math
 
 import numpy as np
 
+from body_tracking.core import so3
+from body_tracking.core.body_model import ModelError
+from body_tracking.core.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
 from body_tracking.filters.ekf.algebra import CLOSE, squared_distance
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, State, StateSpace
-from body_tracking.kinematics import so3
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.lengths import SegmentLengths
-from body_tracking.kinematics.model import ModelError
-from body_tracking.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
 
 _EYE3 = np.eye(3)
 _REST_NS = NANOSECONDS // 4

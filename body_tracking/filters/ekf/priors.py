@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
 from body_tracking.filters.ekf.algebra import cholesky
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
-from body_tracking.skeleton import NANOSECONDS, FloatArray, SingleArray
 
 _PRIOR_PERIOD = 0.1
 """Seconds between two looks at the ranges of motion."""

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, StateSpace
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 
 _DIMENSIONS = 3
 _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from body_tracking.core import so3
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray, TrackingState
 from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, squared_distance, whitening_of
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.orientations import OrientationUpdate
@@ -15,8 +17,6 @@ from body_tracking.filters.ekf.poses import PoseSearch
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sensor_errors import NEGLIGIBLE_SLOW, STRETCH, SensorErrors
 from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, State, StateSpace, single
-from body_tracking.kinematics import so3
-from body_tracking.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray, TrackingState
 
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)

@@ -27,12 +27,12 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.kinematics import so3
+from body_tracking.core import so3
+from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
+from body_tracking.core.parameters import number_field
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.orientation import SEGMENT_NUMBER, SegmentOrientation
-from body_tracking.parameters import number_field
-from body_tracking.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
 PER_SOURCE: Final = 7
 """Numbers of the state for each source: misalignment (3), heading, error that persists (3)."""

@@ -7,14 +7,14 @@ from typing import Any, Self
 
 import numpy as np
 
+from body_tracking.core.body_model import Linearisation
+from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton
 from body_tracking.filters.ekf.sources import Sources
 from body_tracking.kinematics.lengths import SegmentLengths, proportions
-from body_tracking.kinematics.model import Linearisation
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.measurement import BASE_STDDEV
-from body_tracking.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton
 
 NOBODY = Sources.none()
 

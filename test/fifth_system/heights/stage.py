@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking import graph
+from body_tracking.core.message_types import IMAGE
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.messages.base import to_header, to_nanoseconds
-from body_tracking.messages.types import IMAGE
-from body_tracking.parameters import Parameter, Value
-from body_tracking.pipeline.codecs import Codec, Wire
+from body_tracking.messages.codecs import Codec, Wire
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE, skeleton_input
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.recording.qos import RELIABLE as RELIABLE_QOS
 from heights.system import HEIGHT
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from body_tracking.messages.types import IMAGE
+from body_tracking.core.message_types import IMAGE
+from body_tracking.core.qos import RELIABLE
 from body_tracking.pipeline.system import (
     Layer,
     NodeSpec,
@@ -16,7 +17,6 @@ from body_tracking.pipeline.system import (
     TopicSpec,
     transport,
 )
-from body_tracking.recording.qos import RELIABLE
 
 HEIGHT = "/humans/height"
 

@@ -1,0 +1,147 @@
+"""A pinhole camera with lens distortion: from points to pixels and back.
+
+The model is OpenCV's, which ``sensor_msgs/CameraInfo`` names ``plumb_bob`` (k1 k2 p1 p2 k3) and
+``rational_polynomial`` (k1 k2 p1 p2 k3 k4 k5 k6). Camera axes: x right, y down, z forward (REP-103).
+Pixels count from the centre of the upper left one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BoolArray, FloatArray
+
+MODELS: Final = {"plumb_bob": 5, "rational_polynomial": 8}
+"""How many coefficients each model of distortion has."""
+
+_ITERATIONS: Final = 30
+_CONVERGED: Final = 1e-12
+"""Normalised image coordinates by which a Newton step may still move."""
+
+
+class CameraError(BodyTrackingError):
+    """Something that should be a calibrated camera is none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A calibrated camera.
+
+    Attributes:
+        frame_id: its optical frame.
+        width: pixels.
+        height: pixels.
+        matrix: (3, 3) focal lengths and principal point, pixels.
+        distortion: (5,) or (8,) coefficients; zeros for an ideal lens.
+        model: one of :data:`MODELS`.
+
+    Raises:
+        CameraError: no frame, no pixels, focal lengths that are not positive, a skewed matrix, another number of
+            coefficients, or numbers that are not finite.
+    """
+
+    frame_id: str
+    width: int
+    height: int
+    matrix: FloatArray
+    distortion: FloatArray
+    model: str = "plumb_bob"
+
+    def __post_init__(self) -> None:
+        where = f"camera {self.frame_id or '(no frame_id)'}"
+        if not self.frame_id or self.width < 1 or self.height < 1:
+            raise CameraError(f"{where}: {self.width} x {self.height} pixels; a frame and pixels are needed")
+        if self.model not in MODELS:
+            raise CameraError(f"{where}: distortion model {self.model!r}, expected one of {', '.join(MODELS)}")
+        if self.matrix.shape != (3, 3) or self.distortion.shape != (MODELS[self.model],):
+            raise CameraError(
+                f"{where}: matrix {self.matrix.shape} and {self.distortion.shape[0] if self.distortion.ndim else 0} "
+                f"coefficients, expected (3, 3) and {MODELS[self.model]}"
+            )
+        if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
+            raise CameraError(f"{where}: a number is not finite")
+        (fx, skew, _), (other, fy, _), last = self.matrix.tolist()
+        if fx <= 0.0 or fy <= 0.0 or skew or other or last != [0.0, 0.0, 1.0]:
+            raise CameraError(
+                f"{where}: matrix {self.matrix.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; calibrated?"
+            )
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (..., 2) of points (..., 3) in the camera's frame, metres; NaN for points that are not before it."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = points[..., :2] / np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
+        return self.to_pixels(self.distort(flat)[0])
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Unit vectors (..., 3) from the camera through pixels (..., 2); NaN where no direction gives this pixel."""
+        flat = self.undistort(pixels)
+        through = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
+        rays: FloatArray = through / np.linalg.norm(through, axis=-1, keepdims=True)
+        return rays
+
+    def contains(self, pixels: FloatArray) -> BoolArray:
+        """Which pixels (..., 2) are in the image."""
+        inside = (pixels >= -0.5) & (pixels < np.array([self.width, self.height]) - 0.5)
+        return np.asarray(inside.all(axis=-1))
+
+    def to_pixels(self, flat: FloatArray) -> FloatArray:
+        """Pixels (..., 2) of distorted image coordinates (..., 2), x/z and y/z."""
+        pixels: FloatArray = flat * self.matrix[[0, 1], [0, 1]] + self.matrix[:2, 2]
+        return pixels
+
+    def distort(self, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the lens makes of ideal image coordinates (..., 2), x/z and y/z, and its Jacobian (..., 2, 2)."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion.tolist(), 0.0, 0.0, 0.0)[:8]
+        x, y = flat[..., 0], flat[..., 1]
+        r2 = x * x + y * y
+        above, below = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = above / below
+        slope = (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / below
+        seen = np.stack(
+            [
+                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+        mixed = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        jacobian = np.stack(
+            [
+                np.stack([radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x, mixed], axis=-1),
+                np.stack([mixed, radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x], axis=-1),
+            ],
+            axis=-2,
+        )
+        return seen, jacobian
+
+    def undistort(self, pixels: FloatArray) -> FloatArray:
+        """Ideal image coordinates (..., 2), x/z and y/z, of pixels (..., 2), by Newton's method.
+
+        NaN where it does not converge: far outside the image the polynomials turn back, and no direction gives such a
+        pixel.
+        """
+        seen = (pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
+        flat = np.array(seen)
+        with np.errstate(all="ignore"):
+            for _ in range(_ITERATIONS):
+                made, jacobian = self.distort(flat)
+                (a, b), (c, d) = (jacobian[..., 0, 0], jacobian[..., 0, 1]), (jacobian[..., 1, 0], jacobian[..., 1, 1])
+                missing, determinant = seen - made, a * d - b * c
+                step = np.stack(
+                    [
+                        (d * missing[..., 0] - b * missing[..., 1]) / determinant,
+                        (a * missing[..., 1] - c * missing[..., 0]) / determinant,
+                    ],
+                    axis=-1,
+                )
+                flat = flat + step
+                if not (np.abs(step) > _CONVERGED).any():
+                    break
+            # determinant and sign: on this side of where the polynomials turn back
+            known = (np.abs(step) < 1e3 * _CONVERGED).all(axis=-1) & (determinant > 0.0)
+            known &= (flat * seen).sum(axis=-1) >= 0.0
+        return np.where(known[..., None], flat, np.nan)

@@ -1,0 +1,107 @@
+"""``.csv`` and ``.csv.gz`` files line by line; what is wrong with one is an error with the line's number."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import os
+import zlib
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from io import TextIOWrapper
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import open_regular
+from body_tracking.core.skeleton import NANOSECONDS
+
+_MAX_SECONDS = 2**31  # builtin_interfaces/Time counts seconds in 32 bits
+
+
+class CsvError(BodyTrackingError):
+    """A file of separated values does not have its format; the text names file and line."""
+
+
+class CsvFile:
+    """Lines and cells of a file.
+
+    Args:
+        path: the file; gzip is recognised by the suffix ``.gz``.
+
+    Attributes:
+        progress: how much of the file has been read, 0 to 1.
+        cut: how the file is cut off, known once its last line was read; empty where it is whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.progress = 0.0
+        self.cut = ""
+
+    def error(self, line: int, text: str) -> CsvError:
+        """What is wrong with a line, counted from 1."""
+        return CsvError(f"{self.path}, line {line}: {text}")
+
+    def lines(self) -> Iterator[str]:
+        """All lines with their ends.
+
+        Raises:
+            CsvError: the file cannot be read, its gzip stream is damaged, or it is not UTF-8 text.
+        """
+        number = 1
+        try:
+            with open_regular(self.path) as raw:
+                size = max(1, os.fstat(raw.fileno()).st_size)
+                source = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if self.path.suffix == ".gz" else raw
+                with TextIOWrapper(source, encoding="utf-8-sig") as text:
+                    for line in text:
+                        number += 1
+                        self.progress = min(1.0, raw.tell() / size)
+                        yield line
+        except EOFError:
+            self.cut = "the gzip stream is cut off"
+        except (gzip.BadGzipFile, zlib.error) as error:
+            raise self.error(number, f"the gzip stream is damaged ({error})") from error
+        except UnicodeDecodeError as error:
+            raise self.error(number, "not UTF-8 text") from error
+        except OSError as error:
+            raise CsvError(f"{self.path}: {error.strerror or error}") from error
+
+    def rows(self, first: int, lines: list[str], separator: str = ",") -> list[list[str]]:
+        """The cells of each line, of which the first has this number; none for an empty line."""
+        reader = csv.reader(lines, delimiter=separator, strict=True)
+        try:
+            rows = list(reader)
+        except csv.Error as error:
+            raise self.error(first + max(0, reader.line_num - 1), str(error)) from error
+        if len(rows) != len(lines):
+            raise self.error(first, "a quoted cell goes on over several lines")
+        return rows
+
+    def time_ns(self, line: int, text: str, name: str) -> int:
+        """Seconds as text to nanoseconds, exactly: a double would round stamps that count from 1970."""
+        try:
+            seconds = Decimal(text.strip())
+        except InvalidOperation:
+            raise self.error(line, f"{name}: {text!r} is not a number") from None
+        if not seconds.is_finite() or not 0 <= seconds < _MAX_SECONDS:
+            raise self.error(line, f"{name}: {text!r} is not a time in seconds")
+        return int((seconds * NANOSECONDS).to_integral_value())
+
+    def check_whole(self, rows: int, partial: bool) -> list[str]:
+        """A warning where the file is cut off; none where it is whole.
+
+        Args:
+            rows: those that are whole.
+            partial: whether the file is to be read so far.
+
+        Raises:
+            CsvError: the file is cut off and not to be read so far, or has no rows.
+        """
+        text = f"{self.path}: {self.cut}; {rows} row(s) before that are whole"
+        if not self.cut and not rows:
+            raise CsvError(f"{self.path}: no rows follow the header")
+        if self.cut and not partial:
+            raise CsvError(f"{text} (--partial reads these)")
+        return [text] if self.cut else []

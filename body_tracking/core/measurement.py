@@ -1,0 +1,113 @@
+"""How much a skeleton camera's joint position is worth, and which way a seen body faces.
+
+The measurement noise of DESIGN 6: per joint, from its tracking state, its distance and the angle under which the sensor
+sees the body. Calibration, fusion and filters weigh with the same model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.core.skeleton import BoolArray, FloatArray, Joint, TrackingState
+
+# Standard deviation of a Tracked joint of a body that faces the sensor at 2 m, metres. Kinect v2 against markers:
+# trunk and elbows about 20-40 mm, hand tips, thumbs and feet two to three times that (Wang 2015, Napoli 2017,
+# Schlagenhauf 2017 table E.1).
+_BASE = {
+    0.030: ("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK", "HEAD", "SHOULDER", "ELBOW", "HIP", "KNEE"),
+    0.040: ("WRIST", "ANKLE"),
+    0.050: ("HAND", "FOOT"),
+    0.065: ("HAND_TIP", "THUMB"),
+}
+
+
+def _base_stddev() -> FloatArray:
+    stddev = np.empty(len(Joint))
+    kinds = {name: value for value, names in _BASE.items() for name in names}
+    for joint in Joint:
+        stddev[joint] = kinds[joint.name.removesuffix("_LEFT").removesuffix("_RIGHT")]
+    return stddev
+
+
+BASE_STDDEV: FloatArray = _base_stddev()
+"""(25,) metres."""
+
+INFERRED_FACTOR = 3.0
+"""An Inferred joint is a guess of the SDK: three times the standard deviation."""
+
+_LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
+_RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
+
+_YAW_DEG = np.array([0.0, 30.0, 60.0, 90.0, 180.0])
+_YAW_FACTOR = np.array([1.0, 1.0, 1.3, 3.2, 3.2])
+"""Joint error against the body's yaw to the sensor: table 4.4 of Schlagenhauf 2017 (x1.3 at 60, x3.2 at 90 deg)."""
+
+_REFERENCE_DISTANCE = 2.0
+
+
+def left_right_axes(positions: FloatArray) -> FloatArray:
+    """The left-right axes of shoulders and of hips.
+
+    Args:
+        positions: (..., 25, 3) metres, any frame.
+
+    Returns:
+        (..., 2, 3) metres: the vector from the right to the left shoulder, and that from the right to the left hip.
+    """
+    axes: FloatArray = positions.take(_LEFT_ENDS, axis=-2) - positions.take(_RIGHT_ENDS, axis=-2)
+    return axes
+
+
+def body_heading(positions: FloatArray) -> FloatArray:
+    """The left-right axis of a body, from its shoulders and hips.
+
+    Args:
+        positions: (..., 25, 3) metres, any frame.
+
+    Returns:
+        (..., 3) metres: the mean of the vectors from right to left shoulder and from right to left hip.
+    """
+    axis: FloatArray = left_right_axes(positions).mean(axis=-2)
+    return axis
+
+
+def viewing_angle(positions: FloatArray) -> FloatArray:
+    """The angle between the way a body faces and the direction to the sensor, in the horizontal plane.
+
+    Args:
+        positions: (..., 25, 3) metres in a sensor's optical frame (x right, y down, z forward).
+
+    Returns:
+        (...) radians, 0 when the body faces the sensor, pi when it shows its back.
+    """
+    axis = body_heading(positions)
+    centre = positions[..., Joint.SPINE_SHOULDER, :]
+    # The body faces along left x up, with up = -y: (left_z, 0, -left_x).
+    facing = np.arctan2(axis[..., 2], -axis[..., 0])
+    to_sensor = np.arctan2(-centre[..., 0], -centre[..., 2])
+    angle: FloatArray = np.abs((facing - to_sensor + np.pi) % (2 * np.pi) - np.pi)
+    return angle
+
+
+def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | None = None) -> FloatArray:
+    """The standard deviation of each joint position, the same in all directions.
+
+    Args:
+        positions: (..., 25, 3) metres in the sensor's optical frame.
+        states: (..., 25) tracking states.
+        angle: (...) what :func:`viewing_angle` says of the positions, where it is known already.
+
+    Returns:
+        (..., 25) metres; infinity for joints that are not tracked or not finite.
+    """
+    if angle is None:
+        angle = viewing_angle(positions)
+    yaw = np.interp(np.degrees(np.where(np.isfinite(angle), angle, np.pi / 2)), _YAW_DEG, _YAW_FACTOR)
+    # Depth noise of a time-of-flight camera grows with distance; below the reference distance it is a floor.
+    depth = positions[..., Joint.SPINE_MID, 2]
+    distance = np.maximum(np.where(np.isfinite(depth), depth, _REFERENCE_DISTANCE) / _REFERENCE_DISTANCE, 1.0)
+    stddev = BASE_STDDEV * (yaw * distance)[..., None]
+    stddev = np.where(states == TrackingState.INFERRED, stddev * INFERRED_FACTOR, stddev)
+    usable: BoolArray = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=-1)
+    result: FloatArray = np.where(usable, stddev, np.inf)
+    return result

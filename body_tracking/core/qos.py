@@ -1,0 +1,162 @@
+"""Quality of service as a bag stores it: the YAML form of rosbag2, without any ROS library.
+
+rosbag2 writes the names of the policies from metadata version 9 (Jazzy) on, and the numbers of ``rmw`` before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import yaml
+
+from body_tracking.core.files import FileError, load_yaml
+from body_tracking.core.times import NANOSECONDS
+
+INFINITE_NS = 2**63 - 1
+"""``RMW_DURATION_INFINITE``: 9223372036 s and 854775807 ns."""
+
+# The values of the rmw enumerations, for metadata before version 9.
+_NUMBERED = {
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+    "liveliness": ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available"),
+}
+
+_DURATIONS = {
+    "deadline": "deadline_ns",
+    "lifespan": "lifespan_ns",
+    "liveliness_lease_duration": "liveliness_lease_ns",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """What one publisher offered.
+
+    Attributes:
+        reliability: ``reliable`` or ``best_effort``.
+        durability: ``volatile`` or ``transient_local``.
+        depth: messages kept; 0 where discovery did not tell.
+        history: ``keep_last``, ``keep_all``, or ``unknown`` where discovery did not tell.
+        deadline_ns: nanoseconds.
+        lifespan_ns: nanoseconds.
+        liveliness: ``automatic`` or ``manual_by_topic``.
+        liveliness_lease_ns: nanoseconds.
+        avoid_ros_namespace_conventions: as in ``rmw``.
+    """
+
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    depth: int = 10
+    history: str = "keep_last"
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = "automatic"
+    liveliness_lease_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+
+RELIABLE = Qos()
+SENSOR_DATA = Qos(reliability="best_effort", depth=5)
+LATCHED = Qos(durability="transient_local", depth=10)
+LATEST = Qos(reliability="best_effort", depth=1)
+"""To ask for: whatever is the newest, at no cost to who sends it."""
+
+
+def offer_for(recorded: Sequence[Qos]) -> Qos:
+    """The profile under which to play a topic again, so that every subscription that matched then matches now.
+
+    What one publisher offered is offered as it was; of several, the strongest of each policy. What discovery did not
+    tell (history, depth) becomes the usual ``keep_last`` 10.
+    """
+    if not recorded:
+        return RELIABLE
+    first = recorded[0]
+    return Qos(
+        reliability="reliable" if any(qos.reliability != "best_effort" for qos in recorded) else "best_effort",
+        durability="transient_local" if any(qos.durability == "transient_local" for qos in recorded) else "volatile",
+        depth=max(qos.depth for qos in recorded) or RELIABLE.depth,
+        history="keep_all" if all(qos.history == "keep_all" for qos in recorded) else "keep_last",
+        deadline_ns=min(qos.deadline_ns for qos in recorded),
+        lifespan_ns=max(qos.lifespan_ns for qos in recorded),
+        liveliness=first.liveliness if first.liveliness in ("automatic", "manual_by_topic") else "automatic",
+        liveliness_lease_ns=min(qos.liveliness_lease_ns for qos in recorded),
+        avoid_ros_namespace_conventions=first.avoid_ros_namespace_conventions,
+    )
+
+
+def request_for(offered: Sequence[Qos], depth: int) -> Qos:
+    """The profile of a subscription that matches every one of these publishers and takes the most from them.
+
+    Reliable if every publisher is, transient local likewise.
+
+    Args:
+        offered: what the publishers of the topic offer now.
+        depth: messages that may wait for the subscriber.
+    """
+    reliable = all(qos.reliability == "reliable" for qos in offered)
+    latched = all(qos.durability == "transient_local" for qos in offered)
+    return Qos("reliable" if reliable else "best_effort", "transient_local" if latched else "volatile", depth)
+
+
+def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
+    """The value of ``offered_qos_profiles`` in metadata version 9."""
+    profiles = []
+    for offer in offers:
+        profile = asdict(offer)
+        for name, field in _DURATIONS.items():
+            sec, nsec = divmod(profile.pop(field), NANOSECONDS)
+            profile[name] = {"sec": sec, "nsec": nsec}
+        profiles.append(profile)
+    return profiles
+
+
+# libyaml, where PyYAML was built with it, is ten times as fast; a short replay notices.
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+def dump_yaml(content: Any) -> str:
+    """``yaml.safe_dump`` in the given order, as fast as the installation allows."""
+    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False)
+    return text
+
+
+def dump(offers: Sequence[Qos]) -> str:
+    """The text that an mcap channel carries under ``offered_qos_profiles``."""
+    return dump_yaml(to_yaml(offers)).strip() if offers else ""
+
+
+def load(value: object) -> tuple[Qos, ...]:
+    """The profiles in ``offered_qos_profiles`` of any metadata version, text or list.
+
+    Whatever cannot be understood falls back to the default of that policy: a recording whose QoS is odd is still a
+    recording.
+    """
+    if isinstance(value, str):
+        try:
+            value = load_yaml(value)
+        except FileError:
+            return ()
+    return tuple(_profile(item) for item in value if isinstance(item, dict)) if isinstance(value, list) else ()
+
+
+def _profile(item: dict[str, Any]) -> Qos:
+    values: dict[str, Any] = {"depth": 0, "history": "unknown"}
+    for name, names in _NUMBERED.items():
+        value = item.get(name)
+        if isinstance(value, int) and 0 <= value < len(names):
+            value = names[value]
+        if value in names:
+            values[name] = value
+    for name, field in _DURATIONS.items():
+        with contextlib.suppress(TypeError, KeyError, ValueError, OverflowError):
+            nanoseconds = int(item[name]["sec"]) * NANOSECONDS + int(item[name]["nsec"])
+            # Before Jazzy an infinite duration was 2147483647 s and 4294967295 ns; 0 is "unspecified".
+            values[field] = nanoseconds if 0 < nanoseconds < 2147483647 * NANOSECONDS else INFINITE_NS
+    if isinstance(item.get("depth"), int):
+        values["depth"] = max(0, item["depth"])
+    return Qos(**values, avoid_ros_namespace_conventions=bool(item.get("avoid_ros_namespace_conventions", False)))

@@ -1,0 +1,96 @@
+"""What a calibration says of one sensor: where it stands, and how its clock runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.skeleton import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SensorPose:
+    """The pose of ``<sensor>_optical_frame`` (x right, y down, z forward) in ``world``.
+
+    Attributes:
+        sensor: its name.
+        translation: (3,) metres.
+        quat_xyzw: (4,) unit quaternion that takes optical coordinates into ``world``.
+        valid_from_ns: reference time from which it is to be used; 0 for always.
+    """
+
+    sensor: str
+    translation: FloatArray
+    quat_xyzw: FloatArray
+    valid_from_ns: int = 0
+
+    @cached_property
+    def rotation(self) -> FloatArray:
+        """(3, 3) rotation matrix, optical to world."""
+        # Imported here because it takes a third of a second, and most nodes only pass poses on or have none.
+        from scipy.spatial.transform import Rotation
+
+        matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()
+        return matrix
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """(..., 3) optical coordinates into world."""
+        return points @ self.rotation.T + self.translation
+
+
+def level_pose(sensor: str, height: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> SensorPose:
+    """The reference sensor's pose in ``world``: z up, x horizontal along its view.
+
+    Args:
+        sensor: its name.
+        height: metres of the sensor above the world's origin.
+        pitch: radians by which it looks down.
+        roll: radians by which it is turned clockwise about its view, seen from behind it.
+    """
+    from scipy.spatial.transform import Rotation
+
+    optical_to_level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    tilt = Rotation.from_euler("YX", [pitch, roll])
+    rotation = tilt * Rotation.from_matrix(optical_to_level)
+    return SensorPose(sensor, np.array([0.0, 0.0, height]), rotation.as_quat())
+
+
+@dataclass(frozen=True, slots=True)
+class SensorQuality:
+    """How well one sensor's calibration is known.
+
+    Attributes:
+        residual: median distance between what both sensors say of the same joint, metres; NaN before any overlap.
+        rotation_stddev: radians; infinity while unknown.
+        translation_stddev: metres at the place where the person was; infinity while unknown.
+        clock_stddev: of the clock's offset at its anchor, seconds; infinity while unknown.
+        frames: pairs of frames that the estimate stands on.
+        clock_drift_stddev_ppm: of the clock's drift, parts per million; infinity while unknown.
+    """
+
+    residual: float = float("nan")
+    rotation_stddev: float = float("inf")
+    translation_stddev: float = float("inf")
+    clock_stddev: float = float("inf")
+    frames: int = 0
+    clock_drift_stddev_ppm: float = float("inf")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """Poses, clocks and quality of every calibrated sensor, the reference among them.
+
+    Attributes:
+        reference: the sensor that defines ``world`` and its time.
+        poses: a pose per calibrated sensor; a sensor that is not calibrated yet is absent.
+        clocks: the clock of each sensor in ``poses``.
+        quality: likewise.
+    """
+
+    reference: str
+    poses: dict[str, SensorPose]
+    clocks: dict[str, ClockModel]
+    quality: dict[str, SensorQuality]

@@ -1,0 +1,81 @@
+"""Where skeletons come from: recordings of other programs, datasets, and the conversion of their coordinates.
+
+Every reader here is iterated for :class:`RecordedFrame`, and what it yields is in the package's conventions:
+``<sensor>_optical_frame`` (x right, y down, z forward), metres, integer nanoseconds. May import ``skeleton`` and numpy,
+nothing else of the package.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from body_tracking.core.errors import BodyTrackingError
+
+if TYPE_CHECKING:
+    from body_tracking.core.skeleton import Skeleton
+
+RESERVED_NAMES = ("fused", "filtered", "ground_truth", "imu")
+"""First parts of topics that are not sensors."""
+
+
+NOT_FINITE = "joints without finite coordinates"
+"""Counted in :attr:`Recording.problems`: such a joint is NaN and NOT_TRACKED."""
+
+
+class SensorNameError(BodyTrackingError):
+    """A name that cannot be a sensor's."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFrame:
+    """What one sensor said at one instant.
+
+    Attributes:
+        sensor: its name.
+        received_ns: when it was received, by the receiver's clock.
+        skeletons: the bodies; all with one stamp, in the sensor's own clock. Never empty.
+    """
+
+    sensor: str
+    received_ns: int
+    skeletons: tuple[Skeleton, ...]
+
+
+class Recording(Protocol):
+    """A file of recorded frames; its readers count what they meet while they are iterated.
+
+    Attributes:
+        problems: how often each kind of oddity was met, such as ``stamps that repeat``.
+        warnings: a line for each thing that is missing.
+    """
+
+    problems: dict[str, int]
+    warnings: list[str]
+
+    def __iter__(self) -> Iterator[RecordedFrame]:
+        """The frames, in the order of the file."""
+
+    @property
+    def progress(self) -> float:
+        """How much of the file has been read, 0 to 1."""
+
+
+def check_sensor_name(name: str) -> str:
+    """The name, if it can be the first part of a topic and of a frame.
+
+    Raises:
+        SensorNameError: it cannot.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise SensorNameError(f"sensor name {name!r}: letters, digits and _ only, a letter first")
+    if name in RESERVED_NAMES:
+        raise SensorNameError(f"sensor name {name!r} is reserved")
+    return name
+
+
+def optical_frame(sensor: str) -> str:
+    """The frame of a sensor's skeletons."""
+    return f"{sensor}_optical_frame"

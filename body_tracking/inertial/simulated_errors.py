@@ -1,0 +1,147 @@
+"""How much an inertial sensor errs: the parameters of ``imus``, and sets of them for known devices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import check_fields, number_field
+
+STANDARD_GRAVITY: Final = 9.80665
+
+
+class ImuSimulationError(BodyTrackingError):
+    """An inertial sensor was described, or moved, as none can be."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuErrors:
+    """How much an inertial sensor errs; each field's metadata says what it is, its unit and its range.
+
+    Noise densities are those of IEEE Std 952 (Allan deviation N / sqrt(tau), N sqrt(rate) per sample). Deviations of
+    what stays are per axis, and drawn anew for each recording; biases anew at each switching on. The defaults are
+    :data:`CONSUMER`.
+
+    Raises:
+        ImuSimulationError: a value out of its range.
+    """
+
+    gyro_noise: float = number_field(0.01, "noise density of the angular rate", "deg/s/sqrt(Hz)", 0.0, 1.0)
+    gyro_bias: float = number_field(0.3, "stddev of the turn-on bias of the angular rate", "deg/s", 0.0, 20.0)
+    gyro_instability: float = number_field(0.006, "stddev of the in-run bias of the angular rate", "deg/s", 0.0, 5.0)
+    gyro_scale: float = number_field(0.01, "stddev of the scale of the angular rate", "1", 0.0, 0.2)
+    gyro_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the angular rate", "1", 0.0, 0.2)
+    gyro_range: float = number_field(
+        2000.0, "greatest angular rate, of 16 bits; inf: any, exactly", "deg/s", 1.0, np.inf
+    )
+    acc_noise: float = number_field(0.003, "noise density of the acceleration", "m/s2/sqrt(Hz)", 0.0, 1.0)
+    acc_bias: float = number_field(0.1, "stddev of the turn-on bias of the acceleration", "m/s2", 0.0, 5.0)
+    acc_instability: float = number_field(0.003, "stddev of the in-run bias of the acceleration", "m/s2", 0.0, 1.0)
+    acc_scale: float = number_field(0.005, "stddev of the scale of the acceleration", "1", 0.0, 0.2)
+    acc_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the acceleration", "1", 0.0, 0.2)
+    acc_range: float = number_field(
+        16.0 * STANDARD_GRAVITY, "greatest acceleration, of 16 bits; inf: any, exactly", "m/s2", 1.0, np.inf
+    )
+    mag_noise: float = number_field(0.05, "noise density of the magnetic field", "uT/sqrt(Hz)", 0.0, 10.0)
+    mag_bias: float = number_field(1.0, "stddev of what calibration leaves of hard iron", "uT", 0.0, 100.0)
+    mag_scale: float = number_field(0.01, "stddev of scale and cross-axis sensitivities of the field", "1", 0.0, 0.5)
+    mag_range: float = number_field(4912.0, "greatest field, of 16 bits; inf: any, exactly", "uT", 50.0, np.inf)
+    instability_time: float = number_field(300.0, "correlation time of the in-run biases", "s", 1.0, 1e5)
+
+    tilt_time: float = number_field(3.0, "time constant of the driver's levelling", "s", 0.01, 1e3)
+    heading_time: float = number_field(9.0, "time constant of the driver's heading", "s", 0.01, 1e4)
+    driver_bias: float = number_field(
+        0.03, "stddev of the turn-on bias that the driver's own estimate leaves", "deg/s", 0.0, 5.0
+    )
+    stated_tilt: float = number_field(1.5, "stddev of the tilt that the driver states", "deg", 0.0, 90.0)
+    stated_heading: float = number_field(
+        4.0, "stddev of the heading that the driver states, besides drift", "deg", 0.0, 180.0
+    )
+
+    misalignment: float = number_field(5.0, "stddev of the mounting's rotation per axis", "deg", 0.0, 90.0)
+    tissue_sag: float = number_field(
+        0.003, "how far the sensor sags on the flesh in its own weight; 0: bone", "m", 0.0, 0.02
+    )
+    tissue_frequency: float = number_field(8.0, "natural frequency of the sensor on the flesh", "Hz", 1.0, 12.0)
+    tissue_damping: float = number_field(0.25, "damping ratio of it", "1", 0.01, 2.0)
+    tissue_turn: float = number_field(
+        15.0, "turn of the sensor as it slides over the flesh: one over its radius", "rad/m", 0.0, 100.0
+    )
+    twist_share: float = number_field(0.2, "share of a segment's twist that the skin does not follow", "1", 0.0, 1.0)
+
+    jitter: float = number_field(0.0002, "stddev of the instants of sampling", "s", 0.0, 0.1)
+    stamp_jitter: float = number_field(0.0005, "stddev of the stamps about these instants", "s", 0.0, 0.1)
+    packet: int = field(
+        default=2, metadata={"doc": "samples sent together, lost together", "unit": "1", "min": 1, "max": 100}
+    )
+    lost: float = number_field(0.005, "probability that a packet is lost", "1", 0.0, 1.0)
+    outages: float = number_field(0.2, "outages of the radio", "1/min", 0.0, 60.0)
+    outage_time: float = number_field(0.5, "mean duration of an outage", "s", 0.0, 60.0)
+    delay: float = number_field(0.015, "time from sampling to receipt, at least", "s", 0.0, 10.0)
+    delay_jitter: float = number_field(0.005, "what is added to it on average", "s", 0.0, 10.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self, "IMU errors", ImuSimulationError)
+
+
+CONSUMER: Final = ImuErrors()
+"""A chip like the MPU-9250 on a strap, over Bluetooth.
+
+Data sheet PS-MPU-9250A-01: 0.01 deg/s and 300 ug per root hertz, ranges; 3 % scale and 2 % cross-axis tolerance are
+taken for three standard deviations and less, as of a sensor that was calibrated once. Turn-on biases are what a change
+of temperature by 1 to 7 K leaves of such a calibration (0.24 deg/s and 1.5 mg per kelvin).
+"""
+
+GOOD: Final = ImuErrors(
+    gyro_noise=0.007,
+    gyro_bias=0.05,
+    gyro_instability=10.0 / 3600.0,
+    gyro_scale=0.001,
+    gyro_axes=0.001,
+    acc_noise=120e-6 * STANDARD_GRAVITY,
+    acc_bias=0.02,
+    acc_instability=30e-6 * STANDARD_GRAVITY,
+    acc_scale=0.001,
+    acc_axes=0.0005,
+    mag_noise=0.02,
+    mag_bias=0.3,
+    mag_scale=0.003,
+    mag_range=190.0,
+    tilt_time=6.0,
+    heading_time=20.0,
+    driver_bias=0.003,
+    stated_tilt=0.75,
+    stated_heading=1.5,
+    misalignment=3.0,
+    tissue_sag=0.002,
+    tissue_frequency=10.0,
+    twist_share=0.1,
+    jitter=1e-5,
+    stamp_jitter=1e-5,
+    packet=1,
+    lost=0.0005,
+    outages=0.02,
+    delay=0.03,
+    delay_jitter=0.001,
+)
+"""A motion tracker like those of Xsens, calibrated one by one, with tight straps.
+
+Data sheet of the MTi-1: 0.007 deg/s and 120 ug per root hertz, bias stability 10 deg/h and 0.03 mg. Radio as of its
+wireless kin, the MTw.
+"""
+
+IDEAL: Final = replace(
+    CONSUMER,
+    **{
+        item.name: np.inf if item.name.endswith("_range") else 0.0
+        for item in fields(ImuErrors)
+        if item.name.startswith(("gyro", "acc", "mag", "driver", "stated"))
+        or item.name in ("misalignment", "tissue_sag", "twist_share", "jitter", "stamp_jitter")
+        or item.name in ("lost", "outages", "delay", "delay_jitter")
+    },
+    packet=1,
+)
+"""No errors at all; a driver's fusion is still tilted by acceleration and turned by iron."""

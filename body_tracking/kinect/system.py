@@ -1,0 +1,176 @@
+"""The Kinect system: skeletons of cameras, their calibration against each other, and their fusion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from body_tracking.core.message_types import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.core.parameters import Value
+from body_tracking.core.qos import LATCHED
+from body_tracking.core.sources import check_sensor_name
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.system import (
+    Command,
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    Service,
+    System,
+    TopicSpec,
+    asked,
+    sensors_and_transport,
+    transport,
+)
+
+
+def _subjects() -> tuple[str, ...]:
+    from body_tracking.pipeline.people import SUBJECTS
+
+    return SUBJECTS
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    sensors = sensors_of(options)
+    several = sensors_and_transport(options)
+    yield NodeSpec("fusion", "fusion", parameters={**several, **asked(options, subject="subject", people="people")})
+    yield NodeSpec(
+        "calibration", "calibration", parameters={**several, **asked(options, calibration_file="calibration")}
+    )
+    if options["bag"] or options["external"]:
+        return
+    adapted = _adapted(options)
+    for sensor in sensors:
+        yield NodeSpec(
+            f"{sensor}_skeleton",
+            "skeleton_adapter" if sensor in adapted else "kinect_skeleton",
+            parameters={"sensor": sensor, **adapted.get(sensor, {}), **transport(options)},
+        )
+
+
+def sensors_of(options: Options) -> tuple[str, ...]:
+    """The sensors of a graph.
+
+    Raises:
+        GraphError: no sensor, or one twice.
+        SensorNameError: a name that cannot be a sensor's.
+    """
+    given = options["sensors"]
+    sensors = tuple(check_sensor_name(sensor) for sensor in given) if isinstance(given, tuple) else ()
+    if not sensors:
+        raise graph.GraphError("no sensors")
+    if len(set(sensors)) < len(sensors):
+        raise graph.GraphError(f"a sensor is named twice among {', '.join(sensors)}")
+    return sensors
+
+
+def _adapted(options: Options) -> dict[str, dict[str, Value]]:
+    """Of each sensor that another driver's topic is adapted for, the adapter's parameters.
+
+    Raises:
+        GraphError: a sensor that is none of the graph's.
+    """
+    found: dict[str, dict[str, Value]] = {}
+    sensors, given = sensors_of(options), options["adapt"]
+    for entry in given if isinstance(given, tuple) else ():
+        sensor, _, topic = entry.partition(":")
+        if sensor not in sensors:
+            raise graph.GraphError(f"adapted sensor {sensor!r} is none of {', '.join(sensors)}")
+        found[sensor] = {"topic": topic} if topic else {}
+    return found
+
+
+SYSTEM = System(
+    "kinect",
+    order=0,
+    nodes=(
+        NodeType("kinect_skeleton", Place.SOURCE),
+        NodeType("skeleton_adapter", Place.SOURCE),
+        NodeType("calibration", Place.CALIBRATION, "body_tracking.calibration.stage:CalibrationStage"),
+        NodeType("fusion", Place.FUSION, "body_tracking.fusion.stage:FusionStage"),
+    ),
+    specs=_specs,
+    options=(
+        Option(
+            "sensors",
+            graph.DEFAULT_SENSORS,
+            "names, the reference first (default: those in the bag, else kinect1,kinect2)",
+            "A,B",
+        ),
+        Option("external", False, "start no sensor nodes: somebody else publishes /<sensor>/skeleton"),
+        Option(
+            "adapt",
+            (),
+            "this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
+            "SENSOR[:/TOPIC]",
+        ),
+        Option("calibration", "", "YAML file to load the calibration from, if there, and save to", "FILE", path=True),
+        Option("reliable", False, "transport skeletons reliably: nothing is lost, whatever it takes"),
+        Option(
+            "subject",
+            "",
+            "whom to track: one, who is the nearest or is seen first, or all (default: nearest)",
+            choices=_subjects,
+            parameter=("skeleton_filter", "subject"),
+        ),
+        Option(
+            "people",
+            0,
+            "with --subject all: how many at most (6)",
+            "N",
+            parameter=("skeleton_filter", "people"),
+        ),
+    ),
+    topics=(
+        TopicSpec(
+            graph.skeleton_topic("<sensor>"),
+            POINT_CLOUD,
+            graph.SKELETON,
+            "kinect_skeleton",
+            "what one sensor sees, in `<sensor>_optical_frame`: a point per joint, SDK order; fields "
+            "`x y z` float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` "
+            "uint16",
+        ),
+        TopicSpec(
+            graph.CALIBRATION,
+            TRANSFORM,
+            LATCHED,
+            "calibration",
+            "the pose of each sensor's optical frame in `world`, one message per sensor; holds from its stamp on (0: "
+            "always), by the stamps of the reference sensor",
+        ),
+        TopicSpec(
+            graph.CALIBRATION_CLOCK,
+            TIME_REFERENCE,
+            LATCHED,
+            "calibration",
+            "per other sensor (`source`): what it stamps (`time_ref`) when the reference sensor stamps with the "
+            "header's stamp; holds from there on",
+        ),
+        TopicSpec(
+            graph.TF_STATIC,
+            "tf2_msgs/msg/TFMessage",
+            LATCHED,
+            "calibration",
+            "the same poses, where tf2_msgs is installed",
+        ),
+        TopicSpec(
+            graph.FUSED,
+            POINT_CLOUD,
+            graph.SKELETON,
+            "fusion",
+            "the person in `world`, by the stamps of the reference sensor; in addition covariance `xx xy xz yy yz zz`; "
+            "with `subject: all` everybody, with the person's number in `body`",
+        ),
+    ),
+    services=(
+        Service(
+            graph.START_SERVICE,
+            "calibration",
+            "estimate the poses anew; what is published holds until the new estimate",
+        ),
+        Service(graph.RESET_SERVICE, "calibration", "forget the calibration"),
+    ),
+    commands=(Command("calibrate", "body_tracking.recording.calibrate", "the poses and clocks of a bag's sensors"),),
+)

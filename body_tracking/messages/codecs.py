@@ -1,0 +1,279 @@
+"""How what stages exchange is written as messages, one class per content.
+
+Live and offline differ in the client library that handles layouts which this package does not write itself
+(:class:`Wire`); the bytes are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from body_tracking.core.body_model import BodyModel
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.imu import ImuSample
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.messages.base import (
+    IMAGE,
+    IMU,
+    JOINT_STATE,
+    MAGNETIC_FIELD,
+    POINT_CLOUD,
+    STRING,
+    TF,
+    TIME_REFERENCE,
+    TRANSFORM,
+    MessageTypes,
+    to_header,
+)
+from body_tracking.messages.calibration import (
+    clock_to_time_reference,
+    pose_to_transform,
+    time_reference_to_clock,
+    transform_to_pose,
+)
+from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_skeletons
+from body_tracking.messages.imus import (
+    message_to_magnetic_field,
+    message_to_orientation,
+    message_to_sample,
+    orientation_to_message,
+)
+from body_tracking.messages.model import (
+    covariance_to_image,
+    estimate_to_joint_state,
+    estimate_to_stddevs,
+    image_to_covariance,
+    joint_state_to_model,
+)
+from body_tracking.messages.skeletons import cloud_to_skeletons
+
+
+class Wire(Protocol):
+    """The client library's part of serialisation.
+
+    Attributes:
+        types: its message classes.
+    """
+
+    @property
+    def types(self) -> MessageTypes: ...
+
+    def serialize(self, type_name: str, message: Any) -> bytes:
+        """A message as CDR."""
+
+    def deserialize(self, type_name: str, cdr: bytes) -> Any:
+        """A message of CDR.
+
+        Raises:
+            MessageError: the bytes are no such message.
+        """
+
+
+class Codec:
+    """Base of the codecs.
+
+    Attributes:
+        type_name: of the message.
+    """
+
+    type_name: str
+
+    def encode(self, payload: Any, wire: Wire) -> bytes:
+        """The message as CDR."""
+        raise NotImplementedError
+
+    def decode(self, cdr: bytes, wire: Wire) -> Any:
+        """What the message says.
+
+        Raises:
+            MessageError: it does not have the layout that its topic promises.
+        """
+        raise NotImplementedError
+
+    def stamp_ns(self, payload: Any) -> int | None:
+        """Capture time by which a backward jump of an input is noticed; None for messages that state none."""
+        return None
+
+
+class Skeletons(Codec):
+    """All bodies in a frame."""
+
+    type_name = POINT_CLOUD
+
+    def encode(self, payload: Sequence[Skeleton], wire: Wire) -> bytes:
+        return encode_skeletons(list(payload))
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[Skeleton, ...]:
+        return decode_skeletons(cdr) or cloud_to_skeletons(wire.deserialize(POINT_CLOUD, cdr))
+
+    def stamp_ns(self, payload: Sequence[Skeleton]) -> int:
+        return payload[0].stamp_ns
+
+
+class Pose(Codec):
+    """A sensor's pose in ``world``."""
+
+    type_name = TRANSFORM
+
+    def __init__(self, world: str = "") -> None:
+        self.world = world
+
+    def encode(self, payload: SensorPose, wire: Wire) -> bytes:
+        return wire.serialize(TRANSFORM, pose_to_transform(payload, self.world, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> SensorPose:
+        return transform_to_pose(wire.deserialize(TRANSFORM, cdr))
+
+
+class Poses(Pose):
+    """All poses at once, for ``tf2``."""
+
+    type_name = TF
+
+    def encode(self, payload: Any, wire: Wire) -> bytes:
+        transforms = [pose_to_transform(each, self.world, wire.types) for each in payload]
+        return wire.serialize(TF, wire.types.make(TF, transforms=transforms))
+
+
+class SensorClock(NamedTuple):
+    """A sensor's clock, in force from a time of the reference's clock on."""
+
+    sensor: str
+    valid_from_ns: int
+    clock: ClockModel
+
+
+class Clock(Codec):
+    """A sensor's clock."""
+
+    type_name = TIME_REFERENCE
+
+    def encode(self, payload: SensorClock, wire: Wire) -> bytes:
+        message = clock_to_time_reference(payload.sensor, payload.clock, payload.valid_from_ns, wire.types)
+        return wire.serialize(TIME_REFERENCE, message)
+
+    def decode(self, cdr: bytes, wire: Wire) -> SensorClock:
+        return SensorClock(*time_reference_to_clock(wire.deserialize(TIME_REFERENCE, cdr)))
+
+
+class Orientation(Codec):
+    """The orientation of a segment."""
+
+    type_name = IMU
+
+    def __init__(self, segment: str) -> None:
+        self.segment = segment
+
+    def encode(self, payload: SegmentOrientation, wire: Wire) -> bytes:
+        return wire.serialize(IMU, orientation_to_message(payload, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> SegmentOrientation:
+        return message_to_orientation(wire.deserialize(IMU, cdr), self.segment)
+
+
+class Reading(Codec):
+    """A reading of an inertial sensor, as its driver publishes it."""
+
+    type_name = IMU
+
+    def decode(self, cdr: bytes, wire: Wire) -> ImuSample:
+        return message_to_sample(wire.deserialize(IMU, cdr))
+
+
+class Field(Codec):
+    """A magnetic field: stamp, frame, and (3,) tesla."""
+
+    type_name = MAGNETIC_FIELD
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, FloatArray]:
+        return message_to_magnetic_field(wire.deserialize(MAGNETIC_FIELD, cdr))
+
+
+class OfModel(Codec):
+    """Base of the codecs that need the body model.
+
+    Args:
+        model: of the estimates.
+    """
+
+    def __init__(self, model: BodyModel) -> None:
+        self.model = model
+
+
+class ModelState(OfModel):
+    """Coordinates and rates; read as stamp, frame, configuration and velocity."""
+
+    type_name = JOINT_STATE
+
+    def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
+        return wire.serialize(JOINT_STATE, estimate_to_joint_state(payload, self.model, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, FloatArray, FloatArray]:
+        return joint_state_to_model(wire.deserialize(JOINT_STATE, cdr), self.model)
+
+    def stamp_ns(self, payload: tuple[int, str, FloatArray, FloatArray]) -> int:
+        return payload[0]
+
+
+class ModelStddev(OfModel):
+    """Their standard deviations."""
+
+    type_name = JOINT_STATE
+
+    def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
+        return wire.serialize(JOINT_STATE, estimate_to_stddevs(payload, self.model, wire.types))
+
+
+class ModelCovariance(OfModel):
+    """Their covariance; read as stamp and matrix."""
+
+    type_name = IMAGE
+
+    def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
+        return wire.serialize(IMAGE, covariance_to_image(payload, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, FloatArray]:
+        return image_to_covariance(wire.deserialize(IMAGE, cdr), self.model)
+
+
+class Text(Codec):
+    """A string."""
+
+    type_name = STRING
+
+    def encode(self, payload: str, wire: Wire) -> bytes:
+        return wire.serialize(STRING, wire.types.make(STRING, data=payload))
+
+
+class Angles(Codec):
+    """Joint angles, or their standard deviations.
+
+    Args:
+        body: whose they are.
+        part: 0 for the angles, 1 for the deviations.
+        convention: names it, which may change.
+    """
+
+    type_name = JOINT_STATE
+
+    def __init__(self, body: str, part: int, convention: Callable[[], str]) -> None:
+        self.body, self.part, self.convention = body, part, convention
+
+    def encode(self, payload: JointAngles, wire: Wire) -> bytes:
+        return encode_angles(payload, self.body, self.convention())[self.part]
+
+
+class Ids(Codec):
+    """The ids of the people who are tracked, as :class:`Tracked` holds them."""
+
+    type_name = "hri_msgs/msg/IdsList"
+
+    def encode(self, payload: tuple[int, str, tuple[str, ...]], wire: Wire) -> bytes:
+        stamp_ns, frame_id, ids = payload
+        header = to_header(stamp_ns, frame_id, wire.types)
+        return wire.serialize(self.type_name, wire.types.make(self.type_name, header=header, ids=list(ids)))

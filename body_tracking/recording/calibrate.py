@@ -1,0 +1,148 @@
+"""``body_tracking calibrate``: the poses and clocks of a recording's sensors."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
+from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.calibration.storage import save, to_dict
+from body_tracking.core.parameters import Value
+from body_tracking.core.sensor_poses import CalibrationResult
+from body_tracking.recording.replay import Progress, parameters_for, sensor_topics, skeletons_of
+from body_tracking.recording.rig import RigReader
+
+WHOLE = 600.0
+"""Raw frames kept, seconds: a recording up to this long is interpolated anew with the final clock."""
+
+
+def relative_yaw(result: CalibrationResult, sensor: str) -> float:
+    """The turn about the vertical that takes a sensor's coordinates into the reference's, in Kinect camera axes.
+
+    Args:
+        result: with both sensors.
+        sensor: its name.
+
+    Returns:
+        atan2(R[0, 2], R[2, 2]) in radians, for R in camera axes (x to the sensor's left, y up, z forward).
+    """
+    rotation = result.poses[result.reference].rotation.T @ result.poses[sensor].rotation
+    # Camera axes are (-x, -y, z) of optical ones.
+    return float(np.arctan2(-rotation[0, 2], rotation[2, 2]))
+
+
+def calibrate(
+    bag_path: Path, parameters: CalibrationParameters, sensors: tuple[str, ...] = (), reference: str = ""
+) -> tuple[CalibrationResult, list[str]]:
+    """Calibrate from a bag, with all of it.
+
+    Args:
+        bag_path: a rosbag2 folder or an mcap file.
+        parameters: of the calibration.
+        sensors: to use; all in the bag when empty.
+        reference: the sensor that defines ``world``; the first when empty.
+
+    Returns:
+        The result, and what happened on the way, a line each.
+
+    Raises:
+        ReplayError: no skeletons in the bag.
+        BagError: the bag cannot be read.
+        CalibrationError: a sensor could not be calibrated.
+    """
+    counters: Counter[str] = Counter()
+    with RigReader(bag_path) as bag:
+        topics = sensor_topics(bag, sensors)
+        names = tuple(topics.values())
+        calibration = OnlineCalibration(names, replace(parameters, history=WHOLE), reference or None)
+        progress = Progress(bag.start_ns, bag.end_ns)
+        frames = 0
+        for sensor, skeleton, log_time_ns, _ in skeletons_of(bag, topics, counters):
+            frames += 1
+            calibration.push(sensor, skeleton, log_time_ns)
+            progress.at(log_time_ns)
+        progress.end()
+        events = [*bag.warnings, *(f"{name}: {count}" for name, count in sorted(counters.items()))]
+    if not frames:
+        raise CalibrationError(f"{bag_path}: no frame can be used ({'; '.join(events) or 'there is none'})")
+    result = calibration.finish()
+    missing = [name for name in names if name not in result.poses]
+    if missing:
+        raise CalibrationError(
+            f"{bag_path}: {', '.join(missing)} could not be calibrated against {calibration.reference}: "
+            f"{calibration.status()[1]}"
+        )
+    return result, [*calibration.events, *events]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """``body_tracking calibrate``."""
+    command = subparsers.add_parser(
+        "calibrate",
+        description="Finds where each sensor of a recording stood and how its clock ran, from the person they saw.",
+    )
+    command.add_argument(
+        "bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics"
+    )
+    command.add_argument(
+        "--method",
+        choices=("robust", "thesis"),
+        help="robust (default): refined over the movement; thesis: one still pose of 50 frames",
+    )
+    command.add_argument("--sensors", metavar="A,B", help="use these (default: all in the bag)")
+    command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
+    command.add_argument(
+        "--params-file", type=Path, metavar="F", help="ROS parameters file, as for the calibration node"
+    )
+    command.add_argument("-o", "--output", type=Path, metavar="FILE", help="save the calibration (YAML)")
+    command.add_argument("--json", action="store_true", help="print the result as JSON")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """The command."""
+    own: dict[str, Value] = {
+        "use_sim_time": False,
+        "reliable": False,
+        "world_frame": "",
+        "sensors": (),
+        "reference": "",
+        "calibration_file": "",
+    }
+    parameters, _ = parameters_for("calibration", CalibrationParameters, args.params_file, own)
+    if args.method:
+        parameters = replace(parameters, method=args.method)
+    sensors = tuple(args.sensors.split(",")) if args.sensors else ()
+    result, events = calibrate(args.bag, parameters, sensors, args.reference or "")
+    if args.output is not None:
+        save(result, args.output)
+    if args.json:
+        data: dict[str, Any] = {"method": parameters.method, **to_dict(result), "events": events}
+        for name, entry in data["sensors"].items():
+            entry["relative_yaw_deg"] = float(np.degrees(relative_yaw(result, name)))
+        print(json.dumps(data, indent=2))
+        return 0
+    for event in events:
+        print(event)
+    for name, pose in result.poses.items():
+        clock, quality = result.clocks[name], result.quality[name]
+        x, y, z = pose.translation
+        if name == result.reference:
+            print(f"{name}: reference, at ({x:.3f}, {y:.3f}, {z:.3f}) m in world")
+            continue
+        print(
+            f"{name}: at ({x:.3f}, {y:.3f}, {z:.3f}) m in world, yaw {np.degrees(relative_yaw(result, name)):.2f} deg "
+            f"(+-{np.degrees(quality.rotation_stddev):.2f}), "
+            f"clock {clock.offset:+.4f} s (+-{quality.clock_stddev:.4f}), "
+            f"drift {clock.drift_ppm:+.0f} ppm, residual {1e3 * quality.residual:.0f} mm"
+        )
+    if args.output is not None:
+        print(f"saved to {args.output}")
+    return 0

@@ -1,0 +1,187 @@
+"""What ``body_tracking up`` hears of its graph: diagnostics, angles and the clock, as one line."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from body_tracking.core import names
+from body_tracking.core.qos import RELIABLE
+from body_tracking.kinect.system import sensors_of
+from body_tracking.messages.base import MessageError, to_nanoseconds
+from body_tracking.messages.diagnostics import statuses
+from body_tracking.messages.node_status import NodeStatus, note_statuses
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.roles import ROLES, role_of
+from body_tracking.pipeline.system import Options
+from body_tracking.ros.bag_topics import to_profile
+
+_CHAIN = ("skeleton_filter", "joint_angles")
+_NAME = "body_tracking_up"
+_FRESH = 3.0
+"""Seconds for which a node's diagnostics count."""
+
+
+class GraphMonitor:
+    """Listens in a thread of its own.
+
+    Args:
+        bodies: the ids of those who may be tracked.
+        namespace: of the graph.
+    """
+
+    def __init__(self, bodies: Sequence[str], namespace: str = "/") -> None:
+        self.clock_ns = 0
+        """The latest time on ``/clock``; 0 before there is one."""
+        self.last_angles = 0.0
+        """Steady time at which the latest angles came, seconds."""
+        self.angles = 0
+        """How many angle messages have come."""
+        self._angles_topics = [graph.joint_states_topic(body) for body in bodies]
+        self._statuses: dict[str, NodeStatus] = {}
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._namespace = namespace
+        # by the time of its start the older of two can be told
+        self._node = rclpy.create_node(f"{_NAME}_{time.time_ns()}", namespace=namespace, context=self._context)
+        self._node.create_subscription(
+            DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
+        )
+        for topic in self._angles_topics:
+            # deep, so that all are counted though we are held up
+            name, qos = names.relative(topic), to_profile(graph.RELIABLE_SKELETON)
+            self._node.create_subscription(JointState, name, self._on_angles, qos)
+        clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        rclpy.try_shutdown(context=self._context)
+        self._thread.join(timeout=2.0)
+        self._executor.shutdown()  # before Python takes things down in any order
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def _on_diagnostics(self, message: Any) -> None:
+        known = dict(self._statuses)  # the other thread reads them
+        note_statuses(known, statuses(message, time.monotonic(), self._namespace))
+        self._statuses = known
+
+    def _on_angles(self, message: Any) -> None:
+        self.angles += 1
+        self.last_angles = time.monotonic()
+
+    def _on_clock(self, message: Any) -> None:
+        with contextlib.suppress(MessageError):
+            self.clock_ns = to_nanoseconds(message.clock)
+
+    def has_predecessor(self) -> bool:
+        """Whether another ``up`` was started earlier in this domain and namespace, and is there still.
+
+        One that was killed is not: it does not answer who comes later.
+        """
+        name, namespace = self._node.get_name(), self._node.get_namespace()
+        return any(
+            other.startswith(f"{_NAME}_") and where == namespace and (len(other), other) < (len(name), name)
+            for other, where in self._node.get_node_names_and_namespaces()
+        )
+
+    def listened_to(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
+        """Whether who publishes each of these topics says that it has found at least so many subscribers.
+
+        That we have found them does not mean that the publisher has.
+
+        Args:
+            wanted: topics and numbers; a topic that none of the nodes publishes is not waited for.
+            nodes: all that are to have said something.
+        """
+        statuses = [self._statuses.get(name) for name in nodes]
+        for topic, number in wanted.items():
+            key = f"subscribers {names.resolved(topic, self._namespace)}"
+            found = [status.number(key) or 0.0 for status in statuses if status is not None and key in status.values]
+            if found and sum(found) < number:
+                return False
+        return None not in statuses
+
+    # --- for people
+
+    def line(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
+        """The status line: rates, delay, calibration, restarts."""
+        now = time.monotonic()
+        fresh = {name: status for name, status in self._statuses.items() if now - status.received < _FRESH}
+        parts = [f"{elapsed:6.1f} s"]
+        player = fresh.get("bag_player")
+        if player is not None:
+            parts[0] += f" (bag {float(player.values['position s']):.1f}/{float(player.values['duration s']):.1f} s)"
+        parts.append(self._rates(options, fresh))
+        delay = self._delay(options, fresh)
+        if delay:
+            parts.append(delay)
+        calibration = fresh.get("calibration")
+        parts.append(f"calibration: {calibration.text if calibration is not None else 'none'}")
+        malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
+        if malformed:
+            parts.append(f"malformed {malformed}")
+        values = {f"{key}: {said}" for status in fresh.values() for key, said in status.values.items()}
+        parts += sorted(each for each in values if each.startswith("publishers "))
+        if options["robot"]:
+            parts.append(f"robot {fresh['robot_commands'].text if 'robot_commands' in fresh else '-'}")
+        if restarts:
+            parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
+        return " | ".join(parts)
+
+    def _rates(self, options: Options, fresh: Mapping[str, NodeStatus]) -> str:
+        def rate(node: str, way: str, topic: str) -> str:
+            key = f"rate {way} {names.resolved(topic, self._namespace)}"
+            value = fresh[node].values.get(key) if node in fresh else None
+            return f"{float(value):.0f}" if value is not None else "-"
+
+        sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in sensors_of(options))
+        fused = rate("fusion", "out", graph.FUSED)
+        rates = [rate("joint_angles", "out", topic) for topic in self._angles_topics]
+        # those of whom something comes; of nobody at least how it is with the first
+        angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
+        return f"{sensors}, fused {fused}, angles {angles} Hz"
+
+    @staticmethod
+    def _delay(options: Options, fresh: Mapping[str, NodeStatus]) -> str:
+        """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
+        running = fresh.get("skeleton_filter")
+        role = ROLES.get(running.text if running is not None else "")  # it may have changed since the start
+        asked = options["filter_input"]
+        taken = (role or role_of(options)).input if asked in ("", graph.AUTO) else asked
+        by_sensor = taken == graph.SENSORS_INPUT
+        chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)
+        values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in chain]
+        known = [float(value) for value in values if value is not None]
+        return f"delay {sum(known):.1f} ms" if len(known) == len(chain) else ""
+
+    def summary(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
+        """What was done."""
+        what = f"played {options['bag']}" if options["bag"] else "ran"
+        text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
+        if options["record"]:
+            text += f", recorded in {options['record']}"
+        if restarts:
+            text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
+        return text

@@ -1,0 +1,207 @@
+"""The node that hosts a stage: its topics, services, alarms and parameters, over ROS."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any, ClassVar
+
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Value
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.ros.bag_topics import UnknownTypeError, message_class, to_profile
+from body_tracking.ros.node import STEADY, GraphNode, run
+from body_tracking.ros.wire import WIRE
+from body_tracking.systems import stage_class
+
+_LOOK_S = 0.1
+"""Seconds between two looks for what other nodes publish."""
+_SAVE_S = 2.0
+"""Seconds between two writings to disk at least."""
+
+
+class StageNode(GraphNode):
+    """Hosts a stage.
+
+    Attributes:
+        STAGE: its class.
+    """
+
+    STAGE: ClassVar[type[Stage]]
+
+    def __init_subclass__(cls) -> None:
+        cls.NAME, cls.PARAMETERS = cls.STAGE.NAME, cls.STAGE.PARAMETERS
+        cls.__doc__ = cls.STAGE.__doc__
+
+    def __init__(self) -> None:
+        self.inputs: dict[str, tuple[Port, Subscription]] = {}
+        self.outputs: dict[str, tuple[Port, Publisher | None]] = {}
+        self.sent_ns: int | None = None
+        """Wall time at which the message in hand was sent."""
+        super().__init__()
+
+    def configure(self, values: Mapping[str, Value]) -> None:
+        """Make the stage."""
+        self.stage = self.STAGE(values, self.wanted)
+
+    def reconfigure(self, values: Mapping[str, Value]) -> None:
+        """From the next message on."""
+        self.stage.change(values)
+        self.connect()
+
+    def start(self) -> None:
+        """Connect."""
+        self.due = self.make_alarm(self.poll)
+        self.connect()
+        for name, action in self.stage.services.items():
+            self.create_service(Trigger, name, partial(self.answer, action))
+        if type(self.stage).look is not Stage.look:
+            self.create_timer(_LOOK_S, self.look, clock=STEADY)
+        if type(self.stage).save is not Stage.save:
+            self.create_timer(_SAVE_S, self.stage.save, clock=STEADY)
+        self.publish(self.stage.start(Now(self.now_ns(), self.waiting_ns())))
+
+    def connect(self) -> None:
+        """Publish and take what the stage does now, and nothing else: other nodes go by what there is."""
+        offered = {port.topic: port for port in self.stage.outputs}
+        for topic in self.outputs.keys() - offered.keys():
+            _, publisher = self.outputs.pop(topic)
+            if publisher is not None:
+                self.destroy_publisher(publisher)
+        for topic, port in offered.items():
+            publisher = self.outputs[topic][1] if topic in self.outputs else self._publisher(port)
+            self.outputs[topic] = port, publisher
+        taken = {port.topic: port for port in self.stage.inputs}
+        for topic in self.inputs.keys() - taken.keys():
+            self.destroy_subscription(self.inputs.pop(topic)[1])
+        for topic, port in taken.items():
+            self.inputs[topic] = port, self.inputs[topic][1] if topic in self.inputs else self._subscription(port)
+
+    def _publisher(self, port: Port) -> Publisher | None:
+        try:
+            return self.make_publisher(message_class(port.codec.type_name), port.topic, to_profile(port.qos))
+        except UnknownTypeError:
+            if not port.optional:
+                raise
+            return None
+
+    def _subscription(self, port: Port) -> Subscription:
+        qos = to_profile(port.qos)
+        qos.depth = max(qos.depth, port.waiting)
+        kind = message_class(port.codec.type_name)
+        handle = partial(self.on_message, port.topic)
+        subscription = self.listen(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
+        if port.droppable:
+            self._droppable[subscription] = self.full_name(port.topic)
+        return subscription
+
+    def wanted(self, topic: str) -> bool:
+        """Whether anybody listens."""
+        _, publisher = self.outputs[topic]
+        return publisher is not None and publisher.get_subscription_count() > 0
+
+    # --- messages
+
+    def on_message(self, topic: str, cdr: bytes, sent_ns: int) -> None:
+        """Hand a message to the stage."""
+        port, _ = self.inputs[topic]
+        if port.perishable and self.is_stale(self.full_name(topic), sent_ns):
+            return
+        try:
+            payload = port.codec.decode(cdr, WIRE)
+        except BodyTrackingError:
+            self.stage.refused(topic)
+            raise
+        stamp_ns = port.codec.stamp_ns(payload)
+        if stamp_ns is not None and self.monitor.message_in(topic, stamp_ns):
+            self.log_seldom("jump", f"{self.full_name(topic)}: time jumped back, starting anew", period_s=1.0)
+            self.stage.reset(topic)
+        self.sent_ns = sent_ns
+        self.publish(self.stage.take(topic, payload, Now(self.arrived_ns, self.arrived_waiting_ns)))
+        if self.simulated:  # each in its own time, as offline
+            self.poll()
+
+    def messages_taken(self) -> None:
+        """Do what follows from all messages that were there; called by the executor."""
+        self.poll()
+        self.stage.settle()
+        self.sent_ns = None
+
+    def poll(self) -> None:
+        """Publish what is due, and set the alarm for what is due next."""
+        try:
+            self.publish(self.stage.poll(self.waiting_ns()))
+        except BodyTrackingError as error:
+            self.malformed("a message that waited", str(error), "refused")
+        finally:
+            deadline_ns = self.stage.deadline_ns
+            self.due.at(self.stage.due_ns if deadline_ns is None else deadline_ns)
+
+    def publish(self, outputs: Iterable[Output]) -> None:
+        """Publish what the stage says, and log its events."""
+        for output in outputs:
+            port, publisher = self.outputs[output.topic]
+            if publisher is None:
+                continue
+            cdr = port.codec.encode(output.payload, WIRE)
+            if port.measured:
+                self.send(publisher, cdr, output.stamp_ns, self.sent_ns)
+            elif self.sent_ns is None or not self.is_stale(publisher.topic_name, self.sent_ns):
+                publisher.publish(cdr)
+        self.log_events()
+
+    def log_events(self) -> None:
+        """Write what the stage has to say to the log."""
+        while self.stage.events:
+            self.get_logger().info(self.stage.events.pop(0))
+
+    # --- all else
+
+    def look(self) -> None:
+        """Follow what other nodes publish."""
+        if self.stage.look(lambda topic: self.count_publishers(self.full_name(topic)) > 0):
+            self.connect()
+
+    def answer(self, action: Callable[[], str], request: Any, response: Any) -> Any:
+        """A service."""
+        response.message, response.success = action(), True
+        self.get_logger().info(response.message)
+        return response
+
+    def finish(self) -> None:
+        """What waits for a message that does not come."""
+        self.publish(self.stage.drain())
+
+    def time_jumped_back(self, topic: str) -> None:
+        """Start anew."""
+        self.stage.reset(topic)
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """The stage's own."""
+        found = self.stage.state(self.now_ns())
+        self.log_events()
+        return found
+
+    def close(self) -> None:
+        """Save the last state."""
+        try:
+            self.stage.save()
+        except BodyTrackingError as error:
+            self.get_logger().error(str(error))
+
+
+def host_of(executable: str) -> Callable[[], None]:
+    """What runs the node that hosts the stage of this name."""
+    hosted = stage_class(executable)
+
+    class Host(StageNode):
+        STAGE = hosted
+
+    return partial(run, Host)

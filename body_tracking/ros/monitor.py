@@ -1,0 +1,93 @@
+"""What a node counts and measures of its messages, for diagnostics."""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+
+import numpy as np
+
+from body_tracking.core.clocks import JUMP_BACK_NS
+from body_tracking.core.skeleton import NANOSECONDS
+
+GAP_NS = 50_000_000
+"""Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
+
+
+class Monitor:
+    """Counts what goes through a node, for its diagnostics."""
+
+    def __init__(self) -> None:
+        self.totals: Counter[str] = Counter()
+        self.last_reason = ""
+        self.failures: Counter[str] = Counter()
+        """Of each input and kind of error how many callbacks raised one that nobody expected."""
+        self._window: Counter[str] = Counter()
+        self._delays_ns: list[int] = []
+        self._latencies_ns: list[int] = []
+        self._looks = 0
+        self._last_stamp: dict[str, int] = {}
+        self._since = time.monotonic()
+
+    def arrived(self, topic: str) -> None:
+        """Count a message of an input."""
+        self._window[f"in {topic}"] += 1
+        self.totals["received"] += 1
+
+    def message_in(self, topic: str, stamp_ns: int) -> bool:
+        """Look at the stamp of a message of an input; True when time jumped back."""
+        last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
+        if last is None:
+            return False
+        step = stamp_ns - last
+        if step == 0:
+            self.totals["repeated stamps"] += 1
+        elif step < 0:
+            self.totals["stamps backwards"] += 1
+        elif step > GAP_NS:
+            self.totals["gaps"] += 1
+        return step < -JUMP_BACK_NS
+
+    def message_out(self, topic: str, delay_ns: int | None = None, latency_ns: int | None = None) -> None:
+        """Count a message of an output.
+
+        Args:
+            topic: its name.
+            delay_ns: since the input that it answers was sent: transport and processing.
+            latency_ns: since capture, by ROS time.
+        """
+        self._window[f"out {topic}"] += 1
+        self.totals["published"] += 1
+        if delay_ns is not None:
+            self._delays_ns.append(delay_ns)
+        # A sensor that counts from its own start tells nothing about how long ago that was.
+        if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
+            self._latencies_ns.append(latency_ns)
+
+    def wants_latency(self) -> bool:
+        """Whether to look at the clock for this message: a few a second will do, and looking takes its time."""
+        self._looks += 1
+        return self._looks <= 5
+
+    def values(self) -> dict[str, object]:
+        """Rates since the last call, and totals."""
+        now = time.monotonic()
+        elapsed, self._since = max(now - self._since, 1e-3), now
+        values: dict[str, object] = {
+            f"rate {name}": f"{count / elapsed:.1f}" for name, count in sorted(self._window.items())
+        }
+        self._window = Counter(dict.fromkeys(self._window, 0))
+        self._looks = 0
+        for name, samples in (("delay", self._delays_ns), ("latency", self._latencies_ns)):
+            if samples:
+                values[f"{name} median ms"] = f"{np.median(samples) / 1e6:.2f}"
+                values[f"{name} max ms"] = f"{max(samples) / 1e6:.2f}"
+                samples.clear()
+        values.update(self.totals)
+        values |= {f"raised {where}": count for where, count in self.failures.items()}
+        if self.last_reason:
+            values["last malformed"] = self.last_reason
+        return values

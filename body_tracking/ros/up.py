@@ -1,0 +1,519 @@
+"""``body_tracking up``: the graph as separate processes, kept alive, with one line that says how it is doing.
+
+Over 500 lines: the supervisor and the command; both go with the processes that it starts.
+"""
+
+# rclpy is only partly typed, and absent where there is no ROS.
+# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, NoReturn
+
+import yaml
+
+from body_tracking.core import names
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import SECTION, Value, to_ros
+from body_tracking.core.signals import signals_held
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.node_parameters import parameters_for
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.system import NodeSpec, Options
+from body_tracking.recording.rig import RigReader
+from body_tracking.robot.system import convention_of
+from body_tracking.ros import dds
+from body_tracking.systems import (
+    FLOW,
+    add_options,
+    all_nodes_for,
+    bodies_of,
+    is_source,
+    nodes_for,
+    options_from,
+    options_of,
+    subscribers,
+    with_file,
+)
+
+if TYPE_CHECKING:
+    from body_tracking.ros.graph_monitor import GraphMonitor
+
+BACKOFFS = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Seconds before a node that died is started again: at once, and later with each death soon after a start."""
+
+SETTLED = 10.0
+"""A node that has run for this long, seconds, is started again at once."""
+
+IN_FLIGHT = 0.3
+"""Angles that come sooner after the start of a node were on their way when its predecessor died, seconds."""
+
+LISTENERS_TIMEOUT = 30.0
+"""A source starts after this time even if somebody who should listen does not, seconds."""
+
+START_DELAY = 5.0
+"""Recordings in place of sensors begin this long after the start, in step, seconds; by then every node is there."""
+
+CANNOT_START = 2
+"""Exit code of a node that has said in one line why it cannot start."""
+
+STOP_TIMEOUT = 8.0
+"""Seconds for a node to end after it was asked to."""
+
+FINISH_TIMEOUT = 60.0
+"""After the end of a bag: seconds for a node to finish what it has been sent."""
+
+LINE_PERIOD = 5.0
+"""Seconds between status lines where stdout is no terminal."""
+
+_ROS_LOG = re.compile(r"^(?:\x1b\[[0-9;]*m)?\[(DEBUG|INFO|WARN|ERROR|FATAL)\]")
+_FAST_DDS = re.compile(r"RTPS_|\[[A-Z_]+ (?:Error|Warning)\]")
+
+
+class UpError(BodyTrackingError):
+    """The graph cannot be started as asked for."""
+
+
+# --- what to start
+
+
+def options_for(args: argparse.Namespace) -> Options:
+    """The graph that a command line, of ``up`` or of ``ros2 launch``, asks for.
+
+    Raises:
+        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already, the robot's
+            mapping is none or is about angles of another convention.
+    """
+    given = options_from(args)
+    topics: frozenset[str] = frozenset()
+    if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
+        raise UpError(f"{args.record}: exists already; a recording needs a new folder")
+    if args.external and args.bag is not None:
+        raise UpError("external: a bag is played in place of the sensors; give one of the two")
+    if args.bag is None:
+        if args.rate != 1.0:
+            raise UpError("rate is that of a bag; name the bag, too")
+    else:
+        if not 0.01 <= args.rate <= 100.0:
+            raise UpError(f"rate {args.rate:g}: expected 0.01 to 100")
+        with RigReader(args.bag) as reader:
+            topics = frozenset(reader.topics)
+            there = graph.sensors_among(reader.topics)
+        if not there:
+            raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
+        asked = given.get("sensors", there)
+        missing = [sensor for sensor in asked if sensor not in there] if isinstance(asked, tuple) else []
+        if missing:
+            raise UpError(
+                f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
+            )
+        given["sensors"] = asked
+    if args.robot is not None:
+        given["convention"] = convention_of(args.robot, args.convention or "")
+    given["namespace"] = names.check_namespace(args.namespace or "/")
+    options = with_file(options_of(**given), args.params_file)
+    imus = options["imus"]
+    if args.bag is not None and isinstance(imus, tuple):
+        options = {**options, "imu_topics": graph.played_imu_topics(imus, topics)}
+    return options
+
+
+def all_parameters(
+    options: Options,
+    specs: Sequence[NodeSpec],
+    file: Path | None,
+    defaults: Mapping[str, Mapping[str, Value]] | None = None,
+) -> dict[str, dict[str, Value]]:
+    """The parameters of every node; the file may be about every node that there can be.
+
+    Args:
+        options: the graph.
+        specs: its nodes.
+        file: a ROS parameters file, or None.
+        defaults: more defaults by node name.
+
+    Raises:
+        ParameterError: the file is none, is about a node that there cannot be, has unknown names or values that are not
+            allowed.
+        UpError: a sensor node has nothing to read: there is no bag, and the file does not say.
+    """
+    result = parameters_for(specs, file, defaults, all_nodes_for(options))
+    for spec in specs:
+        given = result[spec.name]
+        if (
+            spec.executable == "kinect_skeleton"
+            and not given.get("file")
+            and given.get("backend") in (None, "recording")
+        ):
+            raise UpError(
+                f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
+            )
+    for spec in specs:
+        if spec.executable == "bag_player":
+            count, played = subscribers(specs, result), result[spec.name]["topics"]
+            waited = (
+                [f"{topic}:{count[topic]}" for topic in played if topic in count] if isinstance(played, tuple) else []
+            )
+            result[spec.name]["wait_for_subscribers"] = tuple(waited)
+    return result
+
+
+# --- one process
+
+
+@dataclass(slots=True)
+class Child:
+    """A node's process.
+
+    Attributes:
+        spec: what it runs.
+        parameters: what it is told.
+        process: None while it is not running.
+        started: steady time of its last start, seconds.
+        restarts: how often it was started again.
+        deaths: how often in a row it died soon after its start.
+        died: steady time of its last death, seconds, while nobody has said that angles come again; else None.
+        due: steady time of the next start; None while it runs, or when it is not to run any more.
+        done: it has ended on purpose.
+    """
+
+    spec: NodeSpec
+    parameters: dict[str, Value]
+    process: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    restarts: int = 0
+    deaths: int = 0
+    died: float | None = None
+    due: float | None = field(default_factory=time.monotonic)
+    done: bool = False
+    reader: threading.Thread | None = None
+    last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=3))
+
+
+class Console:
+    """One status line at the bottom of a terminal, and lines above it; plain lines where there is no terminal."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stdout.isatty()
+        self._lock = threading.Lock()
+        self._status = ""
+        self._last = time.monotonic()
+
+    def line(self, text: str, *, error: bool = False) -> None:
+        """A line that stays."""
+        with self._lock:
+            if self._terminal and self._status:
+                print("\r\x1b[K", end="", flush=True)
+            print(text, file=sys.stderr if error else sys.stdout, flush=True)
+            self._draw()
+
+    def status(self, text: str) -> None:
+        """Replace the status line; without a terminal, print it every :data:`LINE_PERIOD`."""
+        with self._lock:
+            if self._terminal:
+                self._status = text
+                self._draw()
+            elif time.monotonic() - self._last >= LINE_PERIOD:
+                self._last = time.monotonic()
+                print(text, flush=True)
+
+    def end(self) -> None:
+        """Leave the status line as the last one."""
+        with self._lock:
+            if self._terminal and self._status:
+                print(flush=True)
+            self._status = ""
+
+    def _draw(self) -> None:
+        if self._terminal and self._status:
+            width = shutil.get_terminal_size().columns - 1
+            print(f"\r\x1b[K{self._status[:width]}", end="", flush=True)
+
+
+class Supervisor:
+    """Starts the nodes, starts those again that die, and leaves none behind.
+
+    Args:
+        options: the graph.
+        specs: its nodes.
+        parameters: of each node.
+        folder: for logs and parameters.
+    """
+
+    def __init__(
+        self,
+        options: Options,
+        specs: Sequence[NodeSpec],
+        parameters: Mapping[str, dict[str, Value]],
+        folder: Path,
+    ) -> None:
+        self.options = options
+        self.folder = folder
+        self.subscribers = subscribers(specs, parameters)
+        self.console = Console()
+        self.children = [Child(spec, dict(parameters[spec.name])) for spec in specs]
+        self.stopping = threading.Event()
+        self.failure = ""
+        self._bag_start_ns = 0
+        if options["bag"]:
+            with RigReader(str(options["bag"])) as reader:
+                self._bag_start_ns = reader.start_ns
+
+    def run(self, monitor: GraphMonitor) -> int:
+        """Until the bag ends, a signal comes or a node cannot start; the exit code."""
+        handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
+        begin = time.monotonic()
+        self.console.line(f"starting {', '.join(child.spec.name for child in self.children)}")
+        try:
+            while not self.stopping.wait(0.05):
+                if monitor.has_predecessor():
+                    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+                    self.failure = (
+                        f"another body_tracking up runs in ROS domain {domain} already, and the two would mix; "
+                        "end it, or give this one another ROS_DOMAIN_ID"
+                    )
+                    break
+                self._look_after(monitor)
+                self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
+                if any(child.done for child in self.children):
+                    self._finish()
+                    break
+        finally:
+            self._stop_all()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        self.console.end()
+        if self.failure:
+            self.console.line(f"body_tracking: {self.failure}", error=True)
+            return 2
+        self.console.line(monitor.summary(self.options, time.monotonic() - begin, self._restarts()))
+        self.console.line(f"logs: {self.folder}")
+        return 0
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.stopping.set()
+
+    def _restarts(self) -> dict[str, int]:
+        return {child.spec.name: child.restarts for child in self.children if child.restarts}
+
+    # --- starting
+
+    def _look_after(self, monitor: GraphMonitor) -> None:
+        now = time.monotonic()
+        for child in self.children:
+            if child.process is not None and child.process.poll() is not None:
+                self._ended(child, now, monitor)
+            if child.died is not None and child.process is not None and monitor.last_angles > child.started + IN_FLIGHT:
+                self.console.line(f"{child.spec.name} is back: angles {monitor.last_angles - child.died:.1f} s later")
+                child.died = None
+            if child.due is not None and now >= child.due and self._may_start(child, now, monitor):
+                self._start(child)
+
+    def _may_start(self, child: Child, now: float, monitor: GraphMonitor) -> bool:
+        """Whether everybody listens whom the node is to wait for; one who does not come holds nobody up forever."""
+        assert child.due is not None
+        if not is_source(child.spec):
+            return True
+        others = [other.spec.name for other in self.children if not is_source(other.spec)]
+        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(self.subscribers, others)
+
+    def _start(self, child: Child) -> None:
+        spec = child.spec
+        file = self.folder / f"{spec.name}.parameters.yaml"
+        values = {name: to_ros(value) for name, value in child.parameters.items()}
+        file.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
+        command = [sys.executable, "-m", "body_tracking.nodes", spec.executable, "--ros-args"]
+        command += ["-r", f"__node:={spec.name}", "-r", f"__ns:={spec.namespace}", "--params-file", str(file)]
+        for source, target in spec.remappings:
+            command += ["-r", f"{source}:={target}"]
+        environment = {
+            **os.environ,
+            graph.PARENT_VARIABLE: str(os.getpid()),
+            "ROS_LOG_DIR": str(self.folder / "ros"),
+            "RCUTILS_COLORIZED_OUTPUT": "0",
+            "PYTHONUNBUFFERED": "1",
+        }
+        # A group of its own: Ctrl-C in the terminal goes to us alone, and we end the nodes in order.
+        with signals_held():  # a node that is to end while it starts does so in order
+            child.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                process_group=0,
+            )
+        child.started, child.due = time.monotonic(), None
+        child.reader = threading.Thread(target=self._read, args=(child, child.process), daemon=True)
+        child.reader.start()
+
+    def _ended(self, child: Child, now: float, monitor: GraphMonitor) -> None:
+        assert child.process is not None
+        code, child.process = child.process.returncode, None
+        if child.reader is not None:
+            child.reader.join(timeout=1.0)
+        playing = child.spec.executable == "bag_player"
+        if playing and (code == 0 or (child.restarts and code == CANNOT_START)):
+            child.done = True
+            return
+        if code == CANNOT_START and child.restarts == 0:
+            self.failure = child.last_lines[-1] if child.last_lines else f"{child.spec.name} could not start"
+            self.stopping.set()
+            return
+        child.deaths = 1 if now - child.started > SETTLED else child.deaths + 1
+        child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
+        child.restarts += 1
+        child.died = now
+        if playing and monitor.clock_ns:
+            child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
+        how = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+        self.console.line(f"{child.spec.name} died ({how}); starting it again", error=True)
+
+    def _read(self, child: Child, process: subprocess.Popen[bytes]) -> None:
+        """Write a node's output to its log, and show what somebody should know."""
+        assert process.stdout is not None
+        with (self.folder / f"{child.spec.name}.log").open("a", encoding="utf-8") as log, process.stdout:
+            for raw in process.stdout:
+                text = raw.decode("utf-8", "replace").rstrip()
+                print(text, file=log, flush=True)
+                level = _ROS_LOG.match(text)
+                if not text or (level is not None and level[1] in ("DEBUG", "INFO")) or _FAST_DDS.search(text):
+                    continue
+                child.last_lines.append(text)
+                if not self.stopping.is_set() and not text.startswith(f"{child.spec.executable}: "):
+                    self.console.line(f"{child.spec.name}: {text}", error=True)
+
+    # --- ending
+
+    def _finish(self) -> None:
+        """The recording is played: end the nodes from source to angles, each of which finishes what it was sent.
+
+        However far one lags behind, what was played comes out.
+        """
+        for executable in FLOW:
+            running = [child for child in self.children if child.spec.executable == executable and child.process]
+            for child in running:
+                assert child.process is not None
+                child.process.send_signal(signal.SIGINT)
+            end = time.monotonic() + FINISH_TIMEOUT
+            while any(child.process is not None and child.process.poll() is None for child in running):
+                if self.stopping.wait(0.02):
+                    return
+                if time.monotonic() > end:
+                    self.console.line(f"{executable} did not finish in {FINISH_TIMEOUT:g} s", error=True)
+                    break
+
+    def _stop_all(self) -> None:
+        self.stopping.set()
+        recorders = [child for child in self.children if child.spec.executable == "bag_recorder"]
+        others = [child for child in self.children if child not in recorders]
+        for group in (others, recorders):  # the recorder last, so that it has everything
+            running = [child.process for child in group if child.process is not None]
+            for process in running:
+                with contextlib.suppress(ProcessLookupError):
+                    process.send_signal(signal.SIGINT)
+            end = time.monotonic() + STOP_TIMEOUT
+            for process in running:
+                try:
+                    process.wait(max(0.0, end - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+        for child in self.children:
+            if child.reader is not None:
+                child.reader.join(timeout=1.0)
+
+
+# --- command line
+
+
+def _log_folder(given: Path | None) -> Path:
+    """Where ROS keeps its logs (``ROS_LOG_DIR``, ``ROS_HOME/log``, ``~/.ros/log``), else a temporary folder."""
+    name = f"body_tracking_up_{datetime.now():%Y%m%d_%H%M%S}_{os.getpid()}"
+    home = os.environ.get("ROS_HOME")
+    base = given or Path(os.environ.get("ROS_LOG_DIR") or (Path(home) if home else Path.home() / ".ros") / "log")
+    try:
+        folder = base.expanduser() / name
+        folder.mkdir(parents=True)
+    except OSError as error:
+        if given is not None:
+            raise UpError(f"{given}: cannot write logs there ({error.strerror})") from error
+        return Path(tempfile.mkdtemp(prefix=f"{name}_"))
+    return folder
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``up`` to the ``body_tracking`` command."""
+    parser = subparsers.add_parser(
+        "up",
+        description="Start the graph as separate processes: the sensors (or a bag in their place), calibration, "
+        "fusion, filter, joint angles and, with --record, a recorder. A node that dies is started again. Ends with "
+        "Ctrl-C, or when the bag ends.",
+        epilog="Without --bag the parameters file says what each sensor node reads, under its name <sensor>_skeleton.",
+    )
+    add_options(parser)
+    parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
+    parser.set_defaults(run=run)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UpError(message.removeprefix("argument --"))  # launch has no dashes
+
+
+def arguments_from(words: Sequence[str]) -> argparse.Namespace:
+    """The options of ``body_tracking up`` in these words, for another program that starts the graph.
+
+    Raises:
+        UpError: an option has a value that it cannot have.
+    """
+    parser: argparse.ArgumentParser = _Parser()
+    add_parser(parser.add_subparsers())
+    return parser.parse_args(["up", *words])
+
+
+def run(args: argparse.Namespace) -> int:
+    """``body_tracking up``."""
+    options = options_for(args)
+    specs = nodes_for(options)
+    try:
+        from body_tracking.ros.graph_monitor import GraphMonitor
+    except ImportError as error:
+        raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
+    all_parameters(options, specs, args.params_file)  # what is wrong is reported before a folder is made
+    folder = _log_folder(args.log_dir)
+    dds.stay_on_this_machine()
+    dds.prepare()
+    defaults: dict[str, dict[str, Value]] = {
+        # A calibration node that is started again goes on from here.
+        "calibration": {"calibration_file": str(folder / "calibration.yaml")}
+    }
+    parameters = all_parameters(options, specs, args.params_file, defaults)
+    start = time.time() + START_DELAY
+    for spec in specs:
+        if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
+            parameters[spec.name]["start_time"] = start
+    bodies = bodies_of(options) or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),)
+    monitor = GraphMonitor(bodies, str(options["namespace"]))
+    try:
+        return Supervisor(options, specs, parameters, folder).run(monitor)
+    finally:
+        monitor.close()
