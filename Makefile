@@ -90,7 +90,7 @@ ros2-workspace: ## the real ros2 for test/ros2, where its sources are present
 bench: $(STAMP) ## every benchmark that can run here; fails at the end where one missed its bar (two hours)
 	$(BIN)/python benchmarks/run.py --all
 
-docs: $(STAMP) ## rewrite what the code defines: tables of README.md, config/
+docs: $(STAMP) ## rewrite what the code defines: tables of docs/reference.md, config/
 	$(BIN)/python docs/update.py
 
 clean: ## remove everything that make and colcon made

@@ -294,11 +294,13 @@ def show(table: Table, figures: Sequence[str]) -> None:
 DOCS = common.ROOT / "docs"
 _HEAD = """# How accurate it is
 
-Simulated people before two Kinect v2 sensors that err like real ones ([simulator.md](simulator.md) says how like), of
-whom everything is known. All methods get the same frames. Means over people with 95 % confidence intervals; errors in
-millimetres and degrees. What each column means is in the docstring of `benchmarks/accuracy.py`, which writes this page:
+Errors on simulated people, whose true motion is known, in front of two Kinect v2 sensors with realistic errors
+([simulator.md](simulator.md) compares them with real sensors). All methods get the same frames. Values are means over
+people with 95 % confidence intervals, in millimetres and degrees. `offsets alone` is a sensor whose only error is its
+joint-centre offsets, `one sensor` the first Kinect, `fused`, `default` and `ekf` are this package. The docstring of
+`benchmarks/accuracy.py` defines every column and error; it writes this page:
 
-    python benchmarks/accuracy.py --write
+    python benchmarks/run.py accuracy --write
 """
 
 
@@ -310,31 +312,31 @@ def page(parts: Mapping[str, Table]) -> str:
         lines += [
             f"## Every motion in layout 4, {_people(table)} people each",
             "",
-            f"The simulator was calibrated with {', '.join(KNOWN)}, and with other people.",
-            "The thesis calibrates in a T-pose, its EKF starts from one and takes the base of the spine to stand",
-            "still, which it does not where people walk or squat. Motions that begin without a T-pose: "
+            f"The simulator was calibrated with other people, in {', '.join(KNOWN)}.",
+            "The thesis calibrates in a T-pose. Its EKF starts from one and assumes that the base of the spine does",
+            "not move, which is wrong when people walk or squat. Motions that begin without a T-pose: "
             f"{', '.join(_unposed(table)) or 'none'}.",
             "",
         ]
         for figure, title in _TITLES.items():
             lines += [f"### {title}", "", *_markdown(table, figure), ""]
-        lines += ["### Ratios of the default to the thesis, without constant offsets", "", *_ratios(table), ""]
+        lines += ["### Ratios of errors without constant offsets: this package to the thesis", "", *_ratios(table), ""]
     if "layouts" in parts:
         lines += [
             "## Layouts",
             "",
-            "Mean 3D error of the default pipeline by the layout of table 5.1 of Schlagenhauf (2017); the best of each",
-            "motion is framed.",
+            "Mean 3D error of the default pipeline in the layouts of table 5.1 of Schlagenhauf (2017). A frame marks",
+            "the best layout of each motion.",
             "",
             "![error by motion and layout](accuracy_layouts.svg)",
             "",
         ]
     if "sensitivity" in parts:
         lines += [
-            "## Other sensors than these",
+            "## Sensitivity to the simulated sensors",
             "",
-            "Every parameter of the simulator at half and at double; mean error without constant offsets over the",
-            "torso twist and reaching. Where a parameter is at a bound of its range, the change is smaller.",
+            "Mean error without constant offsets over the torso twist and reaching, with each parameter of the",
+            "simulator halved and doubled. The change is smaller where a parameter reaches a bound of its range.",
             "",
             *_markdown(parts["sensitivity"], "fixed"),
             "",
@@ -345,12 +347,12 @@ def page(parts: Mapping[str, Table]) -> str:
 _TITLES = {
     "error": "Mean 3D error, mm",
     "fixed": "Mean 3D error without each joint's constant offset, mm",
-    "hidden": "The same where a joint is hidden from a sensor, mm",
+    "hidden": "Mean 3D error without constant offsets of joints that are hidden from a sensor, mm",
     "elevation": "Shoulder elevation, RMSE in degrees",
     "elbow": "Elbow flexion, RMSE in degrees",
-    "covered_elevation": "Shoulder elevation: share of frames within 1.96 stated standard deviations",
-    "covered_elbow": "Elbow flexion: the same",
-    "delay": "Delay by the stamps, ms (what a method waits for is not in it)",
+    "covered_elevation": "Shoulder elevation: share of errors within 1.96 standard deviations",
+    "covered_elbow": "Elbow flexion: share of errors within 1.96 standard deviations",
+    "delay": "Delay by the stamps, ms (without the time that a method waits)",
 }
 
 

@@ -363,14 +363,15 @@ def show_4_4(tables: dict[str, dict[str, list[list[float]]]]) -> None:
 
 PAGE = common.ROOT / "docs" / "simulator.md"
 PAIRS = "## Real and simulated pairs"
-_HEAD = """# How like real sensors the simulated ones are
+_HEAD = """# How realistic the simulated sensors are
 
-The simulated Kinect v2 (`body_tracking/kinect/simulated_sensor.py`, its parameters in `config/simulator.yaml`) was set
-before any of our filters was judged by it: noise, drops, flips and the pose-dependent errors from recordings of real
-pairs, the offsets between a Kinect's joint centres and an anatomist's from table E.1 of Schlagenhauf (2017). Written by
+The simulated Kinect v2 (`body_tracking/kinect/simulated_sensor.py`, parameters in `config/simulator.yaml`) was tuned
+before any of our filters was evaluated with it. Noise, drops, flips and pose-dependent errors are tuned to recordings
+of real pairs of sensors, the offsets between a Kinect's joint centres and the anatomical ones to table E.1 of
+Schlagenhauf (2017). Two benchmarks write this page:
 
-    python benchmarks/calibrate_simulator.py --write
-    python benchmarks/simulated_pairs.py --write
+    python benchmarks/run.py calibrate_simulator --write
+    python benchmarks/run.py simulated_pairs --write
 """
 
 
@@ -380,8 +381,8 @@ def write_page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]],
         _HEAD,
         "## Table E.1",
         "",
-        f"Mean absolute error of LKF2 in layout 4, mm: the median of {count} simulated subjects, and the thesis's in",
-        "brackets. Bold is what is off by more than 25 %.",
+        f"Mean absolute error of the thesis's LKF2 in layout 4, mm: the median of {count} simulated subjects, and in",
+        "brackets the thesis's value. Bold values differ by more than 25 %.",
         "",
         "| joint | x | y | z |",
         "|---|---:|---:|---:|",
@@ -396,8 +397,8 @@ def write_page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]],
         "",
         "## Table 4.4",
         "",
-        "RMSE of joint angles before one sensor against the yaw of the person, degrees: simulated subjects, and the",
-        "one of the thesis in brackets (LE, RE: left and right elbow; LS, RS: shoulders). Others report 3D errors of "
+        "RMSE of joint angles from one sensor by the yaw of the person, degrees: simulated subjects, and in brackets",
+        "the one of the thesis (LE, RE: left and right elbow; LS, RS: shoulders). Other authors report 3D errors of "
         f"{JOINT_ERROR[0]:.0f} to {JOINT_ERROR[1]:.0f} mm.",
         "",
         f"| | {' | '.join(f'{yaw}°' for yaw in YAWS)} |",

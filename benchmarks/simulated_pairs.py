@@ -436,12 +436,12 @@ def section(rows: Sequence[Row]) -> str:
     lines = [
         PAIRS,
         "",
-        "Three people before two Kinect v2 sensors in each of three layouts, who stand still, step to and fro and walk",
-        "about, and as many simulated people who do much the same before sensors at the same places; both calibrated",
-        "alike. Medians over the three recordings of a layout, with their range in brackets. A row is marked where the",
-        f"simulated figure is off by more than a half of the real one: {marked} of {len(rows)}. What happens rarely,",
-        "such as bodies that are turned round, differs between three people by chance. How each statistic is defined",
-        "stands in `benchmarks/simulated_pairs.py`, which writes this section.",
+        "Three people stand still, step back and forth and walk about in front of two Kinect v2 sensors in each of",
+        "three layouts. As many simulated people move similarly in front of simulated sensors at the same places; both",
+        "are calibrated by the same method. Values are medians over the three recordings of a layout, with their range",
+        "in brackets. `differs` marks rows in which the simulated value differs by more than half of the real one:",
+        f"{marked} of {len(rows)}. Rare events, such as bodies with front and back swapped, differ between three",
+        "people by chance. `benchmarks/simulated_pairs.py` defines each statistic and writes this section.",
     ]
     for layout in dict.fromkeys(row.layout for row in rows):
         lines += ["", f"### {layout}", "", "| statistic | unit | real | simulated | |", "|---|---|---:|---:|---|"]

@@ -1,4 +1,4 @@
-"""Write what the code defines: the tables of README.md and benchmarks/README.md, and the files in config/.
+"""Write what the code defines: the tables of docs/reference.md and benchmarks/README.md, and the files in config/.
 
 With ``--check`` it only says whether they are up to date.
 """
@@ -12,14 +12,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from body_tracking import cli, systems
-from body_tracking.core.parameters import Value
+from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import Qos
 from body_tracking.kinect import simulated as kinect
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.pipeline.roles import ROLES
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
+REFERENCE = ROOT / "docs" / "reference.md"
 CONFIG = ROOT / "config" / "body_tracking.yaml"
 SIMULATOR = ROOT / "config" / "simulator.yaml"
 BENCHMARKS = ROOT / "benchmarks" / "README.md"
@@ -37,6 +37,16 @@ SIMULATOR_HEADER = """\
 # How much a simulated Kinect v2 errs. Written by `make docs` from the code; copy it, keep what you change:
 #   body_tracking simulate --config my_errors.yaml -o bag
 """
+GROUPS = {
+    "Angles and commands": ("joint_angles", "robot_commands"),
+    "The filtered person": ("skeleton_filter",),
+    "Sensors": ("kinect_skeleton", "skeleton_adapter", "imu_skeleton"),
+    "Calibration and fusion": ("calibration", "fusion"),
+    "Recordings": ("bag_player", "bag_recorder"),
+    "Views": ("body_markers", "viewer"),
+    "Diagnostics": ("every node",),
+}
+"""Heading -> the nodes whose topics stand below it, in the order in which a user looks for them."""
 SECTION = re.compile(r"(<!-- (\w+): written by make docs -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
 
 
@@ -58,18 +68,28 @@ def _qos(qos: Qos) -> str:
 
 
 def topics() -> str:
-    """Every topic of the graph."""
-    rows = [
-        (
-            f"`{topic.name}`",
-            f"`{topic.type_name.replace('/msg/', '/')}`",
-            _qos(topic.qos),
-            topic.publisher,
-            topic.content,
+    """Every topic of the graph, in a table per group of publishers."""
+    ungrouped = {topic.publisher for topic in systems.TOPICS} - {name for group in GROUPS.values() for name in group}
+    if ungrouped:
+        raise SystemExit(
+            f"GROUPS in {Path(__file__).name} has no place for the topics of {', '.join(sorted(ungrouped))}"
         )
-        for topic in systems.TOPICS
-    ]
-    return table(("topic", "type", "QoS", "from", "content"), rows)
+    parts = []
+    for heading, publishers in GROUPS.items():
+        rows = [
+            (
+                f"`{topic.name}`",
+                f"`{topic.type_name.replace('/msg/', '/')}`",
+                _qos(topic.qos),
+                topic.publisher,
+                topic.content,
+            )
+            for topic in systems.TOPICS
+            if topic.publisher in publishers
+        ]
+        if rows:
+            parts.append(f"### {heading}\n\n" + table(("topic", "type", "QoS", "from", "content"), rows))
+    return "\n".join(parts)
 
 
 def services() -> str:
@@ -105,15 +125,26 @@ def _default(value: Value) -> str:
     return f"`{value}`" if value != "" else '`""`'
 
 
+def _row(item: Parameter) -> tuple[str, ...]:
+    return (f"`{item.name}`{' *' * item.live}", _default(item.default), item.unit, item.constraint, item.doc)
+
+
 def parameters() -> str:
-    """The parameters of every node."""
-    parts = []
-    for executable in systems.EXECUTABLES:
-        rows = [
-            (f"`{item.name}`{' *' * item.live}", _default(item.default), item.unit, item.constraint, item.doc)
-            for item in systems.parameters_of(executable)
-        ]
-        parts.append(f"### {executable}\n\n" + table(("parameter", "default", "unit", "allowed", "meaning"), rows))
+    """The parameters of every node; those that are the same in several nodes stand in the first table only."""
+    titles = ("parameter", "default", "unit", "allowed", "meaning")
+    of_node = {executable: systems.parameters_of(executable) for executable in systems.EXECUTABLES}
+    nodes_of: dict[Parameter, list[str]] = {}
+    for executable, items in of_node.items():
+        for item in items:
+            nodes_of.setdefault(item, []).append(executable)
+    common = {item: nodes for item, nodes in nodes_of.items() if len(nodes) > 1}
+    rows = [(*_row(item), ", ".join(nodes)) for item, nodes in common.items()]
+    parts = ["### Several nodes\n\n" + table((*titles, "nodes"), rows)]
+    for executable, items in of_node.items():
+        own = table(titles, [_row(item) for item in items if item not in common])
+        shared = ", ".join(f"`{item.name}`" for item in items if item in common)
+        more = f"\nAlso, as in [several nodes](#several-nodes): {shared}.\n" if shared else ""
+        parts.append(f"### {executable}\n\n{own}{more}")
     return "\n".join(parts)
 
 
@@ -147,12 +178,12 @@ WRITERS = {
 }
 
 
-def readme() -> str:
-    """The text of README.md with its tables as the code defines them now."""
-    text = README.read_text(encoding="utf-8")
+def reference() -> str:
+    """The text of docs/reference.md with its tables as the code defines them now."""
+    text = REFERENCE.read_text(encoding="utf-8")
     missing = WRITERS.keys() - {match[2] for match in SECTION.finditer(text)}
     if missing:
-        raise SystemExit(f"{README.name} has no place for {', '.join(sorted(missing))}")
+        raise SystemExit(f"{REFERENCE.name} has no place for {', '.join(sorted(missing))}")
     return SECTION.sub(lambda match: f"{match[1]}{WRITERS[match[2]]()}{match[3]}", text)
 
 
@@ -167,7 +198,7 @@ def benchmarks() -> str:
 def files() -> dict[Path, str]:
     """The text of each file as the code defines it now."""
     simulator = f"{SIMULATOR_HEADER}\n{kinect.errors_as_yaml()}"
-    return {README: readme(), CONFIG: systems.config_text(), SIMULATOR: simulator, BENCHMARKS: benchmarks()}
+    return {REFERENCE: reference(), CONFIG: systems.config_text(), SIMULATOR: simulator, BENCHMARKS: benchmarks()}
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""The pages in ``docs/``: every command in them runs, or says at its top why not.
+"""README.md and the pages in ``docs/``: every command in them runs, or says at its top why not.
 
 The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of the
 repository (and nothing of the page before), and must all end with exit code 0. A block that needs a device, ROS's own
@@ -24,7 +24,7 @@ from domains import domain
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 MARK = re.compile(r"# (needs hardware|needs ROS|takes long): \S")
 FILE = re.compile(r"# ([\w-]+\.\w+)\n")

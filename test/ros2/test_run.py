@@ -1,4 +1,4 @@
-"""``ros2 run`` of every node at once, and every service of README.md, as somebody types them."""
+"""``ros2 run`` of every node at once, and every service of docs/reference.md, as somebody types them."""
 
 from __future__ import annotations
 
