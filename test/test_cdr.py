@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from body_tracking.core import so3
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import IMAGE, IMU, SEGMENTS
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import MAX_STAMP_NS, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import IMAGE, IMU, SEGMENTS, MessageError
+from body_tracking.messages.base import MessageError
 from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
 from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.model import (

@@ -15,19 +15,12 @@ from scipy.spatial.transform import Rotation
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.imu import ImuSample, ImuSampleError
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import FLOAT_ARRAY, JOINT_TRAJECTORY, MARKERS, SEGMENTS
 from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
-from body_tracking.messages.base import (
-    FLOAT_ARRAY,
-    JOINT_TRAJECTORY,
-    MARKERS,
-    SEGMENTS,
-    MessageError,
-    MessageTypes,
-    RosMessages,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state

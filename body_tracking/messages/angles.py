@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import JOINT_STATE, MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 
 def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:

@@ -11,51 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import (
-    CLOCK as CLOCK,
-)
-from body_tracking.core.message_types import (
-    DIAGNOSTICS as DIAGNOSTICS,
-)
-from body_tracking.core.message_types import (
-    FLOAT_ARRAY as FLOAT_ARRAY,
-)
-from body_tracking.core.message_types import (
-    IMAGE as IMAGE,
-)
-from body_tracking.core.message_types import (
-    IMU as IMU,
-)
-from body_tracking.core.message_types import (
-    JOINT_STATE as JOINT_STATE,
-)
-from body_tracking.core.message_types import (
-    JOINT_TRAJECTORY as JOINT_TRAJECTORY,
-)
-from body_tracking.core.message_types import (
-    MAGNETIC_FIELD as MAGNETIC_FIELD,
-)
-from body_tracking.core.message_types import (
-    MARKERS as MARKERS,
-)
-from body_tracking.core.message_types import (
-    POINT_CLOUD as POINT_CLOUD,
-)
-from body_tracking.core.message_types import (
-    SEGMENTS as SEGMENTS,
-)
-from body_tracking.core.message_types import (
-    STRING as STRING,
-)
-from body_tracking.core.message_types import (
-    TF as TF,
-)
-from body_tracking.core.message_types import (
-    TIME_REFERENCE as TIME_REFERENCE,
-)
-from body_tracking.core.message_types import (
-    TRANSFORM as TRANSFORM,
-)
 from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
 
 

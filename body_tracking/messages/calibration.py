@@ -7,17 +7,10 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.message_types import TIME_REFERENCE, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
-from body_tracking.messages.base import (
-    TIME_REFERENCE,
-    TRANSFORM,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-    to_time,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_time
 
 
 def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:

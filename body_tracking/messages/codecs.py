@@ -14,10 +14,7 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.joint_angles import JointAngles
-from body_tracking.core.orientation import SegmentOrientation
-from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import FloatArray, Skeleton
-from body_tracking.messages.base import (
+from body_tracking.core.message_types import (
     IMAGE,
     IMU,
     JOINT_STATE,
@@ -27,9 +24,11 @@ from body_tracking.messages.base import (
     TF,
     TIME_REFERENCE,
     TRANSFORM,
-    MessageTypes,
-    to_header,
 )
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.messages.base import MessageTypes, to_header
 from body_tracking.messages.calibration import (
     clock_to_time_reference,
     pose_to_transform,

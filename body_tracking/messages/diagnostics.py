@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from body_tracking.messages.base import DIAGNOSTICS, MessageTypes, RosMessages, to_header
+from body_tracking.core.message_types import DIAGNOSTICS
+from body_tracking.messages.base import MessageTypes, RosMessages, to_header
 from body_tracking.messages.node_status import NodeStatus
 
 MAX_VALUES, MAX_TEXT = 500, 1000

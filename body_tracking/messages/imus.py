@@ -8,17 +8,10 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.imu import ImuSample, check_magnetic_field
+from body_tracking.core.message_types import IMU, MAGNETIC_FIELD
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import (
-    IMU,
-    MAGNETIC_FIELD,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-    to_vector,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_vector
 
 
 def imu_to_message(

@@ -9,16 +9,9 @@ import numpy as np
 
 from body_tracking.core.body_model import BodyModel
 from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.message_types import IMAGE, JOINT_STATE, SEGMENTS
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import (
-    IMAGE,
-    JOINT_STATE,
-    SEGMENTS,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from body_tracking.core.message_types import FLOAT_ARRAY, JOINT_TRAJECTORY
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.messages.base import FLOAT_ARRAY, JOINT_TRAJECTORY, MessageTypes, to_header
+from body_tracking.messages.base import MessageTypes, to_header
 
 
 def command_to_trajectory(

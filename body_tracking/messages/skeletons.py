@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
-from body_tracking.messages.base import POINT_CLOUD, MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 # sensor_msgs/PointField datatypes
 _UINT8, _UINT16, _FLOAT32 = 2, 4, 7

@@ -18,9 +18,10 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from running import environment  # noqa: E402
 from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
 
+from body_tracking.core.message_types import IMU, POINT_CLOUD  # noqa: E402
 from body_tracking.core.qos import RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.core.skeleton import N_JOINTS, Skeleton  # noqa: E402
-from body_tracking.messages.base import IMU, POINT_CLOUD, RosMessages  # noqa: E402
+from body_tracking.messages.base import RosMessages  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
 from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, live  # noqa: E402

@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy")
 from running import environment
 
+from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field

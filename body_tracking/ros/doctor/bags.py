@@ -7,7 +7,7 @@ from pathlib import Path
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.messages.base import IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
 from body_tracking.recording.info import bag_info
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding

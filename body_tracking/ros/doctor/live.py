@@ -20,9 +20,10 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from body_tracking.core import names
+from body_tracking.core.message_types import IMU, POINT_CLOUD, SEGMENTS
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.kinect.ros_time import OTHER_CLOCK_NS
-from body_tracking.messages.base import IMU, POINT_CLOUD, SEGMENTS, MessageError, to_nanoseconds
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.skeletons import cloud_to_skeletons
