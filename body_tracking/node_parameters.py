@@ -45,7 +45,7 @@ def parameters_for(
     tables = {name: {item.name: item for item in parameters_of(spec.executable)} for name, spec in possible.items()}
     sections = read_file(file)
     for pattern, values in sections.items():
-        about = [spec for spec in possible.values() if spec.meant_by(pattern)]
+        about = [spec for spec in possible.values() if spec.in_section(pattern)]
         if not about:
             there = ", ".join(spec.full_name for spec in possible.values())
             raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
@@ -57,7 +57,7 @@ def parameters_for(
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
         for pattern, values in in_order(sections):
-            if spec.meant_by(pattern):
+            if spec.in_section(pattern):
                 wildcard = is_wildcard(pattern)
                 given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
         given |= spec.parameters

@@ -166,7 +166,7 @@ def with_file(options: Options, file: Path | None) -> Options:
             if isinstance(value, list):
                 value = tuple(entry for entry in value if isinstance(entry, str) and entry)
             # What has another type is refused by whoever checks the parameters.
-            if type(value) is type(option.default) and NodeSpec(node, node, str(options["namespace"])).meant_by(
+            if type(value) is type(option.default) and NodeSpec(node, node, str(options["namespace"])).in_section(
                 pattern
             ):
                 found[option.name] = value
@@ -216,7 +216,7 @@ def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     more = {
         **options,
         "record": "recording",
-        "imus": options["imus"] or graph.SOME_IMUS,
+        "imus": options["imus"] or graph.EXAMPLE_IMUS,
         "robot": options["robot"] or "robot.yaml",
         "viewer": True,
         "markers": True,

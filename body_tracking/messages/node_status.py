@@ -37,14 +37,14 @@ class NodeStatus:
             return None
 
 
-MOST = 64
+MAX_NODES = 64
 """Nodes of which a status is kept: a graph has some twenty."""
 
 
-def note_statuses(known: dict[str, NodeStatus], told: Iterable[NodeStatus]) -> None:
+def update_statuses(known: dict[str, NodeStatus], told: Iterable[NodeStatus]) -> None:
     """Keep the newest status of each node, in place; of too many nodes those that were heard last."""
     for status in told:
         known.pop(status.node, None)
         known[status.node] = status
-        if len(known) > MOST:
+        if len(known) > MAX_NODES:
             del known[next(iter(known))]

@@ -74,14 +74,14 @@ class BodyMarkers(GraphNode):
         self.output = self.make_publisher(MarkerArray, graph.markers_topic(self.body), to_profile(RELIABLE))
         sources = {graph.FUSED: "fused", graph.FILTERED: "filtered", **{graph.skeleton_topic(s): s for s in sensors}}
         for topic, name in sources.items():
-            self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
+            self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
         model = UpperBody()
         self.framed = {"segments": model.segment_names, "root": model.segment_names[:1], "none": ()}[given["tf"]]
         if TFMessage is not None and self.framed:
             self.tf = self.make_publisher(TFMessage, graph.TF, to_profile(RELIABLE))
             segments = graph.segments_topic(self.body)
-            self.listen(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
+            self.subscribe(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
         self.create_timer(1.0 / given["rate"], self.publish, clock=STEADY)
 
     def on_skeletons(self, topic: str, name: str, message: Any, sent_ns: int) -> None:

@@ -71,7 +71,7 @@ class KinectSkeleton(GraphNode):
         """Open the source; a thread of its own waits for its frames."""
         given: dict[str, Any] = dict(self.values)
         self.failure = ""
-        self.untold: dict[str, str] = {}
+        self.source_errors: dict[str, str] = {}
         sensor = check_sensor_name(given["sensor"])
         settings = SourceSettings(
             sensor,
@@ -125,25 +125,25 @@ class KinectSkeleton(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether it plays, ended or failed, or what keeps frames from coming."""
-        problem = self.told("problem", "")
+        problem = self.source_value("problem", "")
         if problem:
-            self.log_seldom("problem", problem, _PROBLEM_PERIOD_S)
-        text = self.failure or problem or ("ended" if self.told("ended", False) else "streaming")
-        counters = dict(self.told("counters", {}))
+            self.log_throttled("problem", problem, _PROBLEM_PERIOD_S)
+        text = self.failure or problem or ("ended" if self.source_value("ended", False) else "streaming")
+        counters = dict(self.source_value("counters", {}))
         return (
-            (2 if self.failure else 1 if problem or self.untold else 0),
-            "; ".join([text, *self.untold.values()]),
+            (2 if self.failure else 1 if problem or self.source_errors else 0),
+            "; ".join([text, *self.source_errors.values()]),
             counters,
         )
 
-    def told(self, name: str, otherwise: Any) -> Any:
+    def source_value(self, name: str, otherwise: Any) -> Any:
         """What the source says of itself; where it raises, that is told for as long as it does, and frames go on."""
-        self.untold.pop(name, None)
+        self.source_errors.pop(name, None)
         try:
             return getattr(self.source, name)
         except Exception as error:
-            self.untold[name] = f"{name}: {described(error)}"
-            self.log_seldom(name, f"{self.untold[name]}\n{traceback.format_exc()}", _PROBLEM_PERIOD_S)
+            self.source_errors[name] = f"{name}: {described(error)}"
+            self.log_throttled(name, f"{self.source_errors[name]}\n{traceback.format_exc()}", _PROBLEM_PERIOD_S)
             return otherwise
 
     def close(self) -> None:

@@ -89,20 +89,20 @@ class RobotCommands(GraphNode):
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
         angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
         for topic in angles:
-            self.listen(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
+            self.subscribe(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
         for sensor in self.sensors:
-            self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
-        self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
+            self.subscribe_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
+        self.subscribe(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
         if output.state_topic:
-            self.listen(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot, absolute=True)
+            self.subscribe(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot, absolute=True)
         enable = self.create_service(Trigger, "~/enable", self.on_enable)
         if not self.follower.enabled:
             self.get_logger().warning(
                 f"waits for a person: without a state_topic nobody says where {self.mapping.robot} stands. Once it "
                 f"stands at home: ros2 service call {enable.service_name} std_srvs/srv/Trigger"
             )
-        self.create_timer(1.0 / float(str(self.values["rate"])), self.tell_robot, clock=STEADY)
+        self.create_timer(1.0 / float(str(self.values["rate"])), self.publish_command, clock=STEADY)
 
     def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
         """Angles, or their standard deviations; both of one stamp go on."""
@@ -124,7 +124,7 @@ class RobotCommands(GraphNode):
                 raise
             convention = str(values.header.frame_id)
             if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
-                self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
             self.monitor.totals["unpaired"] += 1
@@ -177,7 +177,7 @@ class RobotCommands(GraphNode):
         self.waiting.clear()
         self.follower.time_jumped_back()
 
-    def tell_robot(self) -> None:
+    def publish_command(self) -> None:
         """One command, or none."""
         now_ns = self.now_ns()
         self.follower.hear_publishers(self.others())

@@ -56,19 +56,19 @@ class SkeletonAdapter(GraphNode):
         self.frame_id = optical_frame(sensor)
         self.joint_state = TrackingState[given["state"].upper()]
         self.topic: str = self.resolve_topic_name(given["topic"])
-        self.heard: float | None = None
+        self.last_received: float | None = None
         self.ros_time = RosTime()
         self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
-        self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
+        self.subscribe(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:
         """Publish the bodies of one message; nobody in view is no message."""
-        self.heard = time.monotonic()
+        self.last_received = time.monotonic()
         if not message.markers:
             return
         stamp_ns, ids, points = markers_to_points(message)
         if self.monitor.message_in(self.topic, stamp_ns):
-            self.log_seldom("jump", f"{self.topic}: time jumped back", period_s=1.0)
+            self.log_throttled("jump", f"{self.topic}: time jumped back", period_s=1.0)
         stamp_ns = self.ros_time.stamp(stamp_ns, self.arrived_ns)
         skeletons = bodies_of(ids, points, stamp_ns, self.frame_id, self.joint_state)
         if skeletons:
@@ -76,9 +76,9 @@ class SkeletonAdapter(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Whether messages come."""
-        if self.heard is None:
+        if self.last_received is None:
             return 1, f"no message on {self.topic} yet", {}
-        silent = time.monotonic() - self.heard
+        silent = time.monotonic() - self.last_received
         return (1, f"no message on {self.topic} for {silent:.0f} s", {}) if silent > SILENCE else (0, "streaming", {})
 
 

@@ -41,7 +41,7 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
-from body_tracking.messages.node_status import NodeStatus, note_statuses
+from body_tracking.messages.node_status import NodeStatus, update_statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES
@@ -108,13 +108,13 @@ class ViewerNode(GraphNode):
         }
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
-            self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+            self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
         self.codecs = {layer.topic: load(layer.codec)() for layer in systems.LAYERS}
         for topic, codec in self.codecs.items():
             kind = message_class(codec.type_name)
-            self.listen(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
-        self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
+            self.subscribe(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
+        self.subscribe(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
         self.of_body: list[Any] = []
         self.body = ""
         self.choose_body(graph.check_body(given["body"]))
@@ -166,7 +166,7 @@ class ViewerNode(GraphNode):
     def on_diagnostics(self, message: Any, sent_ns: int) -> None:
         """What a node says of itself."""
         statuses_now = dict(self.statuses)  # the other thread reads them
-        note_statuses(statuses_now, statuses(message, time.monotonic(), self.get_namespace()))
+        update_statuses(statuses_now, statuses(message, time.monotonic(), self.get_namespace()))
         self.statuses = statuses_now
 
     # --- drawing, in a thread of its own
@@ -178,7 +178,7 @@ class ViewerNode(GraphNode):
         ("deque mutated during iteration"), and the next drawing shows what that one would have.
         """
         rest, failed = 1.0 / float(str(self.values["rate"])), 0
-        self.plotted = self.told = 0.0
+        self.plotted = self.status_drawn = 0.0
         while not self.ended.wait(rest):
             if not self.page.watched:
                 continue
@@ -196,7 +196,7 @@ class ViewerNode(GraphNode):
                     self.get_logger().fatal(f"drawing failed {failed} times: {traceback.format_exc()}")
                     self.context.try_shutdown()
                     return
-                self.log_seldom("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
+                self.log_throttled("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
             spent = time.monotonic() - begin
             self.drawing_s += spent
             rest = max(1.0 / float(str(self.values["rate"])) - spent, spent * (1.0 / _SHARE - 1.0))
@@ -208,8 +208,8 @@ class ViewerNode(GraphNode):
             self.plotted = now
             self.collect_angles()
             self.page.draw_curves(self.history)
-        if now - self.told >= 1.0:
-            self.told = now
+        if now - self.status_drawn >= 1.0:
+            self.status_drawn = now
             self.page.draw_status(self.statuses, now)
             self.page.draw_bodies(self.bodies(), self.body)
 
@@ -321,17 +321,17 @@ class ViewerNode(GraphNode):
         qos = to_profile(LATEST)
         segments = graph.segments_topic(name)
         self.of_body = [
-            self.listen(
+            self.subscribe(
                 graph.joint_states_topic(name), JointState, qos, lambda cdr, _: self.angles.append(cdr), raw=True
             ),
-            self.listen(
+            self.subscribe(
                 graph.joint_states_stddev_topic(name),
                 JointState,
                 qos,
                 lambda cdr, _: self.stddevs.append(cdr),
                 raw=True,
             ),
-            self.listen(segments, MultiDOFJointState, qos, partial(self.on_latest, segments), raw=True),
+            self.subscribe(segments, MultiDOFJointState, qos, partial(self.on_latest, segments), raw=True),
         ]
         return f"angles of {name}"
 

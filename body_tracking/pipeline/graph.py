@@ -53,7 +53,7 @@ RESET_SERVICE = "calibration/reset"
 ALIGN_SERVICE = "imu_skeleton/align"
 DEFAULT_SENSORS = ("kinect1", "kinect2")
 DEFAULT_BODY = "body1"
-SOME_IMUS = ("forearm_left", "forearm_right")
+EXAMPLE_IMUS = ("forearm_left", "forearm_right")
 """Segments of which wrist-worn inertial sensors tell."""
 
 

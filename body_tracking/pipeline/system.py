@@ -133,7 +133,7 @@ class NodeSpec:
         """As in a parameters file: ``/fusion``."""
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
-    def meant_by(self, section: str) -> bool:
+    def in_section(self, section: str) -> bool:
         """Whether a section of a parameters file is about this node; one file serves in every namespace."""
         return matches(section, self.full_name) or matches(section, f"/{self.name}")
 

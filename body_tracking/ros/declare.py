@@ -36,7 +36,7 @@ def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
     overrides: dict[str, RosParameter] = node._parameter_overrides
     known = {parameter.name: parameter for parameter in table}
     given = {name: item.value for name, item in overrides.items() if not is_ros_own(name)}
-    for name in _meant_for_others(node, given.keys() - known.keys()):
+    for name in _of_other_nodes(node, given.keys() - known.keys()):
         del given[name]
     values = check_all(table, given)
     for name, value in values.items():
@@ -47,7 +47,7 @@ def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
     return MappingProxyType(values)
 
 
-def _meant_for_others(node: Node, unknown: Set[str]) -> Set[str]:
+def _of_other_nodes(node: Node, unknown: Set[str]) -> Set[str]:
     """Unknown names that a wildcard section of a parameters file gives to all nodes, and that some node knows."""
     shared: set[str] = set()
     for file in parameter_files() if unknown else ():

@@ -30,26 +30,26 @@ _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
 @runtime_checkable
-class TakesTogether(Protocol):
+class HandlesBatches(Protocol):
     """A node that only notes messages as they are handed over, and then works on all that have come."""
 
-    def messages_taken(self) -> None:
+    def batch_done(self) -> None:
         """Called after the last callback of all the messages that were there."""
 
 
 @runtime_checkable
-class LeavesOut(Protocol):
+class DropsMessages(Protocol):
     """A node that does not handle all that has come."""
 
-    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
         """Those of the messages, each with its subscription, that are to be handled, in the same order."""
 
-    def messages_handled(self) -> None:
+    def work_done(self) -> None:
         """Called after that."""
 
 
 @runtime_checkable
-class Guards(Protocol):
+class GuardsCallbacks(Protocol):
     """A node that lets nothing through that its own callbacks raise."""
 
     def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,9 +66,9 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def __init__(self, node: Node) -> None:
         super().__init__()
-        self._guarded = node.guarded if isinstance(node, Guards) else lambda where, callback: callback
-        self._taken = self._guarded("messages", node.messages_taken) if isinstance(node, TakesTogether) else None
-        self._leaving_out = node if isinstance(node, LeavesOut) else None
+        self._guarded = node.guarded if isinstance(node, GuardsCallbacks) else lambda where, callback: callback
+        self._taken = self._guarded("messages", node.batch_done) if isinstance(node, HandlesBatches) else None
+        self._leaving_out = node if isinstance(node, DropsMessages) else None
         self._changed = True
         self._stopped = False
         self._until_ns: int | None = None
@@ -171,7 +171,7 @@ class LeanExecutor(SingleThreadedExecutor):
                         self._stopped = True
                         return
                 if messages and self._leaving_out is not None:
-                    messages = self._leaving_out.worth_handling(messages)
+                    messages = self._leaving_out.drop_late(messages)
                 for subscription, taken in messages:
                     if self._stopped:
                         return
@@ -180,7 +180,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 if messages and self._taken is not None:
                     self._taken()
                 if messages and self._leaving_out is not None:
-                    self._leaving_out.messages_handled()
+                    self._leaving_out.work_done()
                 executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None

@@ -24,7 +24,7 @@ from body_tracking.core.qos import RELIABLE
 from body_tracking.kinect.system import sensors_of
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
-from body_tracking.messages.node_status import NodeStatus, note_statuses
+from body_tracking.messages.node_status import NodeStatus, update_statuses
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES, role_of
 from body_tracking.pipeline.system import Options
@@ -84,7 +84,7 @@ class GraphMonitor:
 
     def _on_diagnostics(self, message: Any) -> None:
         known = dict(self._statuses)  # the other thread reads them
-        note_statuses(known, statuses(message, time.monotonic(), self._namespace))
+        update_statuses(known, statuses(message, time.monotonic(), self._namespace))
         self._statuses = known
 
     def _on_angles(self, message: Any) -> None:
@@ -106,7 +106,7 @@ class GraphMonitor:
             for other, where in self._node.get_node_names_and_namespaces()
         )
 
-    def listened_to(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
+    def has_subscribers(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
         """Whether who publishes each of these topics says that it has found at least so many subscribers.
 
         That we have found them does not mean that the publisher has.

@@ -97,7 +97,7 @@ class StageNode(GraphNode):
         qos.depth = max(qos.depth, port.waiting)
         kind = message_class(port.codec.type_name)
         handle = partial(self.on_message, port.topic)
-        subscription = self.listen(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
+        subscription = self.subscribe(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
         if port.droppable:
             self._droppable[subscription] = self.full_name(port.topic)
         return subscription
@@ -121,14 +121,14 @@ class StageNode(GraphNode):
             raise
         stamp_ns = port.codec.stamp_ns(payload)
         if stamp_ns is not None and self.monitor.message_in(topic, stamp_ns):
-            self.log_seldom("jump", f"{self.full_name(topic)}: time jumped back, starting anew", period_s=1.0)
+            self.log_throttled("jump", f"{self.full_name(topic)}: time jumped back, starting anew", period_s=1.0)
             self.stage.reset(topic)
         self.sent_ns = sent_ns
         self.publish(self.stage.take(topic, payload, Now(self.arrived_ns, self.arrived_waiting_ns)))
         if self.simulated:  # each in its own time, as offline
             self.poll()
 
-    def messages_taken(self) -> None:
+    def batch_done(self) -> None:
         """Do what follows from all messages that were there; called by the executor."""
         self.poll()
         self.stage.settle()

@@ -40,7 +40,7 @@ _LEAVE_S = 5.0
 """Seconds for the middleware to let a node go that is closed."""
 
 
-class _Ending:
+class _SignalHandler:
     """Waits for SIGINT and SIGTERM in a thread of its own, and then ends the executor.
 
     SIGINT (Ctrl-C, the end of a recording in ``body_tracking up``) lets a node finish what it has been sent; SIGTERM,
@@ -65,7 +65,7 @@ class _Ending:
         threading.Thread(target=self._wait, daemon=True).start()
         release_signals()
 
-    def over(self) -> None:
+    def ignore_sigint(self) -> None:
         """Everything has ended: another Ctrl-C, as ``ros2 launch`` passes it on, must not kill what shuts down.
 
         Python lets go of its handlers then, but for signals that are ignored.
@@ -89,13 +89,13 @@ class _Ending:
         return executor
 
     @property
-    def in_order(self) -> bool:
+    def graceful(self) -> bool:
         """Whether there is time to finish."""
         return self._asked < 2
 
     def _end(self) -> None:
         if self._executor is not None and self._asked:
-            (self._executor.finish if self.in_order else self._executor.stop)()
+            (self._executor.finish if self.graceful else self._executor.stop)()
 
 
 def usage(node_class: type[GraphNode]) -> str:
@@ -118,7 +118,7 @@ def run(node_class: type[GraphNode]) -> None:
         return
     code, node = 0, None
     faulthandler.enable()  # a crash below Python says where it was
-    ending = _Ending()
+    handler = _SignalHandler()
     try:
         for file in parameter_files():
             read_file(file)  # rcl's own complaint takes several lines
@@ -128,8 +128,8 @@ def run(node_class: type[GraphNode]) -> None:
         # What is there now stays: the collector need not look at it again while frames wait.
         gc.collect()
         gc.freeze()
-        ending.watch(LeanExecutor(node)).spin()
-        if ending.in_order:
+        handler.watch(LeanExecutor(node)).spin()
+        if handler.graceful:
             node.hand_over()
     except ExternalShutdownException:
         pass
@@ -153,6 +153,6 @@ def run(node_class: type[GraphNode]) -> None:
                 node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
-        ending.over()
+        handler.ignore_sigint()
     if code:
         sys.exit(code)

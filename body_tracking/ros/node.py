@@ -141,7 +141,7 @@ class GraphNode(Node):
     """Base of the nodes.
 
     A node names itself, lists its parameters, sets itself up in ``configure`` and ``start``, and hands its callbacks
-    through :meth:`listen`, so that no message can end it.
+    through :meth:`subscribe`, so that no message can end it.
     """
 
     NAME: ClassVar[str]
@@ -150,13 +150,13 @@ class GraphNode(Node):
     def __init__(self) -> None:
         self.monitor = Monitor()
         self._failed_in_a_row: Counter[str] = Counter()
-        self._told_failures = 0
+        self._reported_failures = 0
         super().__init__(self.NAME)
         self.backlog = Backlog()
         self.sequences = Sequences()
         self.standstill = Standstill()
         self._droppable: dict[Subscription, str] = {}
-        self._told_dropped: Counter[str] = Counter()
+        self._reported_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
         self._switched: Counter[str] = Counter()
         self._several_since: dict[str, float] = {}
@@ -179,7 +179,7 @@ class GraphNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, to_profile(RELIABLE_QOS))
         self.start()
         self._reported = -_REPORT_S
-        self._told_listeners: dict[str, object] = {}
+        self._reported_subscribers: dict[str, object] = {}
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
 
     # --- to be written by a node
@@ -330,7 +330,7 @@ class GraphNode(Node):
             trace = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {kind} in a callback, which is left out: {error}\n{trace}")
         if self._failed_in_a_row[where] % _FAILURES == 0:
-            self.log_seldom(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; starting anew")
+            self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; starting anew")
             with contextlib.suppress(Exception):
                 self.time_jumped_back(where)
 
@@ -388,7 +388,7 @@ class GraphNode(Node):
         """Publish on a topic of the graph."""
         return self.create_publisher(kind, names.relative(topic), qos)
 
-    def listen(
+    def subscribe(
         self,
         topic: str,
         kind: type[Any],
@@ -419,7 +419,7 @@ class GraphNode(Node):
         checked: Any = callback  # rclpy passes the message info to callbacks of two arguments
         return self.create_subscription(kind, topic if absolute else names.relative(topic), checked, qos, raw=raw)
 
-    def listen_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
+    def subscribe_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
         name = self.full_name(topic)
 
@@ -428,13 +428,13 @@ class GraphNode(Node):
                 return
             skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
-                self.log_seldom("jump", f"{name}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{name}: time jumped back, starting anew", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
         qos = self.skeleton_qos()
         qos.depth = max(qos.depth, FRAMES_KEPT)
-        subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
+        subscription = self.subscribe(topic, PointCloud2, qos, convert, raw=True)
         if not self.values["reliable"]:
             self._droppable[subscription] = name
         return subscription
@@ -443,7 +443,7 @@ class GraphNode(Node):
         """Whether a frame was sent before this process stood still, and is too old now; never with ``reliable``."""
         return not self.values["reliable"] and self.standstill.is_stale(topic, sent_ns, time.time_ns())
 
-    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
         """All messages but frames that are too late where the node is too slow; called by the executor."""
         frames = [place for place, (subscription, _) in enumerate(messages) if subscription in self._droppable]
         if not frames:
@@ -457,7 +457,7 @@ class GraphNode(Node):
             self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
         return [each for place, each in enumerate(messages) if place not in late] if late else messages
 
-    def messages_handled(self) -> None:
+    def work_done(self) -> None:
         """Note how long that took; called by the executor."""
         if self._droppable:
             self.backlog.done(time.time_ns())
@@ -491,9 +491,9 @@ class GraphNode(Node):
         """Count a message that is not used, and why."""
         self.monitor.totals[what] += 1
         self.monitor.last_reason = f"{topic}: {reason}"
-        self.log_seldom(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
+        self.log_throttled(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
 
-    def log_seldom(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
+    def log_throttled(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
         """Warn, but not again about the same within some seconds."""
         if self._may_log(key, period_s):
             self.get_logger().warning(text)
@@ -514,14 +514,14 @@ class GraphNode(Node):
 
     def _look(self) -> None:
         """Report every second, and at once when somebody else listens: a source may wait for that."""
-        if time.monotonic() - self._reported >= _REPORT_S or self._told_listeners != self._listeners():
+        if time.monotonic() - self._reported >= _REPORT_S or self._reported_subscribers != self._subscriber_counts():
             self._report()
 
     def _report(self) -> None:
         self._reported = time.monotonic()
-        self._told_listeners = self._listeners()
+        self._reported_subscribers = self._subscriber_counts()
         level, text, values = self.state()
-        values = {**self.monitor.values(), **self._told_listeners, **values}
+        values = {**self.monitor.values(), **self._reported_subscribers, **values}
         values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
         values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
         values |= {f"left out after a standstill {topic}": n for topic, n in self.standstill.left_out.items()}
@@ -529,16 +529,16 @@ class GraphNode(Node):
             values[f"publishers {topic}"] = ", ".join(nodes)
             said = f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
             level, text = max(level, 1), said + (f"; {text}" if text else "")
-            self.log_seldom(f"publishers {topic}", said, _DOUBLED_PERIOD_S)
-        dropped = self.backlog.dropped - self._told_dropped
+            self.log_throttled(f"publishers {topic}", said, _DOUBLED_PERIOD_S)
+        dropped = self.backlog.dropped - self._reported_dropped
         if dropped:
-            self._told_dropped = Counter(self.backlog.dropped)
+            self._reported_dropped = Counter(self.backlog.dropped)
             said = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
             level, text = max(level, 1), f"too slow: dropped {said}" + (f"; {text}" if text else "")
-            self.log_seldom("dropped", text)
+            self.log_throttled("dropped", text)
         failures = self.monitor.failures.total()
-        if failures > self._told_failures:
-            self._told_failures = failures
+        if failures > self._reported_failures:
+            self._reported_failures = failures
             said = f"{failures} callbacks failed, lately of {next(reversed(self.monitor.failures))}"
             level, text = max(level, 2), said + (f"; {text}" if text else "")
         if self.monitor.totals["malformed"] and level == 0:
@@ -570,7 +570,7 @@ class GraphNode(Node):
                 found[topic] = nodes
         return found
 
-    def _listeners(self) -> dict[str, object]:
+    def _subscriber_counts(self) -> dict[str, object]:
         """How many subscribers this node has found of each of its outputs: none yet is why nothing arrives."""
         return {
             f"subscribers {each.topic_name}": each.get_subscription_count()

@@ -291,7 +291,7 @@ class Supervisor:
                         "end it, or give this one another ROS_DOMAIN_ID"
                     )
                     break
-                self._look_after(monitor)
+                self._supervise(monitor)
                 self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
                 if any(child.done for child in self.children):
                     self._finish()
@@ -316,7 +316,7 @@ class Supervisor:
 
     # --- starting
 
-    def _look_after(self, monitor: GraphMonitor) -> None:
+    def _supervise(self, monitor: GraphMonitor) -> None:
         now = time.monotonic()
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
@@ -333,7 +333,7 @@ class Supervisor:
         if not is_source(child.spec):
             return True
         others = [other.spec.name for other in self.children if not is_source(other.spec)]
-        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(self.subscribers, others)
+        return now - child.due > LISTENERS_TIMEOUT or monitor.has_subscribers(self.subscribers, others)
 
     def _start(self, child: Child) -> None:
         spec = child.spec

@@ -131,7 +131,7 @@ class Noting(rclpy.node.Node):  # type: ignore[misc]
             self.create_subscription(String, topic, lambda message: self.said.append(message.data), 10)
         self.create_timer(0.02, lambda: self.said.append("timer"), clock=STEADY)
 
-    def messages_taken(self) -> None:
+    def batch_done(self) -> None:
         self.said.append("all")
 
 

@@ -184,7 +184,7 @@ class Failing(GraphNode):
 
     def start(self) -> None:
         self.restarts: list[str] = []
-        self.listen("/one", String, RELIABLE, self.on_one)
+        self.subscribe("/one", String, RELIABLE, self.on_one)
         self.create_timer(0.02, self.on_timer, clock=STEADY)
         self.create_service(Trigger, "~/ask", self.on_ask)
 

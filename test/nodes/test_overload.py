@@ -34,7 +34,7 @@ class Slow(GraphNode):
     def start(self) -> None:
         self.waited: list[tuple[str, float]] = []
         for topic in TOPICS:
-            self.listen_to_skeletons(topic, lambda skeletons, sent_ns, topic=topic: self.work(topic, sent_ns))
+            self.subscribe_to_skeletons(topic, lambda skeletons, sent_ns, topic=topic: self.work(topic, sent_ns))
 
     def work(self, topic: str, sent_ns: int) -> None:
         self.waited.append((topic, (time.time_ns() - sent_ns) / 1e9))
