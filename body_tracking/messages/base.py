@@ -1,4 +1,4 @@
-"""What every conversion needs: the classes of messages, their type names, stamps and headers."""
+"""Parts of every conversion: message classes, stamps and headers."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def to_nanoseconds(stamp: Any) -> int:
     """``builtin_interfaces/Time`` to integer nanoseconds, 0 to :data:`~body_tracking.core.skeleton.MAX_STAMP_NS`.
 
     Raises:
-        MessageError: a time that ROS time does not have: negative, or with a second or more of nanoseconds.
+        MessageError: not a valid ROS time: negative, or with a second or more of nanoseconds.
     """
     sec, nanosec = int(stamp.sec), int(stamp.nanosec)
     if not (0 <= sec < 2**31 and 0 <= nanosec < NANOSECONDS):
@@ -82,7 +82,7 @@ def to_time(nanoseconds: int, types: MessageTypes) -> Any:
     """Integer nanoseconds to ``builtin_interfaces/Time``.
 
     Raises:
-        MessageError: a time that ROS time does not have.
+        MessageError: outside the range of ROS time.
     """
     if not 0 <= nanoseconds <= MAX_STAMP_NS:
         raise MessageError(f"a stamp of {nanoseconds} ns, expected 0 to {MAX_STAMP_NS}")

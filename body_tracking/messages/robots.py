@@ -17,7 +17,7 @@ def command_to_trajectory(
 ) -> Any:
     """``trajectory_msgs/JointTrajectory`` with one point, for ``joint_trajectory_controller``.
 
-    Without velocities, for that controller refuses a trajectory that ends in motion (its parameter
+    Without velocities, because that controller refuses a trajectory that ends in motion (its parameter
     ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
 
     Args:
