@@ -1,4 +1,4 @@
-"""``sensor_msgs/Imu`` per segment to ``/imu/<segment>/orientation`` and ``/imu/skeleton``, beside a camera or alone."""
+"""``sensor_msgs/Imu`` per segment to ``/imu/<segment>/orientation`` and ``/imu/skeleton``, with or without a camera."""
 
 from __future__ import annotations
 

@@ -62,13 +62,13 @@ PARAMETERS = (
 
 
 class KinectSkeleton(GraphNode):
-    """Publishes the frames of a source as they come."""
+    """Publishes the frames of a sensor or a recording."""
 
     NAME = "kinect_skeleton"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Open the source; a thread of its own waits for its frames."""
+        """Open the source, and start the thread that reads its frames."""
         given: dict[str, Any] = dict(self.values)
         self.failure = ""
         self.source_errors: dict[str, str] = {}
@@ -93,20 +93,19 @@ class KinectSkeleton(GraphNode):
         self.thread.start()
 
     def publish_frames(self) -> None:
-        """Until the source or the node ends, or the source fails: then the node stays, and says why."""
+        """Publish until the source or the node ends. If the source fails, the node stays and reports the error."""
         publish = self.guarded("frames", self.publish_frame)
         try:
             while self.context.ok() and not self.source.ended:
                 frame = self.source.read(timeout=0.2)
-                if frame is None:
-                    continue
-                publish(frame)
-        except Exception as error:  # whatever the library of a sensor raises
-            if self.context.ok():  # not closed while it was being read
+                if frame is not None:
+                    publish(frame)
+        except Exception as error:  # the library of a sensor may raise anything
+            if self.context.ok():  # otherwise the source was closed during the read
                 self.failed(error)
 
     def publish_frame(self, frame: RecordedFrame) -> None:
-        """One message; a frame of which none can be made is left out."""
+        """Publish one frame, stamped in ROS time."""
         skeletons = frame.skeletons
         stamp_ns = self.ros_time.stamp(skeletons[0].stamp_ns, frame.received_ns)
         if stamp_ns != skeletons[0].stamp_ns:
@@ -116,7 +115,7 @@ class KinectSkeleton(GraphNode):
             self.send(self.output, message, stamp_ns)
 
     def failed(self, error: Exception) -> None:
-        """Say what the source has raised, and where, for who writes it; to be called where it is caught."""
+        """Log an error of the source, with a traceback unless it is one of ours; call it in the except clause."""
         failure = described(error)
         self.get_logger().error(failure)
         if not isinstance(error, BodyTrackingError):
@@ -124,7 +123,7 @@ class KinectSkeleton(GraphNode):
         self.failure = failure
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Whether it plays, ended or failed, or what keeps frames from coming."""
+        """Streaming, ended, failed, or the problem of the source."""
         problem = self.source_value("problem", "")
         if problem:
             self.log_throttled("problem", problem, _PROBLEM_PERIOD_S)
@@ -137,7 +136,7 @@ class KinectSkeleton(GraphNode):
         )
 
     def source_value(self, name: str, otherwise: Any) -> Any:
-        """What the source says of itself; where it raises, that is told for as long as it does, and frames go on."""
+        """A property of the source; if it raises, the default, and the diagnostics report the error."""
         self.source_errors.pop(name, None)
         try:
             return getattr(self.source, name)
@@ -147,7 +146,6 @@ class KinectSkeleton(GraphNode):
             return otherwise
 
     def close(self) -> None:
-        """Let the thread end."""
         try:
             self.source.close()
         except Exception as error:

@@ -1,4 +1,4 @@
-"""What the ROS driver of another camera publishes of bodies, to ``/<sensor>/skeleton``."""
+"""Bodies from the ROS driver of another camera (``visualization_msgs/MarkerArray``) to ``/<sensor>/skeleton``."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -40,17 +40,16 @@ PARAMETERS = (
 )
 
 SILENCE = 1.0
-"""Seconds without a message from which on the topic is a problem."""
+"""Seconds without a message after which the node reports a warning."""
 
 
 class SkeletonAdapter(GraphNode):
-    """Converts and publishes each message as it comes."""
+    """Converts and publishes each message."""
 
     NAME = "skeleton_adapter"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Connect."""
         given: dict[str, Any] = dict(self.values)
         sensor = check_sensor_name(given["sensor"])
         self.frame_id = optical_frame(sensor)
@@ -62,7 +61,7 @@ class SkeletonAdapter(GraphNode):
         self.subscribe(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:
-        """Publish the bodies of one message; nobody in view is no message."""
+        """Publish the bodies of one message; nothing if there are none."""
         self.last_received = time.monotonic()
         if not message.markers:
             return
@@ -75,7 +74,6 @@ class SkeletonAdapter(GraphNode):
             self.send(self.output, encode_skeletons(skeletons), stamp_ns, sent_ns)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Whether messages come."""
         if self.last_received is None:
             return 1, f"no message on {self.topic} yet", {}
         silent = time.monotonic() - self.last_received
