@@ -59,7 +59,7 @@ def bench(domain: None) -> Iterator[Any]:
     rclpy.try_shutdown(context=context)
 
 
-def test_faults_of_a_graph_are_named(bench: Any) -> None:
+def test_faults_of_a_graph_are_reported(bench: Any) -> None:
     def publish(kind: type, topic: str, hertz: float, make: Callable[[], Any], qos: Any = 10) -> None:
         publisher = bench.create_publisher(kind, topic, qos)
         bench.create_timer(1.0 / hertz, lambda: publisher.publish(make()))
@@ -112,7 +112,7 @@ def test_rate_and_stamps_are_judged(kind: str, hertz: float, stamp: float, age: 
     assert said in found.found + found.remedy
 
 
-def test_a_sensor_that_begins_late_is_waited_for(bench: Any) -> None:
+def test_doctor_waits_for_a_late_sensor(bench: Any) -> None:
     def begin() -> None:
         timer.cancel()
         publisher = bench.create_publisher(PointCloud2, "/kinect1/skeleton", 10)
@@ -123,7 +123,7 @@ def test_a_sensor_that_begins_late_is_waited_for(bench: Any) -> None:
     assert [each for each in found if each.found.startswith("/kinect1/skeleton from /bench to nobody: ")], found
 
 
-def test_an_empty_domain_is_named_and_so_is_an_absent_sensor(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_domain_and_absent_sensor_are_reported(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "PATIENCE", 0.0)
     found = [(each.level, each.found) for each in live.domain(["kinect4"], 0.5)]
     assert found == [(WARNING, "0 other nodes in this domain"), (PROBLEM, "/kinect4/skeleton: nobody publishes it")]
