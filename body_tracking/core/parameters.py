@@ -103,7 +103,7 @@ class Parameter:
             why = self.fixed or "it is read at the start"
             raise ParameterError(
                 f"parameter {self.name!r} cannot change while the node runs: {why}. "
-                f"Start it anew with the value in --params-file, or with -p {self.name}:=VALUE"
+                f"Restart it with the value in --params-file, or with -p {self.name}:=VALUE"
             )
         return checked
 

@@ -36,7 +36,7 @@ PARAMETERS = (
     Parameter(
         "rate",
         15.0,
-        "publish markers at most this often, and only while somebody listens",
+        "publish markers at most this often, and only while there is a subscriber",
         unit="Hz",
         min=0.1,
         max=100.0,

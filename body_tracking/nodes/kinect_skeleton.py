@@ -52,7 +52,7 @@ PARAMETERS = (
     Parameter(
         "least_delay",
         _DEFAULTS.least_delay,
-        "network: what the sensor takes at least from capture until its frame can be sent, which nothing else tells",
+        "network: least time of the sensor from capture until its frame can be sent, which cannot be measured",
         unit="s",
         min=0.0,
         max=1.0,

@@ -96,7 +96,7 @@ class RobotCommands(GraphNode):
         enable = self.create_service(Trigger, "~/enable", self.on_enable)
         if not self.follower.enabled:
             self.get_logger().warning(
-                f"waits for a person: without a state_topic nobody says where {self.mapping.robot} stands. Once it "
+                f"waits for a person: without a state_topic the position of {self.mapping.robot} is unknown. Once it "
                 f"stands at home: ros2 service call {enable.service_name} std_srvs/srv/Trigger"
             )
         self.create_timer(1.0 / float(str(self.values["rate"])), self.publish_command, clock=STEADY)
@@ -121,7 +121,7 @@ class RobotCommands(GraphNode):
                 raise
             convention = str(values.header.frame_id)
             if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
-                self.log_throttled("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
             self.monitor.totals["unpaired"] += 1
@@ -192,7 +192,7 @@ class RobotCommands(GraphNode):
     def state(self) -> tuple[int, str, dict[str, object]]:
         command = self.command
         if command is None:
-            return 2, "stopped: nothing heard yet", {}
+            return 2, "stopped: no input yet", {}
         values: dict[str, object] = {
             "robot": self.mapping.robot,
             "state": command.state,

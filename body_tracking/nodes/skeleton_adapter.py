@@ -28,12 +28,12 @@ PARAMETERS = (
     Parameter(
         "topic",
         "body_tracking_data",
-        "what is listened to: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
+        "the input topic: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
     ),
     Parameter(
         "state",
         "tracked",
-        "what is said of every joint: the driver does not tell which ones the camera sees and which it guesses",
+        "the state of every joint: the driver does not report which ones the camera sees and which it infers",
         choices=("tracked", "inferred"),
     ),
     RELIABLE,

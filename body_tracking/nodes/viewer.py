@@ -140,9 +140,7 @@ class ViewerNode(GraphNode):
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
         if not _is_loopback(given["host"]):
-            self.get_logger().warning(
-                f"the page is at {page.address}: whoever reaches that address can press its buttons"
-            )
+            self.get_logger().warning(f"the page is at {page.address}: everyone who reaches that address can use it")
         return page
 
     # --- inputs

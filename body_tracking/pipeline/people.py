@@ -27,7 +27,7 @@ class PeopleParameters:
     subject: str = field(
         default=NEAREST,
         metadata={
-            "doc": "whom to track: the person who is nearest to the reference sensor at first, or the one who is seen "
+            "doc": "the tracked person: the one nearest to the reference sensor at first, or the one seen "
             "first, for as long as that person is there; or all, each under a number and with topics of their own",
             "choices": SUBJECTS,
         },
@@ -43,7 +43,7 @@ class PeopleParameters:
     hold: float = field(
         default=HOLD,
         metadata={
-            "doc": "a person whom no sensor sees keeps the id for this long; another is chosen, or gets it, then",
+            "doc": "an unseen person keeps the id for this long; then another one is chosen, or gets it",
             "unit": "s",
             "min": 0.5,
             "max": 60.0,

@@ -33,7 +33,7 @@ BODY = Parameter(
 SENSORS = Parameter(
     "sensors",
     ("kinect1", "kinect2"),
-    "the sensors; the node listens to /<sensor>/skeleton of each",
+    "the sensors; the node takes /<sensor>/skeleton of each",
     fixed="every node of the graph must have the same sensors",
 )
 REFERENCE = Parameter(

@@ -311,7 +311,7 @@ class GraphNode(Node):
             trace = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {kind} in a callback, which is left out: {error}\n{trace}")
         if self._failed_in_a_row[where] % _FAILURES == 0:
-            self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; starting anew")
+            self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; resetting")
             with contextlib.suppress(Exception):
                 self.time_jumped_back(where)
 
@@ -409,7 +409,7 @@ class GraphNode(Node):
                 return
             skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
-                self.log_throttled("jump", f"{name}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{name}: time jumped back, resetting", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 

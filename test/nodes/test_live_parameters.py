@@ -102,7 +102,7 @@ def test_every_parameter_is_live_or_has_a_reason(executable: str) -> None:
             assert item.check_change(item.default) == item.default
             assert not item.fixed, item.name
         else:
-            with pytest.raises(ParameterError, match=r"cannot change while the node runs: .+ Start it anew"):
+            with pytest.raises(ParameterError, match=r"cannot change while the node runs: .+ Restart it"):
                 item.check_change(item.default)
 
 
@@ -117,7 +117,7 @@ def test_live_parameters_change_and_others_state_reason_and_remedy(running: Grap
         if not item.live:
             assert reason == (
                 f"{node}: parameter {item.name!r} cannot change while the node runs: "
-                f"{item.fixed or 'it is read at the start'}. Start it anew with the value in --params-file, or with "
+                f"{item.fixed or 'it is read at the start'}. Restart it with the value in --params-file, or with "
                 f"-p {item.name}:=VALUE"
             )
 

@@ -110,14 +110,14 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
     publishers = node.get_publishers_info_by_topic(topic)
     readers = [each for each in node.get_subscriptions_info_by_topic(topic) if not each.node_name.startswith(_WATCHERS)]
     by, to = (
-        ", ".join(sorted({f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in side})) or "nobody"
+        ", ".join(sorted({f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in side})) or "no subscriber"
         for side in (publishers, readers)
     )
     if not publishers:
         if wanted or (readers and SEGMENTS not in kinds):  # only filters with a body model publish segments
             remedy = "start its publisher; where it runs, compare env | grep ROS_ in both shells"
             source = wanted or topic == names.CLOCK or kinds[0] in (POINT_CLOUD, IMU)
-            found = f"{topic}: nobody publishes it" + (f", wanted by {to}" if readers else "")
+            found = f"{topic}: no publisher" + (f", wanted by {to}" if readers else "")
             yield Finding(PROBLEM if source else WARNING, found, remedy)
         return
     if len(publishers) > 1 and graph.has_one_publisher(topic):
@@ -140,7 +140,7 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
 def stream(text: str, kind: str, came: Sequence[tuple[float, float, float]]) -> Finding:
     """Rate and stamps of received messages (:attr:`Listener.came`), compared with the least rate of their type."""
     if not came:
-        remedy = "is somebody in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+        remedy = "is a person in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
         return Finding(PROBLEM if kind == IMU else WARNING, f"{text}: nothing came", remedy)
     times, _, ages = zip(*came, strict=True)
     rate = (len(came) - 1) / max(times[-1] - times[0], 1e-3)
