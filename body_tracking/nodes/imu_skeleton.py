@@ -6,8 +6,6 @@ from body_tracking.inertial.stage import ImuStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
 
-PARAMETERS = ImuStage.PARAMETERS
-
 
 class ImuSkeletonNode(StageNode):
     STAGE = ImuStage

@@ -76,11 +76,6 @@ def is_model_covariance(topic: str) -> bool:
     return re.fullmatch(r"(/\w+)*/(filtered|humans/bodies/\w+)/model_covariance", topic) is not None
 
 
-def is_orientation_topic(topic: str) -> bool:
-    """Whether a topic is :func:`orientation_topic` of some segment, in any namespace."""
-    return re.fullmatch(r"(/\w+)*/imu/\w+/orientation", topic) is not None
-
-
 @dataclass(frozen=True, slots=True)
 class ImuTopics:
     """Topics of the driver of a segment's inertial sensor.
