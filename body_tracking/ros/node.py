@@ -1,6 +1,6 @@
 """The base of all nodes: parameters, diagnostics, callbacks that cannot end the node, start and end.
 
-Over 500 lines, because the methods that override rclpy.node.Node belong together.
+Over 500 lines: the methods that override rclpy.node.Node belong together.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
