@@ -192,7 +192,7 @@ class RobotCommands(GraphNode):
     def state(self) -> tuple[int, str, dict[str, object]]:
         command = self.command
         if command is None:
-            return 2, "stopped: no input yet", {}
+            return 2, "stopped: nothing received yet", {}
         values: dict[str, object] = {
             "robot": self.mapping.robot,
             "state": command.state,
