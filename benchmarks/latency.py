@@ -27,12 +27,13 @@ from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState, PointCloud2
 
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.message_types import TIME_REFERENCE, TRANSFORM
 from body_tracking.core.qos import RELIABLE
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import TIME_REFERENCE, TRANSFORM, RosMessages
+from body_tracking.messages.base import RosMessages
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
 from body_tracking.pipeline import graph

@@ -143,7 +143,7 @@ def up_command(folder: Path, bag: Path, args: argparse.Namespace) -> list[str]:
     """``body_tracking up`` with a bag that begins again at its end, and a recorder."""
     values: dict[str, dict[str, Any]] = {"bag_player": {"loop": True}}
     if args.imus:
-        values["imu_skeleton"] = {"segments": [f"{name}:imu_{name}" for name in graph.SOME_IMUS]}
+        values["imu_skeleton"] = {"segments": [f"{name}:imu_{name}" for name in graph.EXAMPLE_IMUS]}
     parameters = live.parameters_file(folder / "parameters.yaml", values)
     words = ["--bag", bag, "--rate", args.rate, "--filter", args.filter, "--record", folder / "recording"]
     return live.up_command(*words, "--log-dir", folder, "--params-file", parameters)
@@ -155,7 +155,7 @@ def simulated(folder: Path, imus: bool) -> Path:
     command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
     command += ["--seconds", str(BAG_SECONDS)]
     subprocess.run(
-        command + (["--imus", ",".join(graph.SOME_IMUS)] if imus else []), check=True, stdout=subprocess.DEVNULL
+        command + (["--imus", ",".join(graph.EXAMPLE_IMUS)] if imus else []), check=True, stdout=subprocess.DEVNULL
     )
     return bag
 

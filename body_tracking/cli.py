@@ -1,4 +1,4 @@
-"""The ``body_tracking`` command: collects the subcommands, which live in the modules that do the work."""
+"""The ``body_tracking`` command: collects the subcommands of all systems."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 def subcommands() -> dict[str, Command]:
-    """The subcommands, of which each is loaded for itself only."""
-    # loads numpy, which main() has to prepare
+    """The subcommands by name; their modules are not loaded."""
+    # loads numpy, which must not happen before main() sets OPENBLAS_NUM_THREADS
     from body_tracking.systems import COMMANDS
 
     return COMMANDS
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The parser of one subcommand; without one that there is, of the names of all."""
+    """The parser of one subcommand; for an unknown or no command, one with the names of all."""
     top = argparse.ArgumentParser(
         prog="body_tracking",
         description="Joint angles with honest uncertainty from several sensors: recordings in, the live graph, "
@@ -46,8 +46,8 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 2 with one line on stderr for anything wrong outside the program."""
     if arguments is None:
-        # The program itself, not a call within another one. Matrices as small as these gain nothing by a second thread,
-        # which OpenBLAS lets spin meanwhile; it has to be said before numpy is loaded, with the first subcommand.
+        # Only in our own process. Small matrices gain nothing by a second thread, and OpenBLAS's threads spin while
+        # they wait. The variable has to be set before numpy is loaded, with the first subcommand.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         arguments = sys.argv[1:]
     try:
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # Whoever read our output has left, as `head` does; Python would complain again when it flushes at exit.
+        # The reader of our output has ended, as `head` does; Python would raise again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     return code

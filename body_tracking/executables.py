@@ -1,8 +1,8 @@
 """The entry points of setup.py: nodes, and commands.
 
-A node needs a second for its imports. A SIGINT meanwhile would end it with a traceback, so signals wait until the node
-can take them: from the first instruction where the process was started with them blocked, as by ``up`` and by the
-scripts that colcon installs, else from here on.
+A node needs a second for its imports, and a SIGINT during that time would end it with a traceback. So signals are
+blocked until the node can handle them: from here on, or from the start of the process where ``up`` or a script that
+colcon installs starts it with blocked signals.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from body_tracking.core.signals import ENDING, hold_signals, release_signals
 
 
 def start(name: str) -> None:
-    """Run the node of this name; where it is to end before it has begun, that is the end."""
+    """Run the node of this name; a signal during the imports ends the process."""
     hold_signals()
     imported = threading.Event()
     threading.Thread(target=_leave_unless, args=(imported,), daemon=True).start()
     if importlib.util.find_spec(f"body_tracking.nodes.{name}") is not None:
         main = importlib.import_module(f"body_tracking.nodes.{name}").main
-    else:  # of a system that another package brings
+    else:  # of a system of another package
         main = importlib.import_module("body_tracking.ros.host").host_of(name)
     imported.set()
     main()

@@ -1,4 +1,4 @@
-"""The parameters of a graph's nodes, from the graph's defaults, a parameters file and what the graph needs."""
+"""The parameters of a graph's nodes, from defaults, a parameters file and the graph's own settings."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def parameters_for(
     defaults: Mapping[str, Mapping[str, Value]] | None = None,
     absent: Sequence[NodeSpec] = (),
 ) -> dict[str, dict[str, Value]]:
-    """Every parameter that is set, for each node: the graph's defaults, then the file, then what the graph needs.
+    """Every parameter that is set, for each node: defaults, overridden by the file, overridden by the graph.
 
     Args:
         specs: the nodes.
         file: a ROS parameters file, or None.
         defaults: more defaults by node name.
-        absent: nodes that the file may be about too, although they are not started.
+        absent: nodes that the file may have sections for, although they are not started.
 
     Raises:
-        ParameterError: the file is none, is about a node that is not there, has unknown names or values that are not
+        ParameterError: the file is invalid, has a section for an unknown node, unknown names or values that are not
             allowed.
     """
-    if file is None:  # what we set ourselves, each node checks
+    if file is None:  # each node checks the graph's own values
         return {
             spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
         }
@@ -45,7 +45,7 @@ def parameters_for(
     tables = {name: {item.name: item for item in parameters_of(spec.executable)} for name, spec in possible.items()}
     sections = read_file(file)
     for pattern, values in sections.items():
-        about = [spec for spec in possible.values() if spec.meant_by(pattern)]
+        about = [spec for spec in possible.values() if spec.in_section(pattern)]
         if not about:
             there = ", ".join(spec.full_name for spec in possible.values())
             raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
@@ -57,7 +57,7 @@ def parameters_for(
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
         for pattern, values in in_order(sections):
-            if spec.meant_by(pattern):
+            if spec.in_section(pattern):
                 wildcard = is_wildcard(pattern)
                 given |= {name: v for name, v in values.items() if not wildcard or name in tables[spec.name]}
         given |= spec.parameters

@@ -1,7 +1,7 @@
-"""The graph: what all systems together bring, and which nodes run for given options.
+"""The graph: nodes, options, topics and commands of all systems, and which nodes run for given options.
 
-``body_tracking up``, the launch file, ``body_tracking replay``, the nodes, the command line and the documentation read
-it here; none repeats it. Knows no ROS library.
+The single source for ``body_tracking up``, the launch file, ``body_tracking replay``, the nodes, the command line and
+the documentation.
 """
 
 from __future__ import annotations
@@ -18,19 +18,13 @@ from typing import TYPE_CHECKING, Final
 
 from body_tracking.core.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.system import (
-    NodeSpec,
-    Options,
-    Place,
-    System,
-    load,
-)
+from body_tracking.pipeline.system import NodeSpec, Options, Place, System, load
 
 if TYPE_CHECKING:
     from body_tracking.pipeline.stage import Stage
 
 ENTRY_POINTS: Final = "body_tracking.systems"
-"""The group of entry points by which another package brings a system."""
+"""The group of entry points by which another package adds a system."""
 
 
 def _found() -> tuple[System, ...]:
@@ -47,30 +41,23 @@ OPTIONS: Final = {option.name: option for system in SYSTEMS for option in system
 NODES: Final = {node.name: node for system in SYSTEMS for node in system.nodes}
 EXECUTABLES: Final = tuple(NODES)
 TOPICS: Final = tuple(topic for system in SYSTEMS for topic in system.topics)
-"""Every topic of the graph; ``TF`` and ``TF_STATIC`` only where ``tf2_msgs`` is installed, and ``TRACKED`` only where
-``hri_msgs`` is."""
+"""Every topic of the graph; ``TF`` and ``TF_STATIC`` need ``tf2_msgs``, ``TRACKED`` needs ``hri_msgs``."""
 SERVICES: Final = tuple(service for system in SYSTEMS for service in system.services)
 COMMANDS: Final = {command.name: command for system in SYSTEMS for command in system.commands}
 LAYERS: Final = tuple(layer for system in SYSTEMS for layer in system.layers)
 _PLACED: Final = sorted(NODES.values(), key=lambda node: node.place)
 STAGES: Final = tuple(node.name for node in _PLACED if node.stage)
 """The nodes that host a stage, in the order in which messages go through them."""
-FLOW: Final = tuple(
-    node.name for node in sorted(NODES.values(), key=lambda node: node.place) if node.place <= Place.ANGLES
-)
+FLOW: Final = tuple(node.name for node in _PLACED if node.place <= Place.ANGLES)
 """Executables from source to angles."""
 
 
-# --- what is known of a node
+# --- nodes
 
 
 @cache
 def stage_class(executable: str) -> type[Stage]:
-    """The class of the stage that a node hosts.
-
-    Raises:
-        KeyError: there is no such node, or it hosts none.
-    """
+    """The class of the stage that a node hosts; KeyError for an unknown node, or one without a stage."""
     node = NODES[executable]
     if not node.stage:
         raise KeyError(executable)
@@ -91,11 +78,7 @@ def parameters_of(executable: str) -> tuple[Parameter, ...]:
 
 
 def options_of(**given: Value) -> Options:
-    """All options, with their defaults where nothing is given.
-
-    Raises:
-        KeyError: there is no option of such a name.
-    """
+    """All options, with defaults for those that are not given; KeyError for an unknown one."""
     unknown = given.keys() - OPTIONS.keys()
     if unknown:
         raise KeyError(f"no option {', '.join(sorted(unknown))}")
@@ -103,12 +86,12 @@ def options_of(**given: Value) -> Options:
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> None:
-    """Options to a command.
+    """Add options to a command.
 
     Args:
         parser: of the command.
-        names: of the options; all that people may give when empty.
-        texts: what the command says of an option in place of its own text.
+        names: of the options; all but the hidden ones when empty.
+        texts: help texts that replace those of the options.
     """
     for option in OPTIONS.values():
         if option.hidden or (names and option.name not in names):
@@ -127,7 +110,7 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
 
 
 def options_from(args: argparse.Namespace) -> dict[str, Value]:
-    """What a command line says of the options that it has; others are left out.
+    """The options that a command line sets; others are left out.
 
     Raises:
         GraphError: a list of sensors without a name.
@@ -146,16 +129,12 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
 
 
 def in_order(sections: Mapping[str, dict[str, object]]) -> list[tuple[str, dict[str, object]]]:
-    """The sections of a parameters file, those later that hold against the ones before: the more exact ones."""
+    """The sections of a parameters file by increasing precedence: exact names after wildcards."""
     return sorted(sections.items(), key=lambda item: (not is_wildcard(item[0]), item[0].count("/")))
 
 
 def with_file(options: Options, file: Path | None) -> Options:
-    """The options with what a parameters file says where they say nothing.
-
-    Raises:
-        ParameterError: the file is none.
-    """
+    """The options, with values of a parameters file for those at their defaults; ParameterError for an invalid file."""
     found = dict(options)
     for pattern, values in in_order(read_file(file) if file is not None else {}):
         for option in OPTIONS.values():
@@ -165,8 +144,8 @@ def with_file(options: Options, file: Path | None) -> Options:
             value = values.get(parameter)
             if isinstance(value, list):
                 value = tuple(entry for entry in value if isinstance(entry, str) and entry)
-            # What has another type is refused by whoever checks the parameters.
-            if type(value) is type(option.default) and NodeSpec(node, node, str(options["namespace"])).meant_by(
+            # Other types are refused later, with the other parameters.
+            if type(value) is type(option.default) and NodeSpec(node, node, str(options["namespace"])).in_section(
                 pattern
             ):
                 found[option.name] = value
@@ -174,7 +153,7 @@ def with_file(options: Options, file: Path | None) -> Options:
 
 
 def bodies_of(options: Options) -> tuple[str, ...]:
-    """The ids of those who may be tracked, of several people; empty with one subject."""
+    """The ids of all people who may be tracked; empty with one subject."""
     from body_tracking.pipeline.people import ALL, MAX_PEOPLE
 
     return graph.bodies(int(str(options["people"])) or MAX_PEOPLE) if options["subject"] == ALL else ()
@@ -184,13 +163,13 @@ def bodies_of(options: Options) -> tuple[str, ...]:
 
 
 def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph; sources last, so that those who listen are there first.
+    """The nodes of a graph; sources last, so that their subscribers start first.
 
     With two sensors and a filter it is the process of Schlagenhauf (2017), figure 5.1.
 
     Raises:
-        GraphError: no sensor, or one twice; a filter was asked for what it cannot do.
-        SensorNameError: a name that cannot be a sensor's.
+        GraphError: no sensor, or one twice; options that the filter does not support.
+        SensorNameError: an invalid name of a sensor.
     """
     specs = [spec for system in SYSTEMS for spec in system.specs(options)]
     specs.sort(key=lambda spec: -NODES[spec.executable].place)
@@ -207,16 +186,16 @@ def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
 
 
 def is_source(spec: NodeSpec) -> bool:
-    """Whether the node is the first on the way, and is to wait for all others."""
+    """Whether the node is a source, which starts after all others."""
     return NODES[spec.executable].place == Place.SOURCE
 
 
 def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and those that it would have live, with a bag and with everything that may be added."""
+    """The nodes of a graph, and all that it could have: live, with a bag, and with all optional nodes."""
     more = {
         **options,
         "record": "recording",
-        "imus": options["imus"] or graph.SOME_IMUS,
+        "imus": options["imus"] or graph.EXAMPLE_IMUS,
         "robot": options["robot"] or "robot.yaml",
         "viewer": True,
         "markers": True,
@@ -226,14 +205,14 @@ def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
 
 
 def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, Stage]:
-    """The stages of a graph, connected with each other, by the names of their nodes in the order of their places.
+    """The connected stages of a graph, by the names of their nodes, in the order of their places.
 
     Args:
         specs: the nodes.
         parameters: of each.
 
     Raises:
-        BodyTrackingError: parameters that a node cannot have.
+        BodyTrackingError: invalid parameters of a node.
     """
     hosts = sorted(
         (spec for spec in specs if spec.executable in STAGES), key=lambda spec: STAGES.index(spec.executable)
@@ -249,7 +228,7 @@ def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, 
 
 
 def subscribers(specs: Sequence[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, int]:
-    """How many nodes of a graph take each topic; arguments and errors as of :func:`stages_for`."""
+    """The number of nodes of a graph that take each topic; arguments and errors as of :func:`stages_for`."""
     stages = stages_for(specs, parameters)
     count = Counter(port.topic for stage in stages.values() for port in stage.inputs)
     published = {port.topic for stage in stages.values() for port in stage.outputs if not port.optional}
@@ -269,16 +248,16 @@ CONFIG_HEADER = """\
 # Every parameter of every node at its default. Written by `make docs` from the code; copy it, keep what you change:
 #   body_tracking up --params-file my_parameters.yaml
 #   ros2 launch body_tracking two_kinects.launch.py params_file:=my_parameters.yaml
-# What the graph hangs together by (names of sensors, the bag, simulated time) is the command line's to say, not the
-# file's. A section /** is about all nodes that have the parameter.
+# The command line, not the file, sets what connects the graph: names of sensors, the bag, simulated time.
+# A section /** applies to all nodes that have the parameter.
 """
 
 
 def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
-    said = [option.parameter for option in OPTIONS.values() if option.parameter is not None]
+    settable = [option.parameter for option in OPTIONS.values() if option.parameter is not None]
     sections = {}
     for spec in sorted(all_nodes_for(options_of()), key=lambda spec: EXECUTABLES.index(spec.executable)):
-        hidden = spec.parameters.keys() - {parameter for node, parameter in said if node == spec.name}
+        hidden = spec.parameters.keys() - {parameter for node, parameter in settable if node == spec.name}
         sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
     return f"{CONFIG_HEADER}\n{as_yaml(sections)}"

@@ -1,4 +1,4 @@
-"""Hands turned over: a pose that points hardly tell from the true one."""
+"""Hands turned over: a pose with almost the same joint positions as the true one."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def run(
 
 @pytest.mark.parametrize("work_s", [0.001, 0.012])
 @pytest.mark.parametrize("stall_s", [0.0, 0.4])
-def test_who_is_fast_enough_loses_nothing_even_when_held_up(work_s: float, stall_s: float) -> None:
+def test_fast_node_drops_nothing_after_a_single_delay(work_s: float, stall_s: float) -> None:
     backlog, waited, lost = run(work_s, 10.0, (3.0, stall_s))
     assert not backlog.dropped and not +lost
     assert len(waited) >= 2 * 10 * 30 - 2 * DEPTH
@@ -55,7 +55,7 @@ def test_who_is_fast_enough_loses_nothing_even_when_held_up(work_s: float, stall
 
 
 @pytest.mark.parametrize("work_s", [0.02, 0.03, 0.08])
-def test_who_is_too_slow_drops_the_oldest_and_what_is_handled_is_of_now(work_s: float) -> None:
+def test_slow_node_drops_the_oldest_frames(work_s: float) -> None:
     backlog, waited, lost = run(work_s, 20.0)
     sent = 2 * 20 * 30
     assert sum(backlog.dropped.values()) + sum(lost.values()) + len(waited) == pytest.approx(sent, abs=2 * DEPTH)
@@ -77,7 +77,7 @@ def test_the_newest_frame_of_each_sensor_is_never_dropped() -> None:
     assert backlog.dropped == {"one": 1, "two": 1}
 
 
-def test_lost_messages_are_counted_by_their_numbers() -> None:
+def test_lost_messages_are_counted_by_sequence_numbers() -> None:
     sequences = Sequences()
     for number in (5, 6, 9, 10):
         sequences.note("one", number)
@@ -88,7 +88,7 @@ def test_lost_messages_are_counted_by_their_numbers() -> None:
     assert sequences.lost == {"one": 3}
 
 
-def test_two_publishers_that_take_turns_are_noticed_and_a_restarted_one_once() -> None:
+def test_alternating_publishers_are_counted_and_a_restart_once() -> None:
     sequences = Sequences()
     for number in (5, 6, 9, 10, 1, 2, 3):
         sequences.note("one", number)
@@ -106,7 +106,7 @@ def test_two_publishers_that_take_turns_are_noticed_and_a_restarted_one_once() -
 
 
 @pytest.mark.parametrize("stood_s", [0.5, 2.0, 60.0])
-def test_after_a_standstill_what_was_sent_before_is_left_out_and_nothing_else(stood_s: float) -> None:
+def test_only_messages_from_before_the_end_of_a_standstill_are_dropped(stood_s: float) -> None:
     standstill, now_ns = Standstill(), 10**18
     for _ in range(90):
         now_ns += PERIOD_NS

@@ -57,7 +57,7 @@ def test_without_distortion_it_is_the_pinhole(x: float, y: float, z: float) -> N
     np.testing.assert_allclose(pixel, [364.7 * x / z + 257.2, 365.1 * y / z + 207.4], rtol=1e-9)
 
 
-def test_what_is_not_before_the_camera_or_has_no_direction_is_not_a_number() -> None:
+def test_points_behind_the_camera_and_pixels_without_direction_are_nan() -> None:
     points = np.array([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert np.isfinite(camera().project(points)).all(axis=-1).tolist() == [False, False, True]
     barrel = camera(distortion=(-0.4, 0.0, 0.0, 0.0, 0.0))  # turns back at 0.61 of the radius
@@ -74,7 +74,7 @@ def test_opencv_has_the_same_pixels_and_directions(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_a_camera_goes_through_its_message(model: str) -> None:
+def test_camera_round_trip_through_its_message(model: str) -> None:
     raw = serialize(camera_to_info(camera(model), 5, BAG_MESSAGES))
     back = info_to_camera(deserialize(CAMERA_INFO, raw))
     assert (back.frame_id, back.width, back.height, back.model) == ("c_optical_frame", 512, 424, model)
@@ -102,6 +102,6 @@ def test_a_message_of_another_camera_is_refused(change: dict[str, object], text:
 
 
 @pytest.mark.parametrize("matrix", [np.eye(4), np.array([[300.0, 1.0, 0.0], [0.0, 300.0, 0.0], [0.0, 0.0, 1.0]])])
-def test_a_matrix_that_is_none(matrix: FloatArray) -> None:
+def test_invalid_matrix_is_refused(matrix: FloatArray) -> None:
     with pytest.raises(CameraError, match="c_optical_frame"):
         Camera("c_optical_frame", 512, 424, matrix, np.zeros(5))

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from body_tracking.core import so3
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import IMAGE, IMU, SEGMENTS
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import MAX_STAMP_NS, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import IMAGE, IMU, SEGMENTS, MessageError
+from body_tracking.messages.base import MessageError
 from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
 from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.model import (
@@ -76,12 +77,12 @@ def test_skeletons_are_written_and_read_as_by_the_serialiser(
 
 
 @given(st.binary(max_size=200))
-def test_other_bytes_are_left_to_others(data: bytes) -> None:
+def test_other_bytes_are_not_decoded(data: bytes) -> None:
     assert decode_skeletons(data) is None
 
 
 @given(st.integers(0, 2**32), st.integers(0, 2), st.data())
-def test_a_damaged_message_is_read_as_by_the_serialiser_or_left_to_it(
+def test_damaged_message_is_decoded_like_the_serialiser_or_not_at_all(
     seed: int, kind: int, data: st.DataObject
 ) -> None:
     cdr = bytearray(encode_skeletons(skeletons(seed, 10**9, "world", 1, kind)))
@@ -93,7 +94,7 @@ def test_a_damaged_message_is_read_as_by_the_serialiser_or_left_to_it(
         assert_same(slow, fast[0])
 
 
-def test_a_name_without_its_end_is_left_to_others() -> None:
+def test_unterminated_name_is_not_decoded() -> None:
     cdr = bytearray(encode_skeletons(skeletons(0, 10**9, "world", 1, 0)))
     assert cdr[16:22] == b"world\0"
     cdr[21] = 1
@@ -101,12 +102,12 @@ def test_a_name_without_its_end_is_left_to_others() -> None:
 
 
 @given(st.integers(0, 2**32), st.integers(0, 2), st.integers(1, 60))
-def test_a_message_that_is_cut_off_is_left_to_others(seed: int, kind: int, missing: int) -> None:
+def test_truncated_message_is_not_decoded(seed: int, kind: int, missing: int) -> None:
     cdr = encode_skeletons(skeletons(seed, 10**9, "world", 1, kind))
     assert decode_skeletons(cdr[:-missing]) is None
 
 
-def test_the_padding_may_hold_anything() -> None:
+def test_padding_bytes_are_ignored() -> None:
     """Fast CDR leaves in the padding what was in its buffer."""
     serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
     from body_tracking.messages.base import RosMessages
@@ -211,7 +212,7 @@ def orientation(seed: int, stamp_ns: int, frame_id: str, turning: bool) -> Segme
         ("velocity", np.full(32, -np.inf), "velocity of base_x is -inf"),
     ],
 )
-def test_a_model_state_that_is_none_is_refused(field: str, value: object, said: str) -> None:
+def test_invalid_model_state_is_refused(field: str, value: object, said: str) -> None:
     message = estimate_to_joint_state(estimate(0), MODEL, BAG_MESSAGES)
     setattr(message, field, value)
     with pytest.raises(MessageError, match=said):
@@ -231,7 +232,7 @@ def test_a_model_state_that_is_none_is_refused(field: str, value: object, said: 
         ("data", np.full(64 * 32, -1.0, "<f4").view(np.uint8), "a variance is negative"),
     ],
 )
-def test_a_covariance_that_is_none_is_refused(field: str, value: object, said: str) -> None:
+def test_invalid_covariance_is_refused(field: str, value: object, said: str) -> None:
     message = covariance_to_image(estimate(0), BAG_MESSAGES)
     setattr(message, field, value)
     with pytest.raises(MessageError, match=said):

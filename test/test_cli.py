@@ -17,7 +17,7 @@ COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "show",
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_every_command_explains_itself_and_the_help_names_it(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_a_help_and_is_listed(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         cli.main([*command.split(), "--help"])
     assert ended.value.code == 0
@@ -44,7 +44,7 @@ def test_the_version_is_the_manifests(capsys: pytest.CaptureFixture[str]) -> Non
         "evaluate nowhere",
     ],
 )
-def test_what_is_not_there_is_said_in_one_line(
+def test_missing_files_are_reported_in_one_line(
     command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -56,7 +56,7 @@ def test_what_is_not_there_is_said_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_reader_who_leaves_is_no_error() -> None:
+def test_closed_stdout_is_no_error() -> None:
     command = [sys.executable, "-m", "body_tracking.cli", "bag", "info", "--json", str(ROOT / "bags" / "tpose_wave")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -77,8 +77,8 @@ except SystemExit:
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell its threads")
-def test_the_command_computes_in_one_thread_unless_told_otherwise() -> None:
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not list threads")
+def test_command_computes_in_one_thread_by_default() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     said = [
         subprocess.run(

@@ -37,7 +37,7 @@ def test_without_drift_not_a_nanosecond_is_lost_even_since_an_epoch(stamp: int, 
     assert ClockModel(offset, 0.0, 0).to_reference(stamp + offset) == stamp
 
 
-def test_a_fast_clock_runs_ahead() -> None:
+def test_fast_clock_gains_on_the_reference() -> None:
     clock = ClockModel(2 * NANOSECONDS, 100.0, 0)
     assert clock.to_sensor(10 * NANOSECONDS) == 12 * NANOSECONDS + 1_000_000
     assert clock.offset == 2.0
@@ -54,7 +54,7 @@ def test_a_clock_is_the_same_by_its_offset_at_another_time(
     assert abs(moved.to_sensor(at) - clock.to_sensor(at)) <= 1000
 
 
-def test_a_clock_is_known_the_worse_the_longer_ago_it_was() -> None:
+def test_clock_uncertainty_grows_with_time() -> None:
     known = ClockModel(10**9, 20.0, 0, 0.003, 4.0)
     later_ns = 1000 * NANOSECONDS
     assert known.stddev_at(later_ns) == np.hypot(0.003, 0.004)
@@ -66,9 +66,7 @@ def test_a_clock_is_known_the_worse_the_longer_ago_it_was() -> None:
 
 
 @given(STAMPS, STAMPS, st.integers(-(10**9), 10**9), st.floats(-500, 500))
-def test_what_is_left_beside_a_base_and_the_base_are_the_clock(
-    anchor: int, other: int, offset: int, ppm: float
-) -> None:
+def test_minus_and_plus_of_a_base_clock_are_inverse(anchor: int, other: int, offset: int, ppm: float) -> None:
     clock, base = ClockModel(offset, ppm, anchor, 0.01, 5.0), ClockModel(-offset, 20.0, other, 0.3, 50.0)
     both = clock.minus(base).plus(base)
     assert (both.offset_ns, both.anchor_ns, both.stddev) == (offset, anchor, 0.01)
@@ -102,7 +100,7 @@ def test_the_least_delay_is_that_of_the_window(steps: list[tuple[int, int]], win
             assert least.at(time) == min(each + rise * (time - at) for at, each in counted)
 
 
-def test_a_clock_that_is_set_is_noticed_by_its_receipt_and_one_that_drifts_is_followed() -> None:
+def test_receipt_clock_detects_a_set_clock_and_follows_drift() -> None:
     clock = ReceiptClock()
     for second in range(600):
         now = second * NANOSECONDS

@@ -1,4 +1,4 @@
-"""What Fast DDS is told where nobody chose anything else."""
+"""The default settings of Fast DDS, and that the user's choice overrides them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def heartbeat() -> float:
     )
 
 
-def test_what_was_lost_is_sent_again_soon_on_this_machine_and_beyond() -> None:
+def test_heartbeat_period_is_short() -> None:
     dds.prepare()
     assert heartbeat() == pytest.approx(0.1)
     assert RANGE not in os.environ

@@ -54,7 +54,7 @@ ALONE = {"troubleshooting"}
         if commands(page)
     ],
 )
-def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+def test_commands_of_the_documentation_work(page: Path, tmp_path: Path) -> None:
     for item in ROOT.iterdir():
         if not item.name.startswith("."):
             (tmp_path / item.name).symlink_to(item)
@@ -99,7 +99,7 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
         assert code == 0, f"{page.name}: exit code {code} of\n{text}\n{output.read_text(errors='replace')}"
 
 
-def test_what_is_not_run_says_why() -> None:
+def test_skipped_commands_state_a_reason() -> None:
     """So that no block is left out by a misspelt mark."""
     for page in PAGES:
         for language, text in blocks(page):

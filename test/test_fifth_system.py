@@ -91,10 +91,10 @@ def test_its_layer_is_drawn_and_can_be_switched_off(monkeypatch: pytest.MonkeyPa
     )
     page = Page("127.0.0.1", 0, (), cast(Any, _Nobody()), ("ekf",), ("model",), 5.0, SYSTEM.layers)
     try:
-        nobody = Seen((), stale=True)
+        empty_view = Seen((), stale=True)
         empty = np.empty((0, 3)), np.empty((0, 4))
-        page.draw(Snapshot({}, {}, nobody, nobody, *empty, {"heights": (0, 1.75)}))
-        page.draw(Snapshot({}, {}, nobody, nobody, *empty))
+        page.draw(Snapshot({}, {}, empty_view, empty_view, *empty, {"heights": (0, 1.75)}))
+        page.draw(Snapshot({}, {}, empty_view, empty_view, *empty))
     finally:
         page.close()
     assert shown == [("1.75 m", True), ("", False)]

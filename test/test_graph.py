@@ -66,7 +66,7 @@ def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
 
 
-def test_sensors_of_somebody_else_need_no_nodes() -> None:
+def test_external_sensors_need_no_nodes() -> None:
     own, external = nodes_for(options_of()), nodes_for(options_of(external=True))
     assert [spec for spec in own if spec.executable != "kinect_skeleton"] == list(external)
     assert nodes_for(options_of(bag="bag", external=True)) == nodes_for(options_of(bag="bag"))
@@ -79,7 +79,7 @@ def counted(**given: Any) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_the_nodes_around_a_filter_follow_its_role_and_sources_wait_for_all_who_listen(name: str) -> None:
+def test_nodes_follow_the_filters_role_and_sources_wait_for_subscribers(name: str) -> None:
     role = ROLES[name]
     specs = named(nodes_for(options_of(bag="bag", record="r", filter=name)))
     angles = specs["joint_angles"].parameters
@@ -100,7 +100,7 @@ def test_the_nodes_around_a_filter_follow_its_role_and_sources_wait_for_all_who_
     assert whole.get(graph.MODEL_COVARIANCE, 0) == 2 * of_model
 
 
-def test_those_who_track_know_of_each_other_whom() -> None:
+def test_all_tracking_nodes_have_the_same_subject() -> None:
     given: dict[str, Any] = {"filter": "ekf", "subject": "all", "people": 2, "imus": ("forearm_left",)}
     specs = named(nodes_for(options_of(**given)))
     for name in ("fusion", "skeleton_filter", "joint_angles"):
@@ -118,7 +118,7 @@ def test_those_who_track_know_of_each_other_whom() -> None:
     assert (alone.state, alone.covariance) == (graph.MODEL_STATE, graph.MODEL_COVARIANCE)
 
 
-def test_whom_to_track_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+def test_subject_is_set_by_file_or_command_line(tmp_path: Path) -> None:
     file = tmp_path / "people.yaml"
     file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
     assert bodies_of(systems.with_file(options_of(), file)) == graph.bodies(4)
@@ -147,7 +147,7 @@ def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:
         parameters_for(nodes_for(options_of()), file)
 
 
-def test_a_robot_and_those_who_show_the_graph_listen_to_every_sensor() -> None:
+def test_robot_and_viewers_subscribe_to_every_sensor() -> None:
     specs = named(nodes_for(options_of(bag="bag", robot="robot.yaml")))
     assert specs["robot_commands"].parameters["mapping"] == "robot.yaml"
     assert specs["robot_commands"].parameters["sensors"] == ("kinect1", "kinect2")
@@ -165,7 +165,7 @@ def test_a_robot_and_those_who_show_the_graph_listen_to_every_sensor() -> None:
             assert found[topic] == plain[topic] + listeners
 
 
-def test_the_convention_is_the_robots() -> None:
+def test_convention_follows_the_robot() -> None:
     file = ROOT / "config" / "robots" / "iiwa7.yaml"
     assert convention_of(file, "") == convention_of(file, "auto") == "isb"
     with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
@@ -174,7 +174,7 @@ def test_the_convention_is_the_robots() -> None:
         convention_of(ROOT / "nowhere.yaml", "")
 
 
-def test_whether_the_covariance_is_recorded_is_in_the_parameters_file_or_on_the_command_line(tmp_path: Path) -> None:
+def test_recording_of_the_covariance_is_set_by_file_or_command_line(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text("/bag_recorder: {ros__parameters: {model_covariance: true}}\n")
     assert systems.with_file(options_of(), file)["model_covariance"]
@@ -210,7 +210,7 @@ def test_angles_of_positions_need_no_model() -> None:
         options_of(filter="schlagenhauf_ekf", angles_input="model_state"),
     ],
 )
-def test_a_filter_is_not_asked_for_what_it_cannot_do(options: Options) -> None:
+def test_options_that_the_filter_does_not_support_are_refused(options: Options) -> None:
     with pytest.raises(graph.GraphError, match=f"filter {options['filter']}"):
         nodes_for(options)
 
@@ -235,7 +235,7 @@ def test_another_cameras_driver_takes_the_place_of_a_sensors_node() -> None:
 
 
 @pytest.mark.parametrize("sensors", [(), ("a", "a"), ("fused",), ("a/b",)])
-def test_sensors_that_cannot_be(sensors: tuple[str, ...]) -> None:
+def test_invalid_sensors_are_refused(sensors: tuple[str, ...]) -> None:
     with pytest.raises(BodyTrackingError):
         nodes_for(options_of(sensors=sensors))
 

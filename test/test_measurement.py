@@ -20,7 +20,7 @@ def turned(degrees: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 45, 90, 135, 180, -60])
-def test_the_viewing_angle_is_the_bodys_yaw_to_the_sensor(degrees: float) -> None:
+def test_viewing_angle_is_the_yaw_to_the_sensor(degrees: float) -> None:
     assert viewing_angle(turned(degrees)) == pytest.approx(np.radians(abs(degrees)), abs=0.02)
 
 
@@ -29,7 +29,7 @@ def test_swapped_sides_look_like_a_back() -> None:
     assert_allclose(body_heading(AT_TWO_METRES[MIRROR]), -body_heading(AT_TWO_METRES))
 
 
-def test_a_joint_is_worth_less_from_the_side_from_afar_and_when_inferred() -> None:
+def test_noise_is_larger_from_the_side_from_afar_and_when_inferred() -> None:
     frontal = joint_stddev(AT_TWO_METRES, TRACKED)
     assert_allclose(frontal, BASE_STDDEV)
     assert_allclose(joint_stddev(turned(90), TRACKED), 3.2 * BASE_STDDEV, rtol=0.03)
@@ -37,7 +37,7 @@ def test_a_joint_is_worth_less_from_the_side_from_afar_and_when_inferred() -> No
     assert_allclose(joint_stddev(AT_TWO_METRES, TRACKED - 1), INFERRED_FACTOR * BASE_STDDEV)
 
 
-def test_what_is_not_tracked_is_worth_nothing() -> None:
+def test_untracked_joints_have_infinite_noise() -> None:
     states = TRACKED.copy()
     states[Joint.HEAD] = 0
     positions = AT_TWO_METRES.copy()

@@ -15,19 +15,12 @@ from scipy.spatial.transform import Rotation
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.imu import ImuSample, ImuSampleError
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import FLOAT_ARRAY, JOINT_TRAJECTORY, MARKERS, SEGMENTS
 from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
-from body_tracking.messages.base import (
-    FLOAT_ARRAY,
-    JOINT_TRAJECTORY,
-    MARKERS,
-    SEGMENTS,
-    MessageError,
-    MessageTypes,
-    RosMessages,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
@@ -59,7 +52,7 @@ ANGLES = JointAngles(
 )
 
 
-def test_angles_come_back_as_they_were(types: MessageTypes) -> None:
+def test_angles_round_trip(types: MessageTypes) -> None:
     found = joint_states_to_angles(*angles_to_joint_states(ANGLES, "body1", "world", types), "body1")
     assert (found.stamp_ns, found.names) == (ANGLES.stamp_ns, ANGLES.names)
     for name in ("position", "velocity", "position_stddev", "velocity_stddev"):
@@ -113,7 +106,7 @@ def test_a_trajectory_has_one_point_without_velocities(types: MessageTypes) -> N
 
 
 @pytest.mark.parametrize("level", [0, 2])
-def test_states_of_nodes_come_back(types: MessageTypes, level: int) -> None:
+def test_statuses_round_trip(types: MessageTypes, level: int) -> None:
     values = {"rate": "29.5", "to": "all"}
     sent = diagnostics(5, "fusion: stream", "", level, "waiting", {"rate": 29.5, "to": "all"}, types)
     (status,) = statuses(sent, 7.0)
@@ -131,7 +124,7 @@ oriented = st.tuples(st.just(np.array([0.5, -0.5, 0.5, 0.5])), covariances) | st
 
 
 @given(st.integers(0, 2**60), oriented, vectors, vectors, fields)
-def test_inertial_readings_come_back(
+def test_inertial_readings_round_trip(
     types: MessageTypes,
     stamp_ns: int,
     orientation: tuple[FloatArray | None, FloatArray | None],
@@ -148,7 +141,7 @@ def test_inertial_readings_come_back(
         assert imu.orientation_covariance[0] == -1.0
 
 
-def test_a_zero_quaternion_is_none_only_if_it_says_so() -> None:
+def test_zero_quaternion_is_absent_only_with_covariance_minus_one() -> None:
     message, _ = sample_to_messages(
         ImuSample(0, "wrist_link", orientation=np.array([0.0, 0.0, 0.0, 1.0])), BAG_MESSAGES
     )
@@ -170,7 +163,7 @@ def standing() -> Skeleton:
     return Skeleton(0, "world", rng.normal(size=(N_JOINTS, 3)), states, 0, covariances)
 
 
-def test_markers_arrive_as_they_were_drawn() -> None:
+def test_markers_round_trip() -> None:
     skeleton, pose = standing(), level_pose("kinect1", 1.0)
     markers = Markers(5, "world", BAG_MESSAGES)
     markers.figure("filtered", figure([skeleton], PALETTE[0]), PALETTE[0], 0.02, 0.01)
@@ -194,7 +187,7 @@ def test_markers_arrive_as_they_were_drawn() -> None:
     assert all(0 < marker.lifetime.nanosec < 1_000_000_000 for marker in message.markers)
 
 
-def test_segments_come_back_and_what_is_no_pose_is_refused_by_name() -> None:
+def test_segments_round_trip_and_invalid_poses_are_refused_by_name() -> None:
     model = UpperBody()
     q, nv = model.neutral(), model.nv
     estimate = ModelEstimate(7, "world", 0, q, np.zeros(nv), np.eye(2 * nv), np.empty(0), np.empty(0))

@@ -25,16 +25,14 @@ TOPIC = st.sampled_from(
 
 
 @given(NAMESPACE, TOPIC)
-def test_what_is_resolved_in_a_namespace_is_found_within_it_and_the_root_changes_nothing(
-    namespace: str, topic: str
-) -> None:
+def test_resolved_and_within_are_inverse(namespace: str, topic: str) -> None:
     assert within(resolved(topic, namespace), namespace) == topic
     assert resolved(topic, "/") == topic == within(topic, "/")
     assert relative(topic) in (topic, topic[1:])
 
 
 @given(NAMESPACE)
-def test_a_rig_is_known_by_its_skeletons_or_its_persons(namespace: str) -> None:
+def test_namespace_of_a_rig_is_found_by_skeletons_or_persons(namespace: str) -> None:
     for topic in (graph.skeleton_topic("kinect1"), graph.joint_states_topic("body1")):
         assert rig_namespace([resolved(topic, namespace), graph.TF, "/somebody/else"]) == namespace
     rig = [resolved(topic, namespace) for topic in (graph.skeleton_topic("a"), graph.FUSED, graph.TRUE_SKELETON)]

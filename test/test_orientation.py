@@ -20,7 +20,7 @@ GOOD: dict[str, Any] = {
 }
 
 
-def test_what_is_an_orientation_is_one() -> None:
+def test_valid_orientations_are_accepted() -> None:
     assert SegmentOrientation(**GOOD).frame_id == "world"
     assert SegmentOrientation(**GOOD | {"angular_velocity": None, "angular_velocity_variance": 0.0}).stamp_ns == 1
 
@@ -47,7 +47,7 @@ def test_what_is_an_orientation_is_one() -> None:
         ("angular_velocity_variance", np.nan, "variance of the angular velocity of nan"),
     ],
 )
-def test_what_is_none_is_refused(field: str, value: object, text: str) -> None:
+def test_invalid_orientations_are_refused(field: str, value: object, text: str) -> None:
     with pytest.raises(OrientationError) as caught:
         SegmentOrientation(**GOOD | {field: value})
     assert str(caught.value).startswith("orientation by 'wrist' at 1 ns: ")

@@ -152,7 +152,7 @@ def test_every_name_on_the_page_exists() -> None:
 @pytest.mark.parametrize(
     "row", [row for row in rows() if "::" in row.here], ids=lambda row: f"{row.paper} {row.numbers}"
 )
-def test_what_implements_a_number_names_it_and_its_paper(row: Row) -> None:
+def test_implementations_cite_number_and_paper(row: Row) -> None:
     for path, name in _REFERENCE.findall(row.here):
         text = docstring(path, name) or ""
         assert missing(mentions(row.numbers), mentions(text)) == [], f"{path}::{name}"

@@ -31,7 +31,7 @@ TABLE = (
 )
 
 
-def test_what_is_given_is_taken_and_the_rest_is_default() -> None:
+def test_given_values_are_taken_and_others_default() -> None:
     values = check_all(TABLE, {"gain": 2, "names": ["a", "", "b"]})
     assert values == {"gain": 2.0, "count": 3, "mode": "fast", "active": True, "names": ("a", "b")}
     assert type(values["gain"]) is float
@@ -57,7 +57,7 @@ def test_what_is_given_is_taken_and_the_rest_is_default() -> None:
         ({"gain": None}, "'gain': None, expected a number"),
     ],
 )
-def test_what_is_not_allowed_is_said_in_one_line(given_values: dict[str, object], said: str) -> None:
+def test_values_that_are_not_allowed_are_refused_in_one_line(given_values: dict[str, object], said: str) -> None:
     with pytest.raises(ParameterError) as caught:
         check_all(TABLE, given_values)
     assert said in str(caught.value)
@@ -119,7 +119,7 @@ def test_namespaces_and_dotted_names_may_be_nested_and_lists_be_tuples_as_launch
 
 
 @pytest.mark.parametrize("content", ["[1, 2]", "a: 1", "a: {ros__parameters: 1}", "a: [", "\x00"])
-def test_a_file_that_is_none(tmp_path: Path, content: str) -> None:
+def test_invalid_file_is_refused(tmp_path: Path, content: str) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(content)
     with pytest.raises(ParameterError, match=r"parameters\.yaml"):
@@ -139,5 +139,5 @@ def test_a_file_that_is_none(tmp_path: Path, content: str) -> None:
         ("/fusion", "/fusion2", False),
     ],
 )
-def test_sections_are_about_nodes_as_in_ros(pattern: str, node: str, match: bool) -> None:
+def test_sections_match_nodes_as_in_ros(pattern: str, node: str, match: bool) -> None:
     assert matches(pattern, node) is match

@@ -307,14 +307,14 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
             return process is not None and process.pid != pid
 
         assert graph_up.until(restarted, timeout=10.0), graph_up.text()
-        # Measured within the graph: how soon others hear of a new node is the affair of their own discovery.
+        # Measured within the graph: the discovery of other processes has a delay of its own.
         back = re.compile(rf"{name} is back: angles ([\d.]+) s later")
         assert graph_up.until(lambda back=back: back.search(graph_up.text()), timeout=10.0), graph_up.text()
         found = back.search(graph_up.text())
         assert found is not None
         assert float(found[1]) < 3.0, graph_up.text()
-        heard = len(graph_up.received)  # out here, where the node has to be discovered first
-        assert graph_up.until(lambda heard=heard: len(graph_up.received) > heard, timeout=5.0), graph_up.text()
+        received = len(graph_up.received)  # out here, where the node has to be discovered first
+        assert graph_up.until(lambda received=received: len(graph_up.received) > received, timeout=5.0), graph_up.text()
         assert graph_up.process.poll() is None
         others = graph_up.nodes()
         assert all(others[other].pid == before[other].pid for other in NODES if other != name)
@@ -335,7 +335,7 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_nothing_is_left_behind(up: Callable[..., Up], tmp_path: Path, how: signal.Signals) -> None:
+def test_no_process_remains(up: Callable[..., Up], tmp_path: Path, how: signal.Signals) -> None:
     graph_up = up("--bag", BAG, "--record", tmp_path / "recording")
     wanted = set(NODES) if how is signal.SIGINT else {"fusion", "calibration"}
     assert graph_up.until(lambda: set(graph_up.nodes()) >= wanted, timeout=30.0), graph_up.text()
@@ -376,7 +376,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     return lines[0]
 
 
-def test_a_bag_that_is_none_or_has_no_skeletons(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_invalid_bag_or_bag_without_skeletons_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert "nowhere" in refusal(capsys, "--bag", tmp_path / "nowhere")
     with BagWriter(tmp_path / "other") as writer:
         writer.add_topic("/fused/skeleton", "std_msgs/msg/String")

@@ -20,7 +20,7 @@ OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.
 
 PERSON = Person.average("male")
 ABOUT_FACE = np.array([-1.0, -1.0, 1.0])
-"""Level axes of somebody who faces a sensor into the sensor's."""
+"""Rotation from the level axes of a person who faces the sensor into the sensor's axes."""
 
 
 _WAVE_S = make_movement("two_handed_wave", PERSON).duration - TPOSE_S - END_S

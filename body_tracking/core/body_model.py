@@ -1,8 +1,8 @@
-"""What every body model offers, whatever body it is: the interface that filters and conversions are written against.
+"""The interface of body models, which filters and conversions are written against.
 
-The words are those of Pinocchio: a configuration ``q`` of size ``nq`` holds quaternions (x, y, z, w) where a rotation
-is free, a tangent vector ``v`` of size ``nv`` is a small change of it. Everything takes leading dimensions, of instants
-or people. World: x forward, y left, z up (REP-103), metres, radians.
+Terms as in Pinocchio: a configuration ``q`` of size ``nq`` holds a quaternion (x, y, z, w) for each free rotation, a
+tangent vector ``v`` of size ``nv`` is a small change of it. All functions take leading dimensions, of instants or
+people. World: x forward, y left, z up (REP-103), metres, radians.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ SEGMENTS: tuple[str, ...] = (
 
 
 class ModelError(BodyTrackingError):
-    """A body model was given something that is no configuration, or no segment lengths, of it."""
+    """Raised for a configuration or segment lengths that do not fit the model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:
-    """Where everything is.
+    """Positions of the joints and poses of the segments.
 
     Attributes:
         positions: (..., m, 3) metres, the model's ``joints``, in world.

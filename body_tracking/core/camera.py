@@ -16,7 +16,7 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray
 
 MODELS: Final = {"plumb_bob": 5, "rational_polynomial": 8}
-"""How many coefficients each model of distortion has."""
+"""Number of coefficients of each distortion model."""
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
@@ -24,7 +24,7 @@ _CONVERGED: Final = 1e-12
 
 
 class CameraError(BodyTrackingError):
-    """Something that should be a calibrated camera is none."""
+    """The parameters of a camera are invalid, or not calibrated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +71,7 @@ class Camera:
             )
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Pixels (..., 2) of points (..., 3) in the camera's frame, metres; NaN for points that are not before it."""
+        """Pixels (..., 2) of points (..., 3) in the camera's frame, metres; NaN for points that are not in front."""
         with np.errstate(divide="ignore", invalid="ignore"):
             flat = points[..., :2] / np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
         return self.to_pixels(self.distort(flat)[0])
@@ -94,7 +94,7 @@ class Camera:
         return pixels
 
     def distort(self, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the lens makes of ideal image coordinates (..., 2), x/z and y/z, and its Jacobian (..., 2, 2)."""
+        """Distorted coordinates of ideal image coordinates (..., 2), x/z and y/z, and the Jacobian (..., 2, 2)."""
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion.tolist(), 0.0, 0.0, 0.0)[:8]
         x, y = flat[..., 0], flat[..., 1]
         r2 = x * x + y * y
@@ -121,8 +121,7 @@ class Camera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Ideal image coordinates (..., 2), x/z and y/z, of pixels (..., 2), by Newton's method.
 
-        NaN where it does not converge: far outside the image the polynomials turn back, and no direction gives such a
-        pixel.
+        NaN where it does not converge: far outside the image the polynomials are not monotonic.
         """
         seen = (pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
         flat = np.array(seen)
@@ -141,7 +140,7 @@ class Camera:
                 flat = flat + step
                 if not (np.abs(step) > _CONVERGED).any():
                     break
-            # determinant and sign: on this side of where the polynomials turn back
+            # determinant and sign: within the range where the polynomials are monotonic
             known = (np.abs(step) < 1e3 * _CONVERGED).all(axis=-1) & (determinant > 0.0)
             known &= (flat * seen).sum(axis=-1) >= 0.0
         return np.where(known[..., None], flat, np.nan)

@@ -1,4 +1,4 @@
-"""Clocks against each other: a clock's offset and drift, the least delay of messages, and backward jumps of time."""
+"""Offset and drift between clocks, the least delay of messages, and backward jumps of time."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 
 JUMP_BACK_NS = NANOSECONDS
-"""A stamp further behind the one before than this is a backward jump of time (a loop, another recording, a clock that
-was set), not a late frame."""
+"""A stamp that is earlier than its predecessor by more than this is a backward jump of time (a loop, another recording,
+a clock that was set), not a late frame."""
 
 
 def jumped_back(stamp_ns: int, last_ns: int | None) -> bool:
-    """Whether a stamp is a backward jump of time after the last one; never after none."""
+    """Whether a stamp is a backward jump of time after the last one, if there is one."""
     return last_ns is not None and stamp_ns < last_ns - JUMP_BACK_NS
 
 
@@ -28,7 +28,7 @@ class ClockModel:
 
     Attributes:
         offset_ns: sensor clock minus reference clock at the anchor, nanoseconds.
-        drift_ppm: by how much the sensor's clock runs fast, parts per million.
+        drift_ppm: relative rate by which the sensor's clock is fast, parts per million.
         anchor_ns: reference time at which the offset holds exactly, and at which the errors of offset and drift are
             uncorrelated.
         stddev: of the offset at the anchor, seconds; infinity while unknown.
@@ -61,13 +61,13 @@ class ClockModel:
 
     def to_reference(self, sensor_ns: int) -> int:
         """The sensor's time to reference time; the inverse of :meth:`to_sensor` to a nanosecond."""
-        # In integers but for the drift's small share: stamps since an epoch have no room for nanoseconds in a float.
+        # Integer arithmetic except for the small drift: a float cannot hold nanoseconds since 1970.
         elapsed = sensor_ns - self.offset_ns - self.anchor_ns
         drift = self.drift_ppm * 1e-6
         return self.anchor_ns + elapsed - round(elapsed * (drift / (1.0 + drift)))
 
     def carried_to(self, reference_ns: int, wander_ppm: float = 0.0) -> ClockModel:
-        """The clock anchored at another time, if the drift may have changed by so much (a deviation) on the way."""
+        """The clock anchored at another time; ``wander_ppm`` is the standard deviation of the drift's change."""
         drift_stddev_ppm = float(np.hypot(self.drift_stddev_ppm, wander_ppm))
         stddev = ClockModel(anchor_ns=self.anchor_ns, stddev=self.stddev, drift_stddev_ppm=drift_stddev_ppm)
         return ClockModel(
@@ -79,7 +79,7 @@ class ClockModel:
         )
 
     def minus(self, base: ClockModel) -> ClockModel:
-        """What is left of offset and drift beside those of another clock, which is taken to be exact."""
+        """Offset and drift minus those of another clock, which is taken to be exact."""
         return self._with(self.offset_ns - base.offset_ns_at(self.anchor_ns), self.drift_ppm - base.drift_ppm)
 
     def plus(self, base: ClockModel) -> ClockModel:
@@ -91,7 +91,7 @@ class ClockModel:
 
 
 def line_information(times: FloatArray, weights: FloatArray) -> FloatArray:
-    """(2, 2) what offsets at times (n,) say of the line ``offset + drift * time``; weights (n,) inverse variances."""
+    """(2, 2) information of offsets at times (n,) on ``offset + drift * time``; weights (n,) are inverse variances."""
     once, twice = float(weights @ times), float(weights @ times**2)
     return np.array([[float(weights.sum()), once], [once, twice]])
 
@@ -101,9 +101,9 @@ def clock_of_line(line: FloatArray, information: FloatArray, zero_ns: int, floor
 
     Args:
         line: (2,) offset in seconds at the zero of time, and drift.
-        information: (2, 2) inverse of its covariance, of which that of the drift's prior is part.
-        zero_ns: reference time that counts as zero.
-        floor: seconds, a lower bound of the offset's deviation.
+        information: (2, 2) inverse of its covariance, the drift's prior included.
+        zero_ns: reference time of the line's zero.
+        floor: seconds, added in quadrature to the offset's standard deviation.
     """
     (variance, both), (_, drift_variance) = np.linalg.inv(information)
     at = -both / drift_variance
@@ -133,13 +133,13 @@ def fit_clock(
 
 
 class LeastDelay:
-    """The lower envelope of delays: whatever is in the way of a message only ever adds to them.
+    """The lower envelope of the delays of messages, to which transport only ever adds.
 
-    The delay of the quickest message at a time, ``min_i delay_i + rise (t - t_i)`` over the messages of the window.
+    The least delay at a time is ``min_i delay_i + rise (t - t_i)`` over the messages of the window.
 
     Args:
-        window: how far back messages count, in the unit of their times; None for ever.
-        rise: by how much the least delay may grow per unit of time, because the clocks drift.
+        window: length of the window, in the unit of the times; None for unlimited.
+        rise: growth of the least delay per unit of time, because the clocks drift.
     """
 
     def __init__(self, window: int | None = None, rise: float = 0.0) -> None:
@@ -154,7 +154,7 @@ class LeastDelay:
         self._lowest.clear()
 
     def add(self, time: int, delay: int) -> None:
-        """Take a message; times must not descend."""
+        """Add a message; times must not descend."""
         level = delay - round(self._rise * time)
         while self._lowest and self._lowest[-1][1] >= level:
             self._lowest.pop()
@@ -164,34 +164,31 @@ class LeastDelay:
             self._lowest.popleft()
 
     def at(self, time: int) -> int:
-        """The least delay at a time, not before that of the last message; there must have been one."""
+        """The least delay at a time not before the last message, of which there must have been one."""
         return self._lowest[0][1] + round(self._rise * time)
 
 
 class ReceiptClock:
-    """A clock by the times of receipt: stamps were given at the least :attr:`delay_ns` before the receipt.
-
-    The least delay of the last half minute, so that a clock that runs fast or slow is followed.
-    """
+    """Estimates a clock's offset from the times of receipt, by the least delay of the last half minute."""
 
     WINDOW_NS = 30 * NANOSECONDS
     SET_NS = NANOSECONDS // 2
-    """A delay that shrinks by more is no matter of transport: the clock was set."""
+    """A delay that shrinks by more than this means that the clock was set."""
 
     def __init__(self) -> None:
         self._least = LeastDelay(self.WINDOW_NS)
 
     def reset(self) -> None:
-        """Know nothing."""
+        """Forget all messages."""
         self._least.clear()
 
     @property
     def delay_ns(self) -> int | None:
-        """Receipt minus stamp at least; None before anything was received."""
+        """The least difference of receipt and stamp; None before the first message."""
         return self._least.at(0) if self._least else None
 
     def add(self, stamp_ns: int, received_ns: int) -> bool:
-        """Take one more; False when the clock was set since the last one."""
+        """Add a message; False when the clock was set since the last one."""
         delay, known = received_ns - stamp_ns, self.delay_ns
         was_set = known is not None and delay < known - self.SET_NS
         if was_set:

@@ -1,4 +1,4 @@
-"""``.csv`` and ``.csv.gz`` files line by line; what is wrong with one is an error with the line's number."""
+"""``.csv`` and ``.csv.gz`` files line by line; errors state the line's number."""
 
 from __future__ import annotations
 
@@ -24,14 +24,11 @@ class CsvError(BodyTrackingError):
 
 
 class CsvFile:
-    """Lines and cells of a file.
-
-    Args:
-        path: the file; gzip is recognised by the suffix ``.gz``.
+    """Lines and cells of a file; the suffix ``.gz`` means gzip.
 
     Attributes:
-        progress: how much of the file has been read, 0 to 1.
-        cut: how the file is cut off, known once its last line was read; empty where it is whole.
+        progress: share of the file that has been read, 0 to 1.
+        cut: how the file is truncated, known once its last line was read; empty where it is whole.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,7 +37,7 @@ class CsvFile:
         self.cut = ""
 
     def error(self, line: int, text: str) -> CsvError:
-        """What is wrong with a line, counted from 1."""
+        """The error of a line, counted from 1."""
         return CsvError(f"{self.path}, line {line}: {text}")
 
     def lines(self) -> Iterator[str]:
@@ -69,7 +66,7 @@ class CsvFile:
             raise CsvError(f"{self.path}: {error.strerror or error}") from error
 
     def rows(self, first: int, lines: list[str], separator: str = ",") -> list[list[str]]:
-        """The cells of each line, of which the first has this number; none for an empty line."""
+        """The cells of each line; ``first`` is the number of the first one. None for an empty line."""
         reader = csv.reader(lines, delimiter=separator, strict=True)
         try:
             rows = list(reader)
@@ -80,7 +77,7 @@ class CsvFile:
         return rows
 
     def time_ns(self, line: int, text: str, name: str) -> int:
-        """Seconds as text to nanoseconds, exactly: a double would round stamps that count from 1970."""
+        """Seconds as text to nanoseconds, exactly: a double would round stamps since 1970."""
         try:
             seconds = Decimal(text.strip())
         except InvalidOperation:
@@ -90,14 +87,14 @@ class CsvFile:
         return int((seconds * NANOSECONDS).to_integral_value())
 
     def check_whole(self, rows: int, partial: bool) -> list[str]:
-        """A warning where the file is cut off; none where it is whole.
+        """A warning where the file is truncated; none where it is whole.
 
         Args:
-            rows: those that are whole.
-            partial: whether the file is to be read so far.
+            rows: number of complete rows.
+            partial: whether to accept a truncated file.
 
         Raises:
-            CsvError: the file is cut off and not to be read so far, or has no rows.
+            CsvError: the file is truncated and ``partial`` is not set, or it has no rows.
         """
         text = f"{self.path}: {self.cut}; {rows} row(s) before that are whole"
         if not self.cut and not rows:

@@ -1,6 +1,6 @@
 """The base class of every error that the package raises on purpose.
 
-A module owns its own exception, derived from this one; whoever only wants a clear line to show catches the base.
+A module owns its own exception, derived from this one; a caller that only shows the text catches the base.
 """
 
 

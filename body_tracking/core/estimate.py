@@ -1,4 +1,4 @@
-"""What a filter, or a fit, says of a body model at one instant."""
+"""The estimate of a body model's state at one instant, by a filter or by a fit."""
 
 from __future__ import annotations
 

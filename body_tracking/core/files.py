@@ -1,4 +1,4 @@
-"""Files of whatever origin: opened only where they are regular ones, YAML read only as far as it harms nobody."""
+"""Reading untrusted files: only regular ones, and YAML only within limits of size, nesting and aliases."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import yaml
 from body_tracking.core.errors import BodyTrackingError
 
 MAX_BYTES = 4 << 20
-"""Bytes of a YAML file; the largest that anybody of us writes, of a recording in a thousand files, has half of that."""
+"""Bytes of a YAML file; our largest, the metadata of a recording in a thousand files, has half of that."""
 MAX_DEPTH = 40
-"""Lists and mappings in each other; a parameters file has about five."""
+"""Levels of nested lists and mappings; a parameters file has about five."""
 MAX_NODES = 50_000
-"""Values, lists and mappings, each alias counted as what it stands for; they take a second to read."""
+"""Values, lists and mappings, with every alias expanded; they take a second to read."""
 MAX_NUMBER = 100
 """Characters of a number."""
 
 SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's, where PyYAML was built with it: ten times as fast."""
+"""libyaml's where PyYAML was built with it, which is ten times as fast."""
 
 _OPENING = (yaml.SequenceStartEvent, yaml.MappingStartEvent)
 _CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
@@ -30,15 +30,15 @@ _NUMERIC = frozenset("+-.0123456789")
 
 
 class FileError(BodyTrackingError):
-    """A file cannot be read as what it should be; the text does not name it."""
+    """A file cannot be read, or has another format; the text does not name the file."""
 
 
 class FileLimitError(FileError):
-    """A file asks for more than any honest one does: size, nesting, aliases, digits."""
+    """A file exceeds a limit: of size, nesting, aliases or digits."""
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading; never a FIFO or a device, for which a reader waits without end.
+    """Open a file for reading; never a FIFO or a device, whose reader may block forever.
 
     Raises:
         OSError: it cannot be opened, or is no regular file.
@@ -78,12 +78,12 @@ def read_text(path: Path, limit: int = MAX_BYTES) -> str:
 def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> Any:
     """The content of a YAML text.
 
-    Its events are looked at first, which takes no more memory than the text: what is built of them is then small.
+    The limits are checked on the events, before any object is built of them.
 
     Args:
-        text: of whatever origin.
+        text: untrusted.
         loader: a safe one.
-        aliases: whether there may be any.
+        aliases: whether they are allowed.
 
     Raises:
         FileError: it is not YAML.
@@ -96,7 +96,7 @@ def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> A
         return yaml.load(text, loader)
     except BodyTrackingError:
         raise
-    except Exception as error:  # a number or time that is none raises whatever its constructor raises
+    except Exception as error:  # constructors of numbers and times raise errors of their own
         raise FileError(f"is not YAML ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 
@@ -110,14 +110,10 @@ def read_yaml(path: Path, loader: Any = SafeLoader, *, aliases: bool = True) -> 
 
 
 def _check(text: str, loader: Any, aliases: bool) -> None:
-    """Refuse nesting, aliases and numbers beyond the limits.
-
-    Raises:
-        FileLimitError: one of them.
-    """
+    """Refuse nesting, aliases and numbers beyond the limits (:class:`FileLimitError`)."""
     nodes = 0
-    sizes: dict[str, int] = {}  # of what has an anchor
-    open_at: list[tuple[str | None, int]] = []  # anchors of what is open, and the nodes before
+    sizes: dict[str, int] = {}  # nodes by anchor
+    open_at: list[tuple[str | None, int]] = []  # anchors of open collections, and the nodes before each
     for event in yaml.parse(text, loader):
         mark: Any = event.start_mark
         where = f"in line {mark.line + 1}"

@@ -1,8 +1,8 @@
-"""One reading of an inertial sensor, and what is plainly wrong with one, or with many in a row.
+"""Readings of an inertial sensor, and checks of single readings and of series.
 
-As REP-145 has it: angular rate and specific force (+9.8 m/s2 upwards at rest) in the sensor's own frame, SI units,
-orientation of the sensor in an earth frame with z up. What a driver gets wrong in one reading raises
-:class:`ImuSampleError`; what only many readings tell, such as an acceleration without gravity, :class:`ImuWatch` says.
+Conventions of REP-145: angular rate and specific force (+9.8 m/s2 upwards at rest) in the sensor's own frame, SI units,
+orientation of the sensor in an earth frame with z up. An invalid reading raises :class:`ImuSampleError`;
+:class:`ImuWatch` reports errors that show only over many readings, such as an acceleration without gravity.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 
 STANDARD_GRAVITY: Final = 9.80665
 """m/s2."""
@@ -25,23 +25,23 @@ MAX_RATE: Final = 75.0
 MAX_ACCELERATION: Final = 4000.0
 """m/s2, 400 g: beyond the range of every accelerometer that is worn."""
 MAX_FIELD: Final = 1e-3
-"""Tesla: ten times what a strong magnet close by adds to the earth's 25e-6 to 65e-6."""
+"""Tesla: ten times the field of a strong magnet nearby; the earth's is 25e-6 to 65e-6."""
 
 _NORM_TOLERANCE: Final = 0.01
-"""Of a quaternion; float32 on the way costs 1e-7, four digits of a text file 1e-4."""
+"""Of a quaternion's norm; float32 costs 1e-7, a text file with four digits 1e-4."""
 _ASYMMETRY: Final = 1e-6
-"""Of a covariance, as a share of its greatest element."""
+"""Of a covariance, relative to its greatest element."""
 
 
 class ImuSampleError(BodyTrackingError):
-    """A reading that no inertial sensor can have made, or in other units than REP-145 says."""
+    """A reading that no inertial sensor can have made, or in other units than REP-145's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
-    """What an inertial sensor said at one instant; None for what it did not say.
+    """One reading of an inertial sensor; None for quantities that it does not measure.
 
-    A quaternion that is slightly off unit length is normalised, its length beyond 1 % off is an error.
+    A quaternion is normalised; a norm that is off by more than 1 % is an error.
 
     Attributes:
         stamp_ns: nanoseconds of the sensor's own clock.
@@ -53,8 +53,8 @@ class ImuSample:
         magnetic_field: (3,) tesla in the sensor's frame.
 
     Raises:
-        ImuSampleError: a number that is not finite, a zero quaternion or one that is not normalised, a covariance that
-            is none, rates, accelerations or fields beyond what can be measured (other units), no frame.
+        ImuSampleError: a number that is not finite, a zero quaternion or one that is not normalised, an invalid
+            covariance, rates, accelerations or fields beyond the range of sensors (other units), no frame.
     """
 
     stamp_ns: int
@@ -81,7 +81,7 @@ class ImuSample:
 
 
 def check_magnetic_field(field: FloatArray) -> None:
-    """Whether (3,) can be a field in tesla.
+    """Check a field (3,) in tesla.
 
     Raises:
         ImuSampleError: not finite, or beyond 1e-3 T.
@@ -134,14 +134,14 @@ _WINDOW_S: Final = 3.0
 _EVERY_S: Final = 0.5
 _LEAST_SAMPLES: Final = 30
 _LEAST_FORCE, _MOST_FORCE = 0.6 * STANDARD_GRAVITY, 5.0 * STANDARD_GRAVITY
-"""Bounds of the median specific force of seconds: a body that falls half the time, and twice that of forearms that
-punch without a rest; the nearest wrong unit makes it 9.81 times too much."""
+"""Bounds of the median specific force over the window: that of a body that falls half the time, and twice that of
+forearms punching without rest; the nearest wrong unit is off by a factor of 9.81."""
 _IN_G: Final = 0.15
-"""How near to 1 g a median is, and how little half of the readings spread, that are in units of g."""
+"""Readings in units of g: largest deviation of their median from 1, and largest interquartile range."""
 _CALM: Final = 3.0
-"""m/s2 about gravity: nothing that turns as fast as :data:`_SPIN` is as calm 4 cm from its axis."""
+"""m/s2, interquartile range; a sensor that turns at :data:`_SPIN` 4 cm from the axis has a larger one."""
 _SPIN: Final = 9.0
-"""rad/s, median of seconds; fast arm movements have more only for tenths of seconds."""
+"""rad/s, median over the window; fast arm movements exceed it only for tenths of seconds."""
 
 GRAVITY_MISSING: Final = "gravity is missing from the acceleration"
 IN_G: Final = "the acceleration is in units of g, not m/s2"
@@ -151,10 +151,10 @@ FRAME_CHANGED: Final = "readings of two frames come as one sensor's"
 
 
 class ImuWatch:
-    """Finds in the readings of one sensor what no single reading tells.
+    """Detects errors of a driver that show only over many readings of a sensor.
 
-    Medians over 3 s, looked at twice a second: the size of the specific force tells whether gravity is in it and in
-    which unit, fast turning without any acceleration tells degrees. Time that runs backwards begins anew.
+    Every 0.5 s, medians over 3 s: the norm of the specific force shows a missing gravity or a wrong unit, fast turning
+    without acceleration shows deg/s. A backward jump of time clears the window.
     """
 
     def __init__(self) -> None:
@@ -162,19 +162,15 @@ class ImuWatch:
         self._frame: str | None = None
         self._due_ns = 0
         self._latest_ns: int | None = None
-        self._said: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Everything that was found so far."""
-        return tuple(self._said.values())
+        """All problems that were found so far."""
+        return tuple(self._reported.values())
 
     def add(self, sample: ImuSample) -> tuple[str, ...]:
-        """Look at the next reading.
-
-        Returns:
-            A line for each problem that has not been said before; one of a kind.
-        """
+        """Check the next reading; returns a line for each kind of problem that is found for the first time."""
         if self._latest_ns is None or sample.stamp_ns < self._latest_ns:
             self._readings.clear()
             self._due_ns = sample.stamp_ns
@@ -188,31 +184,31 @@ class ImuWatch:
             self._readings.popleft()
         if sample.stamp_ns >= self._due_ns:
             self._due_ns = sample.stamp_ns + round(_EVERY_S * NANOSECONDS)
-            found |= self._look()
-        new = {kind: text for kind, text in found.items() if kind not in self._said}
-        self._said |= new
+            found |= self._check_window()
+        new = {kind: text for kind, text in found.items() if kind not in self._reported}
+        self._reported |= new
         return tuple(new.values())
 
-    def _look(self) -> dict[str, str]:
-        """What the window tells, by kind."""
+    def _check_window(self) -> dict[str, str]:
+        """A line for each kind of problem in the window."""
         span = self._readings[-1][0] - self._readings[0][0]
         if len(self._readings) < _LEAST_SAMPLES or span < 0.5 * _WINDOW_S * NANOSECONDS:
             return {}
         _, forces, rates = np.array(self._readings).T
+        if not np.isfinite(forces).all():
+            return {}
         found: dict[str, str] = {}
-        known: BoolArray = np.isfinite(forces)
-        if not known.all():
-            return found
         low, median, high = np.percentile(forces, [25.0, 50.0, 75.0])
-        says = f"its median is {median:.3g}, expected {STANDARD_GRAVITY:.2f} m/s2"
+        kind = ""
         if abs(median - 1.0) < _IN_G and high - low < _IN_G:
-            found[IN_G] = f"{IN_G}: {says}"
+            kind = IN_G
         elif median < _LEAST_FORCE:
-            found[GRAVITY_MISSING] = f"{GRAVITY_MISSING}: {says}"
+            kind = GRAVITY_MISSING
         elif median > _MOST_FORCE:
-            found[WRONG_FORCE] = f"{WRONG_FORCE}: {says}"
-        # calm in whichever unit it is
-        calm = high - low < _CALM * median / STANDARD_GRAVITY
+            kind = WRONG_FORCE
+        if kind:
+            found[kind] = f"{kind}: its median is {median:.3g}, expected {STANDARD_GRAVITY:.2f} m/s2"
+        calm = high - low < _CALM * median / STANDARD_GRAVITY  # relative to the median, which may be in another unit
         if calm and np.isfinite(rates).all() and np.median(rates) > _SPIN:
             found[IN_DEGREES] = f"{IN_DEGREES}: its median is {np.median(rates):.3g} while the acceleration is calm"
         return found
@@ -227,7 +223,7 @@ def _size(vector: FloatArray | None) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedImu:
-    """What one inertial sensor said, in a recording.
+    """One reading of an inertial sensor in a recording.
 
     Attributes:
         sensor: its name.
@@ -242,10 +238,10 @@ class RecordedImu:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedAngles:
-    """Joint angles that a recording holds beside its sensors, as its own program computed them.
+    """Joint angles in a recording, computed by the program that made it.
 
     Attributes:
-        received_ns: of the receiver's clock; their stamp, too.
+        received_ns: by the receiver's clock; also their stamp.
         names: n names, as in the file.
         angles: (n,) radians.
     """
@@ -256,11 +252,11 @@ class RecordedAngles:
 
 
 class ImuRecording(Protocol):
-    """A file of inertial readings; its readers count what they meet while they are iterated.
+    """A file of inertial readings.
 
     Attributes:
-        problems: how often each kind of oddity was met.
-        warnings: a line for each thing that is missing.
+        problems: how often each kind of irregularity was read so far.
+        warnings: a line for each part that is missing.
     """
 
     problems: dict[str, int]
@@ -271,7 +267,7 @@ class ImuRecording(Protocol):
 
     @property
     def progress(self) -> float:
-        """How much of the file has been read, 0 to 1."""
+        """Share of the file that has been read, 0 to 1."""
 
 
 def imu_frame(sensor: str) -> str:

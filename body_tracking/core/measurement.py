@@ -1,7 +1,7 @@
-"""How much a skeleton camera's joint position is worth, and which way a seen body faces.
+"""Measurement noise of a skeleton camera's joints (DESIGN 6), and the heading of a body.
 
-The measurement noise of DESIGN 6: per joint, from its tracking state, its distance and the angle under which the sensor
-sees the body. Calibration, fusion and filters weigh with the same model.
+The noise of a joint depends on its tracking state, its distance and the body's yaw to the sensor. Calibration, fusion
+and filters all use this model.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BASE_STDDEV: FloatArray = _base_stddev()
 """(25,) metres."""
 
 INFERRED_FACTOR = 3.0
-"""An Inferred joint is a guess of the SDK: three times the standard deviation."""
+"""Factor on the standard deviation of an Inferred joint, which the SDK guesses."""
 
 _LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
@@ -90,12 +90,12 @@ def viewing_angle(positions: FloatArray) -> FloatArray:
 
 
 def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | None = None) -> FloatArray:
-    """The standard deviation of each joint position, the same in all directions.
+    """The standard deviation of each joint position, isotropic.
 
     Args:
         positions: (..., 25, 3) metres in the sensor's optical frame.
         states: (..., 25) tracking states.
-        angle: (...) what :func:`viewing_angle` says of the positions, where it is known already.
+        angle: (...) :func:`viewing_angle` of the positions; computed when None.
 
     Returns:
         (..., 25) metres; infinity for joints that are not tracked or not finite.

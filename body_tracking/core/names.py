@@ -2,7 +2,7 @@
 
 Everywhere in this package a topic has its name in the root namespace, as in ``/fused/skeleton``. A node uses the
 :func:`relative` name, so that the node's namespace holds the whole rig; a recording holds :func:`resolved` names, and
-:func:`rig_namespace` finds out whose they are. Knows no ROS library.
+:func:`rig_namespace` finds the rig's namespace among them.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ DIAGNOSTICS: Final = "/diagnostics"
 TF: Final = "/tf"
 TF_STATIC: Final = "/tf_static"
 WHOLE_DOMAIN: Final = frozenset({CLOCK, DIAGNOSTICS, TF, TF_STATIC, "/rosout", "/parameter_events"})
-"""Topics that all rigs of a domain share, as everywhere in ROS."""
+"""Topics that all rigs of a domain share."""
 
 _RIG: Final = re.compile(r"((?:/\w+)*?)/(?:\w+/skeleton|humans/bodies/\w+/\w+)")
-"""Topics by which a rig is known, whatever it consists of."""
+"""Topics that every rig has, whatever it consists of."""
 
 
 class NamespaceError(BodyTrackingError):
-    """A namespace that is none."""
+    """Not a valid namespace."""
 
 
 def check_namespace(text: str) -> str:
     """A namespace as ROS writes it: ``/`` for the root, else with a leading slash and none at the end.
 
     Raises:
-        NamespaceError: it cannot be one.
+        NamespaceError: it is not a valid one.
     """
     name = text.strip("/")
     if name and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
@@ -41,7 +41,7 @@ def check_namespace(text: str) -> str:
 
 
 def relative(topic: str) -> str:
-    """The name that a node uses, so that the topic is in the node's namespace; the whole domain's stay as they are."""
+    """The name that a node uses, relative to its namespace; topics of the whole domain keep their names."""
     return topic if topic in WHOLE_DOMAIN else topic.removeprefix("/")
 
 
@@ -59,6 +59,6 @@ def within(topic: str, namespace: str) -> str | None:
 
 
 def rig_namespace(topics: Iterable[str]) -> str:
-    """The namespace of the rig that these full names belong to; the root where there is none, or there are several."""
+    """The namespace of the rig with these full topic names; the root where there is no rig or more than one."""
     found = {match[1] for topic in topics if (match := _RIG.fullmatch(topic))}
     return found.pop() or "/" if len(found) == 1 else "/"

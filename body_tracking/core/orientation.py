@@ -1,7 +1,4 @@
-"""One measured orientation of one segment of the body: what inertial sensors say once they are aligned.
-
-The counterpart of ``skeleton.py`` for sources that know how a segment is turned and not where it is.
-"""
+"""One measured orientation of one segment of the body, as an aligned inertial sensor gives it."""
 
 from __future__ import annotations
 
@@ -15,35 +12,35 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
 
 SEGMENT_NUMBER: Final = {name: number for number, name in enumerate(SEGMENTS)}
-"""Of each segment its place in :data:`~body_tracking.core.body_model.SEGMENTS`."""
+"""Index of each segment in :data:`~body_tracking.core.body_model.SEGMENTS`."""
 
 MAX_RATE: Final = 70.0
-"""Radians per second: a gyroscope's greatest range is 4000 deg/s; beyond is no measurement but a damaged number."""
+"""rad/s; the widest range of a gyroscope is 4000 deg/s, a larger number is corrupt."""
 _ORTHOGONAL = 1e-6
 _EYE3 = np.eye(3)
 
 
 class OrientationError(BodyTrackingError):
-    """Something that should be the orientation of a segment is not one."""
+    """Not a valid orientation of a segment."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentOrientation:
-    """How a segment was turned at one instant, as its sensor has it.
+    """The orientation of a segment at one instant, as its sensor measured it.
 
     Attributes:
         stamp_ns: capture time in nanoseconds, in the reference clock.
         source: name of the inertial sensor.
-        segment: on which it sits, one of ``upper_body.SEGMENTS``.
+        segment: that carries it, one of ``SEGMENTS``.
         rotation: (3, 3) the segment's vectors to ``frame_id``.
-        covariance: (3, 3) rad2 about the axes of ``frame_id``, positive definite: of all that is wrong with
-            the orientation, not only of what changes from one sample to the next.
+        covariance: (3, 3) rad2 about the axes of ``frame_id``, positive definite; of the total error, not only of the
+            white noise.
         angular_velocity: (3,) rad/s of the segment about its own axes, or None.
-        angular_velocity_variance: rad2/s2 per axis; of no meaning without the former.
+        angular_velocity_variance: rad2/s2 per axis; meaningless without the angular velocity.
         frame_id: a fixed frame with z up.
 
     Raises:
-        OrientationError: not finite, no rotation, no covariance, an unknown segment.
+        OrientationError: not finite, an invalid rotation or covariance, an unknown segment.
     """
 
     stamp_ns: int

@@ -1,7 +1,7 @@
-"""Parameters as data: what a node can be told, with its unit, range and default, in one place.
+"""Parameters as data: name, unit, range and default of each parameter of a node.
 
-The nodes declare what is listed here, ``body_tracking up`` checks a parameters file against it before anything starts,
-and the documentation prints it. Knows no ROS library.
+The nodes declare these parameters, ``body_tracking up`` checks a parameters file against them before it starts a node,
+and the documentation prints them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SECTION = "ros__parameters"
 
 
 class ParameterError(BodyTrackingError):
-    """A parameter with an unknown name, of the wrong type or out of its range; or a file of them that is none."""
+    """A parameter with an unknown name, of the wrong type or out of its range; or an invalid parameters file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Parameter:
         max: the greatest value, of a number.
         choices: the allowed values, of a string; empty for any.
         live: whether it may change while the node runs.
-        fixed: why it may not, where there is more to it than that it is read at the start.
+        fixed: why it may not; empty where the reason is only that it is read at the start.
     """
 
     name: str
@@ -58,13 +58,13 @@ class Parameter:
 
     @property
     def type_name(self) -> str:
-        """For people."""
+        """The type in words."""
         names = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
         return names.get(type(self.default), "a list of strings")
 
     @property
     def constraint(self) -> str:
-        """What values are allowed, for people; empty for any."""
+        """The allowed values in words; empty for any."""
         if self.choices:
             return ", ".join(self.choices)
         if self.min is None and self.max is None:
@@ -74,7 +74,7 @@ class Parameter:
         return f"at most {self.max:g}" if self.min is None else f"{self.min:g} to {self.max:g}"
 
     def check(self, value: object) -> Value:
-        """The value in the parameter's own type; a whole number serves as a number.
+        """The value in the parameter's own type; an integer is accepted for a float.
 
         Raises:
             ParameterError: another type, or out of range.
@@ -93,17 +93,17 @@ class Parameter:
         return checked
 
     def check_change(self, value: object) -> Value:
-        """As :meth:`check`, of a node that runs.
+        """As :meth:`check`, for a change while the node runs.
 
         Raises:
-            ParameterError: not allowed at all, or not while the node runs, with the reason and what to do instead.
+            ParameterError: not allowed at all, or not while the node runs; states the reason and the remedy.
         """
         checked = self.check(value)
         if not self.live:
             why = self.fixed or "it is read at the start"
             raise ParameterError(
                 f"parameter {self.name!r} cannot change while the node runs: {why}. "
-                f"Start it anew with the value in --params-file, or with -p {self.name}:=VALUE"
+                f"Restart it with the value in --params-file, or with -p {self.name}:=VALUE"
             )
         return checked
 
@@ -138,11 +138,10 @@ def parameters_from(
     Args:
         parameter_class: a dataclass with a default for every field; ``field(metadata=...)`` may hold ``doc``, ``unit``,
             ``min``, ``max`` and ``choices``.
-        only: the fields that users may set, by name; all when empty. Others keep their defaults, whose source stands
-            beside them, but for who uses the class.
+        only: the fields that become parameters, by name; all when empty.
         live: whether they may change while the node runs.
         prefix: of the parameters' names, such as ``ekf.``.
-        fixed: those that may not even so, and why not; empty for the usual reason.
+        fixed: fields that may not change even if ``live``, with the reason; an empty reason for the usual one.
     """
     table = []
     for item in fields(parameter_class):
@@ -161,12 +160,12 @@ def check_fields(parameters: Any, what: str, error: type[BodyTrackingError]) -> 
     """Check the values of a parameter dataclass by the metadata of its fields.
 
     Args:
-        parameters: an instance of a class as :func:`parameters_from` takes it.
-        what: the parameters are of, for the error's text.
+        parameters: an instance of a class that :func:`parameters_from` takes.
+        what: begins the error's text.
         error: the class of the error.
 
     Raises:
-        BodyTrackingError: a value is of another type, or out of its range: one of the class ``error``.
+        BodyTrackingError: of the class ``error``; a value is of another type, or out of its range.
     """
     for item in parameters_from(type(parameters)):
         try:
@@ -176,7 +175,7 @@ def check_fields(parameters: Any, what: str, error: type[BodyTrackingError]) -> 
 
 
 def fields_of(parameter_class: type[Any], values: Mapping[str, Value], *, prefix: str = "") -> dict[str, Any]:
-    """Those of a node's values that are fields of a library's parameter dataclass; ``prefix`` as given above."""
+    """Those of a node's values that are fields of a parameter dataclass; ``prefix`` as in :func:`parameters_from`."""
     names = (item.name for item in fields(parameter_class))
     return {name: values[f"{prefix}{name}"] for name in names if f"{prefix}{name}" in values}
 
@@ -196,7 +195,7 @@ def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[s
 
 
 def unknown_parameter(name: str, known: Collection[str]) -> ParameterError:
-    """The error of a name that is none of those that are known."""
+    """The error for an unknown name, with the most similar known one."""
     similar = get_close_matches(name, known, n=1)
     hint = f"did you mean {similar[0]!r}?" if similar else f"known: {', '.join(sorted(known))}"
     return ParameterError(f"unknown parameter {name!r}; {hint}")
@@ -206,7 +205,7 @@ def unknown_parameter(name: str, known: Collection[str]) -> ParameterError:
 
 
 class _Loader(files.SafeLoader):  # type: ignore[misc]
-    """PyYAML's safe loader, which also reads the tuples that ``ros2 launch`` writes for lists."""
+    """PyYAML's safe loader that also reads the tuples that ``ros2 launch`` writes for lists."""
 
 
 yaml.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_yaml_seq, _Loader)
@@ -228,7 +227,7 @@ def read_file(path: Path) -> dict[str, dict[str, object]]:
 
 
 def _collect(path: Path, content: object, name: str, sections: dict[str, dict[str, object]]) -> None:
-    """Namespaces may be nested: ``ns: {node: {ros__parameters: ...}}``."""
+    """Collect the sections of nested namespaces: ``ns: {node: {ros__parameters: ...}}``."""
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: {name or 'the file'} holds no {SECTION}")
     for key, value in content.items():
@@ -245,7 +244,7 @@ def _collect(path: Path, content: object, name: str, sections: dict[str, dict[st
 
 
 def _flatten(values: Mapping[object, object], prefix: str, flat: dict[str, object]) -> None:
-    """ROS writes the name ``a.b`` as ``a: {b: ...}`` too."""
+    """Collect full names: ROS writes ``a.b`` as ``a: {b: ...}`` too."""
     for key, value in values.items():
         if isinstance(value, dict):
             _flatten(value, f"{prefix}{key}.", flat)
@@ -254,11 +253,7 @@ def _flatten(values: Mapping[object, object], prefix: str, flat: dict[str, objec
 
 
 def as_yaml(sections: Mapping[str, Sequence[Parameter]]) -> str:
-    """A parameters file with every parameter at its default, explained.
-
-    Args:
-        sections: the parameters of each node.
-    """
+    """A commented parameters file with every parameter of each node at its default."""
     lines: list[str] = []
     for node, table in sections.items():
         lines += ["", f"{node}:", f"  {SECTION}:"]
@@ -273,7 +268,7 @@ def as_yaml(sections: Mapping[str, Sequence[Parameter]]) -> str:
 
 
 def matches(pattern: str, node: str) -> bool:
-    """Whether a section of a parameters file is about the node of this full name, such as ``/fusion``.
+    """Whether a section of a parameters file applies to the node of this full name, such as ``/fusion``.
 
     ``*`` stands for one part of the name, ``**`` for any number of them.
     """
@@ -290,12 +285,12 @@ def matches(pattern: str, node: str) -> bool:
 
 
 def to_ros(value: Value) -> bool | int | float | str | list[str]:
-    """A value as ROS takes it; an empty list would have no type there and becomes ``[""]``."""
+    """A value in ROS's types; an empty list, which has no type there, becomes ``[""]``."""
     return list(value) or [""] if isinstance(value, tuple) else value
 
 
 def is_wildcard(pattern: str) -> bool:
-    """Whether a section may be about several nodes."""
+    """Whether a section may apply to several nodes."""
     return "*" in pattern
 
 

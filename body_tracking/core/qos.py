@@ -1,4 +1,4 @@
-"""Quality of service as a bag stores it: the YAML form of rosbag2, without any ROS library.
+"""Quality of service as a bag stores it, in the YAML form of rosbag2.
 
 rosbag2 writes the names of the policies from metadata version 9 (Jazzy) on, and the numbers of ``rmw`` before.
 """
@@ -35,13 +35,13 @@ _DURATIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """What one publisher offered.
+    """The profile that one publisher offers.
 
     Attributes:
         reliability: ``reliable`` or ``best_effort``.
         durability: ``volatile`` or ``transient_local``.
-        depth: messages kept; 0 where discovery did not tell.
-        history: ``keep_last``, ``keep_all``, or ``unknown`` where discovery did not tell.
+        depth: messages kept; 0 where discovery did not report it.
+        history: ``keep_last``, ``keep_all``, or ``unknown`` where discovery did not report it.
         deadline_ns: nanoseconds.
         lifespan_ns: nanoseconds.
         liveliness: ``automatic`` or ``manual_by_topic``.
@@ -64,14 +64,14 @@ RELIABLE = Qos()
 SENSOR_DATA = Qos(reliability="best_effort", depth=5)
 LATCHED = Qos(durability="transient_local", depth=10)
 LATEST = Qos(reliability="best_effort", depth=1)
-"""To ask for: whatever is the newest, at no cost to who sends it."""
+"""For a subscriber that needs only the newest message and must not hold up the publisher."""
 
 
 def offer_for(recorded: Sequence[Qos]) -> Qos:
     """The profile under which to play a topic again, so that every subscription that matched then matches now.
 
-    What one publisher offered is offered as it was; of several, the strongest of each policy. What discovery did not
-    tell (history, depth) becomes the usual ``keep_last`` 10.
+    The profile of a single publisher is kept; of several, the strongest of each policy is taken. Where discovery did
+    not report history and depth, they become the usual ``keep_last`` 10.
     """
     if not recorded:
         return RELIABLE
@@ -90,13 +90,9 @@ def offer_for(recorded: Sequence[Qos]) -> Qos:
 
 
 def request_for(offered: Sequence[Qos], depth: int) -> Qos:
-    """The profile of a subscription that matches every one of these publishers and takes the most from them.
+    """The strongest profile of a subscription that matches every one of these publishers.
 
-    Reliable if every publisher is, transient local likewise.
-
-    Args:
-        offered: what the publishers of the topic offer now.
-        depth: messages that may wait for the subscriber.
+    Reliable if every publisher is, transient local likewise; ``depth`` is the subscriber's queue, messages.
     """
     reliable = all(qos.reliability == "reliable" for qos in offered)
     latched = all(qos.durability == "transient_local" for qos in offered)
@@ -115,13 +111,9 @@ def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
     return profiles
 
 
-# libyaml, where PyYAML was built with it, is ten times as fast; a short replay notices.
-_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-
 def dump_yaml(content: Any) -> str:
-    """``yaml.safe_dump`` in the given order, as fast as the installation allows."""
-    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False)
+    """``yaml.safe_dump`` in the given order; by libyaml where PyYAML was built with it, which is ten times as fast."""
+    text: str = yaml.dump(content, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
     return text
 
 
@@ -133,8 +125,7 @@ def dump(offers: Sequence[Qos]) -> str:
 def load(value: object) -> tuple[Qos, ...]:
     """The profiles in ``offered_qos_profiles`` of any metadata version, text or list.
 
-    Whatever cannot be understood falls back to the default of that policy: a recording whose QoS is odd is still a
-    recording.
+    A value that cannot be read falls back to the default of its policy, so that the recording can still be played.
     """
     if isinstance(value, str):
         try:

@@ -1,4 +1,4 @@
-"""What a calibration says of one sensor: where it stands, and how its clock runs."""
+"""The result of a calibration: the pose and the clock of each sensor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SensorPose:
         sensor: its name.
         translation: (3,) metres.
         quat_xyzw: (4,) unit quaternion that takes optical coordinates into ``world``.
-        valid_from_ns: reference time from which it is to be used; 0 for always.
+        valid_from_ns: reference time from which it is valid; 0 for always.
     """
 
     sensor: str
@@ -30,7 +30,7 @@ class SensorPose:
     @cached_property
     def rotation(self) -> FloatArray:
         """(3, 3) rotation matrix, optical to world."""
-        # Imported here because it takes a third of a second, and most nodes only pass poses on or have none.
+        # Imported here because it takes a third of a second, and most nodes need no rotation.
         from scipy.spatial.transform import Rotation
 
         matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()
@@ -63,11 +63,11 @@ class SensorQuality:
     """How well one sensor's calibration is known.
 
     Attributes:
-        residual: median distance between what both sensors say of the same joint, metres; NaN before any overlap.
+        residual: median distance between both sensors' positions of a joint, metres; NaN before any overlap.
         rotation_stddev: radians; infinity while unknown.
-        translation_stddev: metres at the place where the person was; infinity while unknown.
+        translation_stddev: metres, at the place of the person; infinity while unknown.
         clock_stddev: of the clock's offset at its anchor, seconds; infinity while unknown.
-        frames: pairs of frames that the estimate stands on.
+        frames: pairs of frames that the estimate is made of.
         clock_drift_stddev_ppm: of the clock's drift, parts per million; infinity while unknown.
     """
 

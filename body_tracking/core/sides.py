@@ -18,7 +18,7 @@ SAME_SENSE = 0.5
 """Cosine between two axes above which they have the same sense; a mean of axes farther apart has no length left."""
 
 _SHORTEST = 0.02
-"""An axis shorter than this has no direction, metres."""
+"""An axis shorter than this, metres, has no heading."""
 
 PAIRS = (
     np.array([Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT], dtype=np.intp),
@@ -32,7 +32,7 @@ _LOWER = np.isin(
 )
 _LATERAL = np.arange(N_JOINTS) != MIRROR
 HALVES = (np.flatnonzero(_LATERAL & ~_LOWER), np.flatnonzero(_LATERAL & _LOWER))
-"""The joints that have a left and a right: of the upper and of the lower body."""
+"""The paired joints (left and right) of the upper and of the lower body."""
 
 
 def headings_of(points: FloatArray) -> list[float]:
@@ -45,7 +45,7 @@ def headings_of(points: FloatArray) -> list[float]:
 
 
 def heading_weights(points: FloatArray, variance: FloatArray) -> list[float]:
-    """What :func:`headings_of` is worth: the inverse variances of both headings, 1/rad2; 0 where not known.
+    """The inverse variances of both headings of :func:`headings_of`, 1/rad2; 0 where not known.
 
     The variance of the direction of an axis is that of the difference of its ends across it over its squared length.
 
@@ -62,18 +62,17 @@ def heading_weights(points: FloatArray, variance: FloatArray) -> list[float]:
 
 
 def reversed_halves(headings: Sequence[float], believed: Sequence[float]) -> list[tuple[IntArray, bool]]:
-    """The halves of a body that do not have the believed heading, as far as that is known.
+    """The halves of a body whose heading differs from the reference; a half with an unknown heading is left out.
 
     Args:
-        headings: of both halves, as :func:`headings_of` says.
-        believed: those that are taken for true.
+        headings: of both halves, from :func:`headings_of`.
+        believed: the reference headings of both halves.
 
     Returns:
-        The joints of each such half, and whether its heading is opposite to the believed one, so that left and right
-        are swapped; else it is across.
+        The joints of each such half, and whether its heading is opposite to the reference, so that left and right
+        are swapped; otherwise it is across.
     """
-    cosines = [math.cos(a - b) for a, b in zip(headings, believed, strict=True)]
-    # NaN for an axis that is not known: nothing to be said
+    cosines = [math.cos(a - b) for a, b in zip(headings, believed, strict=True)]  # NaN for an unknown heading
     return [
         (joints, cosine < -SAME_SENSE) for joints, cosine in zip(HALVES, cosines, strict=True) if cosine < SAME_SENSE
     ]
@@ -82,12 +81,12 @@ def reversed_halves(headings: Sequence[float], believed: Sequence[float]) -> lis
 def swap_left_right(
     halves: Sequence[tuple[IntArray, bool]], points: FloatArray, variance: FloatArray, states: np.ndarray
 ) -> None:
-    """Swap left and right, in place, in halves that are opposite, and give up the joints of those that are across.
+    """Swap left and right, in place, in halves that are opposite, and reject the joints of those that are across.
 
     Args:
-        halves: as :func:`reversed_halves` says.
+        halves: from :func:`reversed_halves`.
         points: (25, 3) metres.
-        variance: (25,) square metres; doubled by a swap, infinite where given up.
+        variance: (25,) square metres; doubled by a swap, infinite for rejected joints.
         states: (25,).
     """
     for joints, opposite in halves:

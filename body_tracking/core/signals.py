@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM, which wait while a node starts."""
+"""SIGINT and SIGTERM, which are blocked while a node starts."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def hold_signals() -> None:
-    """Let SIGINT and SIGTERM wait; also across ``exec``, by which the client library from PyPI starts Python anew."""
+    """Block SIGINT and SIGTERM, also across ``exec``, by which the client library from PyPI restarts Python."""
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
 
 
 def release_signals() -> None:
-    """Take those that have come meanwhile, each once, and all later ones."""
+    """Unblock them; each that is pending is delivered once."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
 
 
 @contextlib.contextmanager
 def signals_held() -> Iterator[None]:
-    """Within it, processes are started with these signals blocked."""
+    """A context in which child processes start with these signals blocked."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         yield

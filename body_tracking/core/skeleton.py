@@ -19,11 +19,11 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 MAX_RANGE = 100.0
-"""A coordinate beyond this many metres is no measurement of a person but a damaged number."""
+"""Metres; a larger coordinate is corrupt."""
 
 
 class SkeletonError(BodyTrackingError):
-    """An array that should be a skeleton is not one."""
+    """Raised for arrays of the wrong shape for a skeleton, and for inconsistent joint sets."""
 
 
 class Joint(IntEnum):
@@ -57,7 +57,7 @@ class Joint(IntEnum):
 
 
 class TrackingState(IntEnum):
-    """What the sensor says of a joint (Kinect v2 SDK ``TrackingState``)."""
+    """The tracking state of a joint (Kinect v2 SDK ``TrackingState``)."""
 
     NOT_TRACKED = 0
     INFERRED = 1
@@ -159,10 +159,10 @@ class Skeleton:
     """One body at one instant.
 
     Attributes:
-        stamp_ns: capture time in ROS time, nanoseconds: as its sensor stamps, or as the reference sensor does where it
-            is fused or filtered. In files that are imported, by the sensor's own clock.
+        stamp_ns: capture time in ROS time, nanoseconds: by the clock of its sensor, or of the reference sensor for a
+            fused or filtered skeleton. In imported files, by the sensor's own clock.
         frame_id: the frame of the positions, such as ``kinect1_optical_frame`` or ``world``.
-        positions: (n, 3) metres; NaN where nothing is known.
+        positions: (n, 3) metres; NaN where unknown.
         states: (n,) uint8 of :class:`TrackingState`.
         body: the sensor's number of this body.
         covariances: (n, 3, 3) square metres, or None where the source states none (raw sensors).

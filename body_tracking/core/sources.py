@@ -1,8 +1,7 @@
 """Where skeletons come from: recordings of other programs, datasets, and the conversion of their coordinates.
 
-Every reader here is iterated for :class:`RecordedFrame`, and what it yields is in the package's conventions:
-``<sensor>_optical_frame`` (x right, y down, z forward), metres, integer nanoseconds. May import ``skeleton`` and numpy,
-nothing else of the package.
+Iterating a reader yields :class:`RecordedFrame` in the package's conventions: ``<sensor>_optical_frame`` (x right,
+y down, z forward), metres, integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -20,18 +19,17 @@ if TYPE_CHECKING:
 RESERVED_NAMES = ("fused", "filtered", "ground_truth", "imu")
 """First parts of topics that are not sensors."""
 
-
 NOT_FINITE = "joints without finite coordinates"
 """Counted in :attr:`Recording.problems`: such a joint is NaN and NOT_TRACKED."""
 
 
 class SensorNameError(BodyTrackingError):
-    """A name that cannot be a sensor's."""
+    """Not a valid name of a sensor."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """What one sensor said at one instant.
+    """One frame of one sensor.
 
     Attributes:
         sensor: its name.
@@ -45,11 +43,11 @@ class RecordedFrame:
 
 
 class Recording(Protocol):
-    """A file of recorded frames; its readers count what they meet while they are iterated.
+    """A file of recorded frames.
 
     Attributes:
-        problems: how often each kind of oddity was met, such as ``stamps that repeat``.
-        warnings: a line for each thing that is missing.
+        problems: how often each kind of irregularity was read so far, such as ``stamps that repeat``.
+        warnings: a line for each part that is missing.
     """
 
     problems: dict[str, int]
@@ -67,7 +65,7 @@ def check_sensor_name(name: str) -> str:
     """The name, if it can be the first part of a topic and of a frame.
 
     Raises:
-        SensorNameError: it cannot.
+        SensorNameError: it cannot be.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise SensorNameError(f"sensor name {name!r}: letters, digits and _ only, a letter first")

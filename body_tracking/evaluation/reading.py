@@ -11,18 +11,12 @@ import numpy as np
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Skeleton
 from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.base import (
-    JOINT_STATE,
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    MessageError,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.model import coordinates_to_configuration

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import JOINT_STATE, MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 
 def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:
@@ -17,8 +18,7 @@ def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types:
     Args:
         angles: radians and radians per second.
         body: the REP-155 body id; every name ends in ``_<body>``.
-        frame_id: of both headers. What ``joint_angles`` publishes names its convention here, so that a subscriber can
-            tell angles of the same name apart.
+        frame_id: of both headers; ``joint_angles`` puts the convention here, because conventions share names of angles.
         types: the family of message classes to build.
     """
     header = to_header(angles.stamp_ns, frame_id, types)
@@ -46,14 +46,13 @@ def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngl
     Args:
         values: ``sensor_msgs/JointState``.
         deviations: the same, of the same stamp.
-        body: whose they are; the ending ``_<body>`` of their names is left out.
+        body: id of the person; the suffix ``_<body>`` of the names is removed.
 
     Raises:
-        MessageError: different names, stamps or frames, a name without that ending, sizes that do not go together.
+        MessageError: different names, stamps or frames, a name without that suffix, sizes that do not match.
     """
     names, stamp_ns = tuple(values.name), to_nanoseconds(values.header.stamp)
-    same = deviations.header == values.header and tuple(deviations.name) == names
-    if not same:
+    if deviations.header != values.header or tuple(deviations.name) != names:
         raise MessageError("joint states and their standard deviations have other names, stamps or frames")
     other = next((name for name in names if not name.endswith(f"_{body}")), None)
     if other is not None:

@@ -1,4 +1,4 @@
-"""What every conversion needs: the classes of messages, their type names, stamps and headers."""
+"""Parts of every conversion: message classes, stamps and headers."""
 
 from __future__ import annotations
 
@@ -11,51 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import (
-    CLOCK as CLOCK,
-)
-from body_tracking.core.message_types import (
-    DIAGNOSTICS as DIAGNOSTICS,
-)
-from body_tracking.core.message_types import (
-    FLOAT_ARRAY as FLOAT_ARRAY,
-)
-from body_tracking.core.message_types import (
-    IMAGE as IMAGE,
-)
-from body_tracking.core.message_types import (
-    IMU as IMU,
-)
-from body_tracking.core.message_types import (
-    JOINT_STATE as JOINT_STATE,
-)
-from body_tracking.core.message_types import (
-    JOINT_TRAJECTORY as JOINT_TRAJECTORY,
-)
-from body_tracking.core.message_types import (
-    MAGNETIC_FIELD as MAGNETIC_FIELD,
-)
-from body_tracking.core.message_types import (
-    MARKERS as MARKERS,
-)
-from body_tracking.core.message_types import (
-    POINT_CLOUD as POINT_CLOUD,
-)
-from body_tracking.core.message_types import (
-    SEGMENTS as SEGMENTS,
-)
-from body_tracking.core.message_types import (
-    STRING as STRING,
-)
-from body_tracking.core.message_types import (
-    TF as TF,
-)
-from body_tracking.core.message_types import (
-    TIME_REFERENCE as TIME_REFERENCE,
-)
-from body_tracking.core.message_types import (
-    TRANSFORM as TRANSFORM,
-)
 from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray
 
 
@@ -115,7 +70,7 @@ def to_nanoseconds(stamp: Any) -> int:
     """``builtin_interfaces/Time`` to integer nanoseconds, 0 to :data:`~body_tracking.core.skeleton.MAX_STAMP_NS`.
 
     Raises:
-        MessageError: a time that ROS time does not have: negative, or with a second or more of nanoseconds.
+        MessageError: not a valid ROS time: negative, or with a second or more of nanoseconds.
     """
     sec, nanosec = int(stamp.sec), int(stamp.nanosec)
     if not (0 <= sec < 2**31 and 0 <= nanosec < NANOSECONDS):
@@ -127,7 +82,7 @@ def to_time(nanoseconds: int, types: MessageTypes) -> Any:
     """Integer nanoseconds to ``builtin_interfaces/Time``.
 
     Raises:
-        MessageError: a time that ROS time does not have.
+        MessageError: outside the range of ROS time.
     """
     if not 0 <= nanoseconds <= MAX_STAMP_NS:
         raise MessageError(f"a stamp of {nanoseconds} ns, expected 0 to {MAX_STAMP_NS}")

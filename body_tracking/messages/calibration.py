@@ -7,17 +7,10 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.message_types import TIME_REFERENCE, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
-from body_tracking.messages.base import (
-    TIME_REFERENCE,
-    TRANSFORM,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-    to_time,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_time
 
 
 def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:
@@ -40,8 +33,8 @@ def transform_to_pose(message: Any) -> SensorPose:
     """The inverse of :func:`pose_to_transform`.
 
     Raises:
-        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a place that is
-            too far away, a quaternion far from unit length, a stamp that is none.
+        MessageError: a child frame that is not ``<sensor>_optical_frame``, numbers that are not finite, a translation
+            beyond :data:`MAX_RANGE`, a quaternion far from unit length, an invalid stamp.
     """
     suffix = "_optical_frame"
     child = str(message.child_frame_id)
@@ -61,26 +54,26 @@ def clock_to_time_reference(sensor: str, clock: ClockModel, at_ns: int, types: M
     Args:
         sensor: written into ``source``.
         clock: the sensor's clock against the reference clock.
-        at_ns: the reference time from which the relation is valid; where the sensor's clock shows 0 only later, from
-            then on, which is as good: it has no frame of before.
+        at_ns: the reference time from which the relation is valid, or from which the sensor's clock is not negative,
+            whichever is later.
         types: the family of message classes to build.
     """
     at_ns = max(at_ns, clock.to_reference(0))
     return types.make(
         TIME_REFERENCE,
         header=to_header(at_ns, "", types),
-        time_ref=to_time(max(0, clock.to_sensor(at_ns)), types),  # which rounding may make -1 ns
+        time_ref=to_time(max(0, clock.to_sensor(at_ns)), types),  # rounding may give -1 ns
         source=sensor,
     )
 
 
 def time_reference_to_clock(message: Any) -> tuple[str, int, ClockModel]:
-    """(sensor, valid from in the reference clock, the relation of the clocks from then on).
+    """(sensor, reference time from which the relation is valid in nanoseconds, the sensor's clock).
 
-    ``time_ref`` may be negative, as it was in recordings of sensors that were switched on later than the reference.
+    ``time_ref`` may be negative, as in recordings of sensors that were switched on later than the reference.
 
     Raises:
-        MessageError: a stamp that is none.
+        MessageError: an invalid stamp.
     """
     at_ns, shown = to_nanoseconds(message.header.stamp), message.time_ref
     shown_ns = int(shown.sec) * NANOSECONDS + int(shown.nanosec)

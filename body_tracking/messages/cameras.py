@@ -13,7 +13,7 @@ CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
 
 def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:
-    """The message; the image is neither binned nor cut, and not rectified."""
+    """The message of a full, unrectified image."""
     projection = np.hstack([camera.matrix, np.zeros((3, 1))])
     region = types.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types.make(
@@ -33,10 +33,10 @@ def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:
 
 
 def info_to_camera(message: Any) -> Camera:
-    """The camera; ``plumb_bob`` with fewer coefficients has zeros for the rest.
+    """The camera; missing coefficients of ``plumb_bob`` are zero.
 
     Raises:
-        MessageError: it is not calibrated (zero focal lengths), has another model of distortion, is binned or cut.
+        MessageError: not calibrated (zero focal lengths), another distortion model, a binned or cropped image.
     """
     frame_id = message.header.frame_id
     if message.binning_x > 1 or message.binning_y > 1 or message.roi.x_offset or message.roi.y_offset:

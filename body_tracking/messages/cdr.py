@@ -1,7 +1,6 @@
-"""The messages that the graph publishes most, as CDR bytes, made and read without message objects.
+"""The most frequent messages of the graph, written and read as CDR bytes without message objects.
 
-Per message, microseconds of a processor, conversion to and from our own objects included, all in one run (rosbags
-0.11.9, rclpy 7.1.6):
+CPU microseconds per message, including the conversion to and from our own types (rosbags 0.11.9, rclpy 7.1.6):
 
 ======================================  =====  ===============  ==============
 message                                  here  rosbags          rclpy
@@ -14,9 +13,9 @@ with covariance and velocity, read       17.3   84.1 (4.9 x)    121.4 (7.0 x)
 segments of a body, written               3.4   37.2 (10.8 x)    97.7 (28 x)
 ======================================  =====  ===============  ==============
 
-What is written here is what ``messages`` and a ROS serialiser would write, but for padding, which Fast CDR leaves as it
-is. What is read is only a message of that same layout; anything else is left to ``messages``, which says what is wrong
-with it. Encoding: OMG CDR, little-endian (XCDR1); alignment counts from behind the encapsulation header.
+The bytes are those of the other modules of this package and a ROS serialiser, except for padding, which Fast CDR does
+not initialise. Only messages of exactly this layout are read here; the other modules read all others and report their
+errors. Encoding: OMG CDR, little-endian (XCDR1); alignment counts from the end of the encapsulation header.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ def _padded(data: bytes, to: int = 4) -> bytes:
 
 
 def _string(text: str) -> bytes:
-    """Its length with the terminating zero, and itself; not padded behind."""
+    """A CDR string: length with the terminating zero, then the text; without trailing padding."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
 
@@ -59,14 +58,14 @@ def _string(text: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """A kind of skeleton message: what stands between its header and its points.
+    """The bytes between header and points of one kind of skeleton message.
 
     Attributes:
         table: ``height`` to the length of ``data``, as CDR with zeros as padding.
         padding: 0 where the table has padding, 255 elsewhere.
         words: 32-bit words per point.
         covariance: whether points have one.
-        velocity: likewise.
+        velocity: whether points have one.
     """
 
     table: bytes
@@ -81,14 +80,14 @@ class _Layout:
         return int.from_bytes(self.table[-4:], "little")
 
     def fits(self, cdr: bytes, start: int) -> bool:
-        """Whether a message has this table there, whatever another serialiser left in the padding."""
+        """Whether a message has this table at ``start``, with any padding bytes."""
         given = np.frombuffer(cdr, np.uint8, len(self.table), start)
         return cdr.startswith(self.table, start) or bytes(given & self.padding) == self.table
 
 
 @cache
 def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
-    """From the one place that knows the fields."""
+    """The layout of a message that :func:`skeletons_to_cloud` makes."""
     joints, states = np.zeros((N_JOINTS, 3)), np.zeros(N_JOINTS, np.uint8)
     covariances = np.zeros((N_JOINTS, 3, 3)) if covariance else None
     sample = Skeleton(0, "", joints, states, 0, covariances, joints if velocity else None)
@@ -125,18 +124,14 @@ def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:
 
 
 def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
-    """``cloud_to_skeletons`` of a serialised message, for messages as :func:`encode_skeletons` makes them.
-
-    Returns:
-        The bodies; None where the message is anything else, right or wrong.
-    """
+    """The bodies in a message of the layout of :func:`encode_skeletons`; None for any other message."""
     header = _read_header(cdr)
     if header is None:
         return None
     stamp_ns, frame_id, start = header
     for layout in _KNOWN:
         end = start + len(layout.table) + layout.size
-        if end < len(cdr) <= end + 4 and layout.fits(cdr, start):  # behind it is_dense and, maybe, padding
+        if end < len(cdr) <= end + 4 and layout.fits(cdr, start):  # is_dense and padding follow
             break
     else:
         return None
@@ -170,7 +165,7 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
 
 _KINDS = ((True, False), (True, True), (False, False))
 _KNOWN = tuple(_layout(count, *kind) for count in range(1, 7) for kind in _KINDS)
-"""Those that are read here: one body of each kind, and then some more."""
+"""The layouts that are read here: of 1 to 6 bodies."""
 
 
 # --- joint angles
@@ -178,7 +173,7 @@ _KNOWN = tuple(_layout(count, *kind) for count in range(1, 7) for kind in _KINDS
 
 @cache
 def _names(names: tuple[str, ...], suffix: str = "") -> bytes:
-    """``name``, padded to 4; with the suffix behind each."""
+    """The field ``name``, padded to 4; the suffix is appended to each name."""
     table = struct.pack("<I", len(names))
     for name in names:
         table = _padded(table + _string(name + suffix))
@@ -195,7 +190,7 @@ def encode_angles(angles: JointAngles, body: str, frame_id: str) -> tuple[bytes,
 
 
 def _doubles(position: int, *values: FloatArray) -> bytes:
-    """Sequences of ``float64``, aligned to 8 from behind the encapsulation, and an empty one for ``effort``."""
+    """Sequences of ``float64``, aligned to 8 from the end of the encapsulation header, and an empty ``effort``."""
     data = b""
     for value in values:
         data += struct.pack("<I", len(value))
@@ -217,7 +212,7 @@ def encode_segments(
 
 
 def _read_header(cdr: bytes) -> tuple[int, str, int] | None:
-    """Stamp, frame and the place behind ``std_msgs/Header``, padded to 4; None where there is none."""
+    """Stamp, frame and offset of the end of ``std_msgs/Header``, padded to 4; None where it is invalid."""
     if len(cdr) < 16 or cdr[:4] != _ENCAPSULATION:
         return None
     sec, nanosec, length = _STAMP_AND_LENGTH.unpack_from(cdr, 4)

@@ -1,7 +1,6 @@
-"""How what stages exchange is written as messages, one class per content.
+"""Codecs between the types that stages exchange and serialised messages, one class per content.
 
-Live and offline differ in the client library that handles layouts which this package does not write itself
-(:class:`Wire`); the bytes are the same.
+A :class:`Wire` serialises the messages that this package does not write itself: by rclpy live, by rosbags offline.
 """
 
 from __future__ import annotations
@@ -14,10 +13,7 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.joint_angles import JointAngles
-from body_tracking.core.orientation import SegmentOrientation
-from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import FloatArray, Skeleton
-from body_tracking.messages.base import (
+from body_tracking.core.message_types import (
     IMAGE,
     IMU,
     JOINT_STATE,
@@ -27,9 +23,11 @@ from body_tracking.messages.base import (
     TF,
     TIME_REFERENCE,
     TRANSFORM,
-    MessageTypes,
-    to_header,
 )
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.messages.base import MessageTypes, to_header
 from body_tracking.messages.calibration import (
     clock_to_time_reference,
     pose_to_transform,
@@ -54,11 +52,7 @@ from body_tracking.messages.skeletons import cloud_to_skeletons
 
 
 class Wire(Protocol):
-    """The client library's part of serialisation.
-
-    Attributes:
-        types: its message classes.
-    """
+    """Message classes of a client library, and their serialisation."""
 
     @property
     def types(self) -> MessageTypes: ...
@@ -67,11 +61,7 @@ class Wire(Protocol):
         """A message as CDR."""
 
     def deserialize(self, type_name: str, cdr: bytes) -> Any:
-        """A message of CDR.
-
-        Raises:
-            MessageError: the bytes are no such message.
-        """
+        """A message from CDR; MessageError where the bytes are not of this type."""
 
 
 class Codec:
@@ -88,15 +78,11 @@ class Codec:
         raise NotImplementedError
 
     def decode(self, cdr: bytes, wire: Wire) -> Any:
-        """What the message says.
-
-        Raises:
-            MessageError: it does not have the layout that its topic promises.
-        """
+        """The content of a message; MessageError where it is malformed."""
         raise NotImplementedError
 
     def stamp_ns(self, payload: Any) -> int | None:
-        """Capture time by which a backward jump of an input is noticed; None for messages that state none."""
+        """Capture time, for the detection of backward jumps; None for contents without one."""
         return None
 
 
@@ -141,7 +127,7 @@ class Poses(Pose):
 
 
 class SensorClock(NamedTuple):
-    """A sensor's clock, in force from a time of the reference's clock on."""
+    """A sensor's clock, valid from a time of the reference clock on."""
 
     sensor: str
     valid_from_ns: int
@@ -195,11 +181,7 @@ class Field(Codec):
 
 
 class OfModel(Codec):
-    """Base of the codecs that need the body model.
-
-    Args:
-        model: of the estimates.
-    """
+    """Base of the codecs that need the body model of the estimates."""
 
     def __init__(self, model: BodyModel) -> None:
         self.model = model
@@ -221,7 +203,7 @@ class ModelState(OfModel):
 
 
 class ModelStddev(OfModel):
-    """Their standard deviations."""
+    """Standard deviations of coordinates and rates."""
 
     type_name = JOINT_STATE
 
@@ -230,7 +212,7 @@ class ModelStddev(OfModel):
 
 
 class ModelCovariance(OfModel):
-    """Their covariance; read as stamp and matrix."""
+    """Covariance of coordinates and rates; read as stamp and matrix."""
 
     type_name = IMAGE
 
@@ -254,9 +236,9 @@ class Angles(Codec):
     """Joint angles, or their standard deviations.
 
     Args:
-        body: whose they are.
-        part: 0 for the angles, 1 for the deviations.
-        convention: names it, which may change.
+        body: id of the person.
+        part: 0 for the angles, 1 for the standard deviations.
+        convention: returns its name, which may change.
     """
 
     type_name = JOINT_STATE
@@ -269,7 +251,7 @@ class Angles(Codec):
 
 
 class Ids(Codec):
-    """The ids of the people who are tracked, as :class:`Tracked` holds them."""
+    """The ids of the tracked people, with stamp and frame."""
 
     type_name = "hri_msgs/msg/IdsList"
 

@@ -1,15 +1,16 @@
-"""What nodes say of themselves."""
+"""Status reports of nodes, as ``diagnostic_msgs/DiagnosticArray``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from body_tracking.messages.base import DIAGNOSTICS, MessageTypes, RosMessages, to_header
+from body_tracking.core.message_types import DIAGNOSTICS
+from body_tracking.messages.base import MessageTypes, RosMessages, to_header
 from body_tracking.messages.node_status import NodeStatus
 
 MAX_VALUES, MAX_TEXT = 500, 1000
-"""Values of a status, and characters of each text, that are kept of what comes; our nodes tell a tenth of that."""
+"""Values of a received status, and characters of each text, that are kept; our nodes report a tenth of that."""
 
 
 def diagnostics(
@@ -19,7 +20,7 @@ def diagnostics(
 
     Args:
         stamp_ns: node time.
-        name: ``<node>: <what>``, with the node's full name but for the leading slash.
+        name: ``<node>: <subject>``, with the node's full name without the leading slash.
         hardware_id: the sensor, or empty.
         level: 0 OK, 1 warning, 2 error, 3 stale.
         text: one line for people.
@@ -38,12 +39,12 @@ def diagnostics(
 
 
 def statuses(message: Any, received: float = 0.0, namespace: str | None = None) -> tuple[NodeStatus, ...]:
-    """Those in a ``diagnostic_msgs/DiagnosticArray``.
+    """The statuses in a ``diagnostic_msgs/DiagnosticArray``.
 
     Args:
         message: the array.
         received: steady time, seconds.
-        namespace: only of nodes in this namespace, by their names there; None for all nodes by their full names.
+        namespace: select the nodes in this namespace, and use their names in it; None for all nodes by full name.
     """
     prefix = "" if namespace is None else f"{namespace.strip('/')}/".removeprefix("/")
     return tuple(

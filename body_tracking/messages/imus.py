@@ -8,17 +8,10 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.imu import ImuSample, check_magnetic_field
+from body_tracking.core.message_types import IMU, MAGNETIC_FIELD
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import (
-    IMU,
-    MAGNETIC_FIELD,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-    to_vector,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_vector
 
 
 def imu_to_message(
@@ -30,14 +23,14 @@ def imu_to_message(
     covariances: tuple[FloatArray, FloatArray, FloatArray],
     types: MessageTypes,
 ) -> Any:
-    """``sensor_msgs/Imu`` as REP-145 has it.
+    """``sensor_msgs/Imu`` by REP-145.
 
     Args:
         stamp_ns: capture time in the sensor's clock, nanoseconds.
         frame_id: of the sensor.
         angular_velocity: (3,) rad/s.
         linear_acceleration: (3,) m/s2, specific force.
-        quat_xyzw: (4,) of the sensor in a world that is east, north, up; None for raw data.
+        quat_xyzw: (4,) of the sensor in an east-north-up frame; None for raw data.
         covariances: (3, 3) each, of orientation, angular velocity and acceleration; -1 in [0, 0] where unknown.
         types: the family of message classes to build.
     """
@@ -70,7 +63,7 @@ def magnetic_field_to_message(
 def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any | None]:
     """``sensor_msgs/Imu`` and, if there is a field, ``sensor_msgs/MagneticField`` of a reading.
 
-    What the reading does not have is marked by -1 as REP-145 says; a covariance that is not known is zero.
+    Absent quantities are marked by -1 (REP-145); an unknown covariance is zero.
     """
     absent = np.zeros((3, 3))
     absent[0, 0] = -1.0
@@ -96,15 +89,15 @@ def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any
 
 
 def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) -> ImuSample:
-    """The reading in a ``sensor_msgs/Imu``, without what its covariances say is absent (-1, REP-145).
+    """The reading in a ``sensor_msgs/Imu``; None for quantities whose covariance begins with -1 (REP-145).
 
     Args:
         message: of a ROS install or of a recording.
         magnetic_field: (3,) tesla of the same instant, if there is one.
 
     Raises:
-        MessageError: a covariance that has not nine elements.
-        ImuSampleError: what no inertial sensor can have said.
+        MessageError: a covariance without nine elements.
+        ImuSampleError: an invalid reading.
     """
     covariances = {}
     for name in ("orientation", "angular_velocity", "linear_acceleration"):
@@ -118,8 +111,7 @@ def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) ->
         to_nanoseconds(message.header.stamp),
         str(message.header.frame_id),
         np.array([q.x, q.y, q.z, q.w]) if there["orientation"] else None,
-        # all zeros: not known
-        stated if there["orientation"] and stated.any() else None,
+        stated if there["orientation"] and stated.any() else None,  # all zeros: unknown
         _array(message.angular_velocity) if there["angular_velocity"] else None,
         _array(message.linear_acceleration) if there["linear_acceleration"] else None,
         magnetic_field,
@@ -144,7 +136,7 @@ def _array(vector: Any) -> FloatArray:
 def orientation_to_message(measurement: SegmentOrientation, types: MessageTypes) -> Any:
     """``sensor_msgs/Imu`` of a segment's orientation: rotation and covariance in a fixed frame, rate in its own.
 
-    The header's frame is that fixed frame, such as ``world``; which segment it is, the topic says.
+    The header's frame is the fixed frame, such as ``world``; the topic names the segment.
     """
     absent = np.zeros((3, 3))
     absent[0, 0] = -1.0
@@ -168,9 +160,9 @@ def message_to_orientation(message: Any, segment: str) -> SegmentOrientation:
     """The inverse of :func:`orientation_to_message`.
 
     Raises:
-        MessageError: a covariance that has not nine elements, no orientation or none of its covariance.
-        ImuSampleError: numbers that are not finite, a quaternion that is none, no frame.
-        OrientationError: no orientation of that segment.
+        MessageError: a covariance without nine elements, no orientation, or no covariance of it.
+        ImuSampleError: numbers that are not finite, an invalid quaternion, no frame.
+        OrientationError: an invalid orientation or segment.
     """
     sample = message_to_sample(message)
     if sample.orientation is None or sample.orientation_covariance is None:

@@ -9,16 +9,9 @@ import numpy as np
 
 from body_tracking.core.body_model import BodyModel
 from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.message_types import IMAGE, JOINT_STATE, SEGMENTS
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import (
-    IMAGE,
-    JOINT_STATE,
-    SEGMENTS,
-    MessageError,
-    MessageTypes,
-    to_header,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
@@ -30,8 +23,8 @@ def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: Me
         types: the family of message classes to build.
 
     Returns:
-        Positions: the tangent vector from the model's neutral pose, so that a rotation that is free is its rotation
-        vector; velocities: the tangent velocity.
+        Positions: the tangent vector from the neutral pose, in which a free rotation is a rotation vector;
+        velocities: the tangent velocity.
     """
     return _joint_state(estimate, model, model.difference(model.neutral(), estimate.q), estimate.velocity, types)
 
@@ -56,14 +49,14 @@ def _joint_state(
 
 
 def joint_state_to_model(message: Any, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray]:
-    """The inverse of :func:`estimate_to_joint_state`, without what that does not hold.
+    """The inverse of :func:`estimate_to_joint_state`, without uncertainty and lengths.
 
     Args:
         message: ``sensor_msgs/JointState``.
-        model: what it is to be about.
+        model: that the message must be of.
 
     Returns:
-        Stamp in nanoseconds, frame, (nq,) configuration, (nv,) tangent velocity; NaN where that is not known.
+        Stamp in nanoseconds, frame, (nq,) configuration, (nv,) tangent velocity; NaN where unknown.
 
     Raises:
         MessageError: other names, other sizes, a position that is not finite, an infinite velocity.
@@ -84,7 +77,7 @@ def joint_state_to_model(message: Any, model: BodyModel) -> tuple[int, str, Floa
 def coordinates_to_configuration(
     position: FloatArray, velocity: FloatArray, model: BodyModel
 ) -> tuple[FloatArray, FloatArray]:
-    """(nq,) configuration and (nv,) tangent velocity of the numbers in a message.
+    """(nq,) configuration and (nv,) tangent velocity from a message's positions and velocities.
 
     Raises:
         MessageError: other sizes, a position that is not finite, an infinite velocity.
@@ -106,7 +99,7 @@ COVARIANCE_ENCODING = "32FC1"
 
 
 def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
-    """``sensor_msgs/Image`` of 2 nv rows of nv: the covariance of the coordinates, and under it that of their rates."""
+    """``sensor_msgs/Image`` of 2 nv rows of nv: the covariance of the coordinates, then that of the rates."""
     nv = len(estimate.velocity)
     rows = np.concatenate([estimate.covariance[:nv, :nv], estimate.covariance[nv:, nv:]]).astype("<f4")
     return types.make(
@@ -124,7 +117,7 @@ def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
 def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray]:
     """(stamp in nanoseconds, (2 nv, 2 nv) covariance), the inverse of :func:`covariance_to_image`.
 
-    Nothing is said of how coordinates and rates depend on each other.
+    The cross covariance of coordinates and rates is not in the message, and zero here.
 
     Raises:
         MessageError: another encoding or size, big-endian numbers, a NaN, a negative variance.
@@ -182,7 +175,7 @@ def joint_state_to_segments(message: Any) -> tuple[tuple[str, ...], FloatArray, 
         Names of s segments, (s, 3) origins in metres, (s, 4) unit quaternions xyzw.
 
     Raises:
-        MessageError: another number of transforms than of names, or numbers that are no pose.
+        MessageError: another number of transforms than of names, or an invalid pose.
     """
     names = tuple(message.joint_names)
     if len(message.transforms) != len(names):

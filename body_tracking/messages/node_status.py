@@ -1,4 +1,4 @@
-"""What a node says of itself."""
+"""The status of a node, as it reports it in ``/diagnostics``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class NodeStatus:
     """One status of ``/diagnostics``.
 
     Attributes:
-        name: ``<node>: <what>``, with the namespace before the node where that is not known.
+        name: ``<node>: <subject>``, with the node's namespace where the receiver has selected none.
         level: 0 OK, 1 warning, 2 error, 3 stale.
         text: one line.
         values: rates, counters.
@@ -26,25 +26,25 @@ class NodeStatus:
 
     @property
     def node(self) -> str:
-        """Whose it is."""
+        """The node's name."""
         return self.name.partition(":")[0]
 
     def number(self, key: str) -> float | None:
-        """A value as a number; None where there is none, as other people's nodes may say anything."""
+        """A value as a number; None where it is absent or not a number."""
         try:
             return float(self.values[key])
         except (KeyError, ValueError):
             return None
 
 
-MOST = 64
-"""Nodes of which a status is kept: a graph has some twenty."""
+MAX_NODES = 64
+"""Nodes whose status is kept; a graph has about twenty."""
 
 
-def note_statuses(known: dict[str, NodeStatus], told: Iterable[NodeStatus]) -> None:
-    """Keep the newest status of each node, in place; of too many nodes those that were heard last."""
-    for status in told:
+def update_statuses(known: dict[str, NodeStatus], received: Iterable[NodeStatus]) -> None:
+    """Keep the newest status of each node, in place; of too many nodes, the most recent ones."""
+    for status in received:
         known.pop(status.node, None)
         known[status.node] = status
-        if len(known) > MOST:
+        if len(known) > MAX_NODES:
             del known[next(iter(known))]

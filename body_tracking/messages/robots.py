@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from body_tracking.core.message_types import FLOAT_ARRAY, JOINT_TRAJECTORY
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.messages.base import FLOAT_ARRAY, JOINT_TRAJECTORY, MessageTypes, to_header
+from body_tracking.messages.base import MessageTypes, to_header
 
 
 def command_to_trajectory(
@@ -16,7 +17,7 @@ def command_to_trajectory(
 ) -> Any:
     """``trajectory_msgs/JointTrajectory`` with one point, for ``joint_trajectory_controller``.
 
-    Without velocities, for that controller refuses a trajectory that ends in motion (its parameter
+    Without velocities, because that controller refuses a trajectory that ends in motion (its parameter
     ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
 
     Args:

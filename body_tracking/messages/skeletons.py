@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
-from body_tracking.messages.base import POINT_CLOUD, MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 # sensor_msgs/PointField datatypes
 _UINT8, _UINT16, _FLOAT32 = 2, 4, 7
@@ -28,12 +29,12 @@ _VELOCITY_FIELDS = tuple((name, _FLOAT32) for name in ("vx", "vy", "vz"))
 
 _UPPER = np.triu_indices(3)
 MAX_BODIES = 64
-"""More bodies than this in one message is taken for a malformed one."""
+"""A message with more bodies is malformed."""
 
 
 @cache
 def _cloud_layout(with_covariance: bool, with_velocity: bool) -> tuple[np.dtype[Any], tuple[tuple[str, int], ...]]:
-    """The packed record and its fields; 16, 40 or 52 bytes a point."""
+    """The packed record and its fields; 16, 40 or 52 bytes per point."""
     fields = (
         _BASE_FIELDS + (_COVARIANCE_FIELDS if with_covariance else ()) + (_VELOCITY_FIELDS if with_velocity else ())
     )
@@ -48,7 +49,7 @@ def skeletons_to_cloud(skeletons: Sequence[Skeleton], types: MessageTypes) -> An
         types: the family of message classes to build.
 
     Returns:
-        The message; a point per joint and body, joints in SDK order, fields as in the design's topic table.
+        The message; a point per joint and body, joints in SDK order.
     """
     first = skeletons[0]
     record, fields = _cloud_layout(first.covariances is not None, first.velocities is not None)
@@ -158,10 +159,10 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
 
 
 def markers_to_points(message: Any) -> tuple[int, list[int], FloatArray]:
-    """The markers of one ``visualization_msgs/MarkerArray`` that are there to be shown: stamp, ids, (n, 3) positions.
+    """Stamp in nanoseconds, ids and (n, 3) positions of the added markers of a ``visualization_msgs/MarkerArray``.
 
     Raises:
-        MessageError: no such marker, or markers of several times.
+        MessageError: no such marker, or markers with different stamps.
     """
     shown = [marker for marker in message.markers if marker.action == 0]  # ADD
     stamps = {to_nanoseconds(marker.header.stamp) for marker in shown}

@@ -1,4 +1,4 @@
-"""``python -m body_tracking.nodes <executable> [--ros-args ...]``: a node without an installed script, for ``up``.
+"""``python -m body_tracking.nodes <executable> [--ros-args ...]`` runs a node without an installed script, for ``up``.
 
 ``python -m body_tracking.nodes parameters`` prints ``config/body_tracking.yaml``.
 """

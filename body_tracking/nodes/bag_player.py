@@ -1,4 +1,4 @@
-"""Plays a bag: its messages as they were recorded, on their topics, with their QoS, and ``/clock``."""
+"""Plays a bag: the recorded messages on their topics with their QoS, and ``/clock``."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from rosgraph_msgs.msg import Clock
@@ -48,12 +49,12 @@ PARAMETERS = (
     Parameter("on_end", "exit", "what to do after the last message", choices=("exit", "idle")),
 )
 
-_LOOK_NS = 20_000_000  # between two looks for subscribers
-_SETTLE_NS = 250_000_000  # after they are seen, for them to see us too
+_LOOK_NS = 20_000_000  # between two counts of subscribers
+_SETTLE_NS = 250_000_000  # from finding the subscribers until they have found this node too
 
 
 class BagPlayer(GraphNode):
-    """Sends what a :class:`Playback` says is due; one timer, set anew each time, does it all."""
+    """Publishes the messages of a bag when they are due."""
 
     NAME = "bag_player"
     PARAMETERS = PARAMETERS
@@ -62,7 +63,6 @@ class BagPlayer(GraphNode):
     clock_ns = 0
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Rate and loop may change while it plays."""
         given: dict[str, Any] = dict(values)
         if self.playback is not None:
             self.playback.set_rate(given["rate"], time.monotonic_ns())
@@ -94,27 +94,26 @@ class BagPlayer(GraphNode):
             self.clock_topic = self.make_publisher(Clock, graph.CLOCK_TOPIC, to_profile(qos))
         self.warned = 0
         self.warn_of_damage()
-        self.create_service(Trigger, "~/pause", self.on_pause)
-        self.create_service(Trigger, "~/resume", self.on_resume)
-        self.create_service(Trigger, "~/toggle_paused", self.on_toggle_paused)
+        for service, paused in (("~/pause", True), ("~/resume", False), ("~/toggle_paused", None)):
+            self.create_service(Trigger, service, partial(self.set_paused, paused))
         self.phase = "waiting for subscribers"
         self.give_up_ns = time.monotonic_ns() + round((given["wait_timeout"] or 1e9) * NANOSECONDS)
         self.alarm = self.create_timer(1.0, self.wait, clock=STEADY)
         self.wake(0)
 
     def wake(self, after_ns: int) -> None:
-        """Set the timer anew."""
+        """Set the timer."""
         self.alarm.timer_period_ns = max(1, after_ns)
         self.alarm.reset()
 
     def now_ns(self) -> int:
-        """The time of the bag, which is that of the graph where this node publishes ``/clock``; 0 before it begins."""
+        """The bag's time if this node publishes ``/clock``; 0 before it begins."""
         return self.clock_ns if self.values["clock_rate"] else super().now_ns()
 
     # --- topics
 
     def offer(self, topics: tuple[str, ...]) -> dict[str, Any]:
-        """A publisher for each topic that can be played here."""
+        """A publisher for each topic that can be played."""
         missing = [topic for topic in topics if topic not in self.reader.topics]
         if missing:
             has = ", ".join(self.reader.topics) or "none"
@@ -149,10 +148,10 @@ class BagPlayer(GraphNode):
             wanted[topic] = int(number or 1)
         return wanted
 
-    # --- the timer, phase by phase
+    # --- callbacks of the timer
 
     def wait(self) -> None:
-        """Look whether everybody who was asked for listens."""
+        """Wait for the required subscribers, then play."""
         self.absent = {
             topic: number
             for topic, number in self.absent.items()
@@ -169,7 +168,7 @@ class BagPlayer(GraphNode):
         self.wake(_SETTLE_NS if self.values["wait_for_subscribers"] and not late else 0)
 
     def play(self) -> None:
-        """Send what is due."""
+        """Publish the messages that are due."""
         assert self.playback is not None
         step = self.playback.step(time.monotonic_ns())
         for batch in step.batches:
@@ -184,7 +183,7 @@ class BagPlayer(GraphNode):
             self.wake(step.wake_ns - time.monotonic_ns())
 
     def end(self) -> None:
-        """After the last message: see that it arrives, then leave or stay."""
+        """After the last message: wait for its acknowledgement, then exit or stay."""
         self.phase = "at the end"
         self.alarm.cancel()
         self._report()
@@ -194,21 +193,11 @@ class BagPlayer(GraphNode):
 
     # --- services
 
-    def on_pause(self, _: Any, response: Any) -> Any:
-        """``~/pause``."""
-        return self.set_paused(True, response)
-
-    def on_resume(self, _: Any, response: Any) -> Any:
-        """``~/resume``."""
-        return self.set_paused(False, response)
-
-    def on_toggle_paused(self, _: Any, response: Any) -> Any:
-        """``~/toggle_paused``."""
-        return self.set_paused(self.playback is not None and not self.playback.paused, response)
-
-    def set_paused(self, paused: bool, response: Any) -> Any:
-        """Let the bag's time stand still or run."""
+    def set_paused(self, paused: bool | None, _: Any, response: Any) -> Any:
+        """Pause or resume; None toggles."""
         assert self.playback is not None
+        if paused is None:
+            paused = not self.playback.paused
         now_ns = time.monotonic_ns()
         if paused:
             self.playback.pause(now_ns)
@@ -224,13 +213,12 @@ class BagPlayer(GraphNode):
     # --- diagnostics
 
     def warn_of_damage(self) -> None:
-        """Damage in the bag shows while it is read."""
+        """Log damage in the bag, which is found during reading."""
         for warning in self.reader.warnings[self.warned :]:
             self.get_logger().warning(warning)
         self.warned = len(self.reader.warnings)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Where it is, and how late."""
         assert self.playback is not None
         self.warn_of_damage()
         text = "paused" if self.playback.paused else self.phase
@@ -250,7 +238,6 @@ class BagPlayer(GraphNode):
         )
 
     def close(self) -> None:
-        """Close the bag."""
         self.reader.close()
 
 

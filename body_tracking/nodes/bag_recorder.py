@@ -1,4 +1,4 @@
-"""Records topics into a bag: the messages as they arrive, as bytes."""
+"""Records the serialised messages of topics into a bag."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -66,21 +66,21 @@ PARAMETERS = (
 
 _DEPTH = 1000  # messages of a topic that may wait while the disk is slow
 _EARLY_S = 1.0
-"""With simulated time, what comes so shortly before the first ``/clock`` belongs to it; what came earlier does not."""
+"""With simulated time, messages received within this time before the first ``/clock`` get its time; older ones are
+dropped."""
 _EARLY_LATCHED = 256
-"""Latched messages, which hold until there is another, that wait for it however long."""
+"""Latched messages wait for ``/clock`` without a limit of time, but at most so many."""
 _EARLY_BYTES = 16 << 20
-"""Of all that waits."""
+"""Limit of all waiting messages."""
 
 
 class BagRecorder(GraphNode):
-    """One bag; recording can be stopped and continued."""
+    """Records one bag; recording can be stopped and continued."""
 
     NAME = "bag_recorder"
     PARAMETERS = PARAMETERS
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Where to, and what."""
         given: dict[str, Any] = dict(values)
         self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
         self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
@@ -88,17 +88,12 @@ class BagRecorder(GraphNode):
         self.model_covariance = bool(given["model_covariance"])
 
     def reconfigure(self, values: Mapping[str, Value]) -> None:
-        """For the next recording.
-
-        Raises:
-            BagError: a bag is being recorded.
-        """
+        """Apply the parameters to the next recording; BagError while a bag is being recorded."""
         if self.writer is not None:
             raise BagError(f"{self.folder} is being recorded; call recorder/stop first, and recorder/start afterwards")
         self.configure(values)
 
     def start(self) -> None:
-        """Open the bag and look for topics."""
         given: dict[str, Any] = dict(self.values)
         self.writer: BagWriter | None = None
         self.inputs: dict[str, tuple[Qos, Any]] = {}
@@ -119,7 +114,7 @@ class BagRecorder(GraphNode):
     # --- beginning and stopping
 
     def begin(self) -> str:
-        """Record, into the next file of the bag; what was done.
+        """Record into the next file of the bag; returns the answer to the caller.
 
         Raises:
             BagError: the bag cannot be written.
@@ -128,7 +123,7 @@ class BagRecorder(GraphNode):
             interval: Any = self.values["chunk_seconds"]
             self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
             self.error = ""
-            # After a failure the subscriptions are still there; the new file does not know their topics.
+            # After a failure the subscriptions still exist, but the new file lacks their topics.
             for topic in tuple(self.inputs):
                 self.forget(topic)
             self.get_logger().info(f"recording into {self.writer.path}")
@@ -136,7 +131,7 @@ class BagRecorder(GraphNode):
         return f"recording into {self.folder}"
 
     def stop(self) -> str:
-        """Close the bag; what was done.
+        """Close the bag; returns the answer to the caller.
 
         Raises:
             BagError: its end cannot be written.
@@ -163,7 +158,7 @@ class BagRecorder(GraphNode):
         return response
 
     def fail(self, error: BagError) -> None:
-        """The disk is full, or gone: say so, count what is lost, stay alive for ``recorder/start``."""
+        """After a failure of the disk: log it, count lost messages, and stay alive for ``recorder/start``."""
         self.error = str(error)
         self.get_logger().error(f"recording has stopped: {error}")
         if self.writer is not None:
@@ -171,7 +166,6 @@ class BagRecorder(GraphNode):
             self.writer = None
 
     def close(self) -> None:
-        """Close the bag."""
         try:
             self.stop()
         except BagError as error:
@@ -180,7 +174,7 @@ class BagRecorder(GraphNode):
     # --- topics
 
     def discover(self) -> None:
-        """Subscribe to what has appeared."""
+        """Subscribe to new topics."""
         if self.writer is None:
             return
         for topic, types in self.get_topic_names_and_types():
@@ -196,7 +190,7 @@ class BagRecorder(GraphNode):
         return topic not in self.exclude and names.within(topic, self.get_namespace()) is not None
 
     def adapt(self, topic: str, type_name: str) -> None:
-        """Subscribe as the topic's publishers allow, anew when they have changed."""
+        """Subscribe with the strongest QoS that all publishers match; again when they have changed."""
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or self.writer is None or self.refused.get(topic) == type_name:
             return
@@ -244,9 +238,7 @@ class BagRecorder(GraphNode):
             self.write(topic, cdr, self.now_ns())
 
     def wait_for_clock(self, topic: str, cdr: bytes) -> None:
-        """Keep a message that came before ``/clock``, for a moment, or while it is latched: 0 would put the beginning
-        of the bag years before its rest.
-        """
+        """Keep a message from before the first ``/clock``: time 0 would put it years before the rest of the bag."""
         if topic in self.inputs and self.inputs[topic][0].durability == LATCHED.durability:
             self.early_latched.append((topic, cdr))
         else:
@@ -254,7 +246,7 @@ class BagRecorder(GraphNode):
         self.forget_early()
 
     def forget_early(self) -> None:
-        """Of what waits, drop what is too old or too much."""
+        """Drop waiting messages that are too old or too many."""
         now = time.monotonic()
         size = sum(len(cdr) for _, _, cdr in self.early) + sum(len(cdr) for _, cdr in self.early_latched)
         while self.early and (now - self.early[0][0] > _EARLY_S or size > _EARLY_BYTES):
@@ -265,13 +257,13 @@ class BagRecorder(GraphNode):
             self.before_the_clock += 1
 
     def drop_early(self) -> None:
-        """Drop all that waits."""
+        """Drop all waiting messages."""
         self.before_the_clock += len(self.early) + len(self.early_latched)
         self.early.clear()
         self.early_latched.clear()
 
     def write_early(self) -> None:
-        """Write what came before the clock did."""
+        """Write the messages from before the first ``/clock``."""
         if self.early or self.early_latched:
             self.forget_early()
             early = [*self.early_latched, *((topic, cdr) for _, topic, cdr in self.early)]
@@ -281,7 +273,7 @@ class BagRecorder(GraphNode):
                 self.write(topic, cdr, self.now_ns())
 
     def write(self, topic: str, cdr: bytes, received_ns: int, sent_ns: int | None = None) -> None:
-        """Write at once; if that is not possible, count."""
+        """Write a message, or count it as lost."""
         if self.writer is None:
             self.lost += bool(self.error)
             return
@@ -294,7 +286,6 @@ class BagRecorder(GraphNode):
             self.n_bytes += len(cdr)
 
     def flush(self) -> None:
-        """Write through to the disk what came last, though nothing more comes."""
         if self.writer is not None:
             try:
                 self.writer.flush()
@@ -304,7 +295,6 @@ class BagRecorder(GraphNode):
     # --- diagnostics
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """What was recorded, and what was not."""
         values: dict[str, object] = {
             "bag": self.folder,
             "messages": self.written + (0 if self.writer is None else self.writer.message_count),

@@ -36,7 +36,7 @@ PARAMETERS = (
     Parameter(
         "rate",
         15.0,
-        "publish markers at most this often, and only while somebody listens",
+        "publish markers at most this often, and only while there is a subscriber",
         unit="Hz",
         min=0.1,
         max=100.0,
@@ -58,13 +58,12 @@ _FRUSTUM_DEPTH: Final = 0.3
 
 
 class BodyMarkers(GraphNode):
-    """Keeps what came last of each topic, and draws it now and then."""
+    """Keeps the latest message of each topic, and publishes markers at a limited rate."""
 
     NAME = "body_markers"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Connect."""
         given: dict[str, Any] = dict(self.values)
         self.body, self.world = graph.check_body(given["body"]), given["world_frame"]
         sensors = [check_sensor_name(sensor) for sensor in given["sensors"]]
@@ -74,34 +73,31 @@ class BodyMarkers(GraphNode):
         self.output = self.make_publisher(MarkerArray, graph.markers_topic(self.body), to_profile(RELIABLE))
         sources = {graph.FUSED: "fused", graph.FILTERED: "filtered", **{graph.skeleton_topic(s): s for s in sensors}}
         for topic, name in sources.items():
-            self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
+            self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_skeletons, topic, name))
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
         model = UpperBody()
         self.framed = {"segments": model.segment_names, "root": model.segment_names[:1], "none": ()}[given["tf"]]
         if TFMessage is not None and self.framed:
             self.tf = self.make_publisher(TFMessage, graph.TF, to_profile(RELIABLE))
             segments = graph.segments_topic(self.body)
-            self.listen(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
+            self.subscribe(segments, MultiDOFJointState, to_profile(LATEST), self.on_segments)
         self.create_timer(1.0 / given["rate"], self.publish, clock=STEADY)
 
     def on_skeletons(self, topic: str, name: str, message: Any, sent_ns: int) -> None:
-        """Note what is seen."""
         skeletons = cloud_to_skeletons(message)
         self.monitor.message_in(topic, skeletons[0].stamp_ns)
         self.latest.setdefault(name, {}).update({each.body: each for each in skeletons})
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
-        """A sensor's pose."""
         pose = transform_to_pose(message)
         if pose.sensor in self.colours:
             self.poses[pose.sensor] = pose
 
     def on_segments(self, message: Any, sent_ns: int) -> None:
-        """Where the segments are."""
         self.send(self.tf, segments_to_transforms(message, self.body, self.framed, ROS))
 
     def publish(self) -> None:
-        """Markers of what is new; what does not come again vanishes by itself."""
+        """Publish markers of the new messages; markers that are not updated expire."""
         latest, self.latest = self.latest, {}
         if not self.output.get_subscription_count():
             return

@@ -6,8 +6,6 @@ from body_tracking.calibration.stage import CalibrationStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
 
-PARAMETERS = CalibrationStage.PARAMETERS
-
 
 class CalibrationNode(StageNode):
     STAGE = CalibrationStage

@@ -6,8 +6,6 @@ from body_tracking.fusion.stage import FusionStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
 
-PARAMETERS = FusionStage.PARAMETERS
-
 
 class FusionNode(StageNode):
     STAGE = FusionStage

@@ -1,12 +1,10 @@
-"""``sensor_msgs/Imu`` per segment to ``/imu/<segment>/orientation`` and ``/imu/skeleton``, beside a camera or alone."""
+"""``sensor_msgs/Imu`` per segment to ``/imu/<segment>/orientation`` and ``/imu/skeleton``, with or without a camera."""
 
 from __future__ import annotations
 
 from body_tracking.inertial.stage import ImuStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
-
-PARAMETERS = ImuStage.PARAMETERS
 
 
 class ImuSkeletonNode(StageNode):

@@ -6,8 +6,6 @@ from body_tracking.kinematics.stage import AnglesStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
 
-PARAMETERS = AnglesStage.PARAMETERS
-
 
 class JointAnglesNode(StageNode):
     STAGE = AnglesStage

@@ -52,7 +52,7 @@ PARAMETERS = (
     Parameter(
         "least_delay",
         _DEFAULTS.least_delay,
-        "network: what the sensor takes at least from capture until its frame can be sent, which nothing else tells",
+        "network: least time of the sensor from capture until its frame can be sent, which cannot be measured",
         unit="s",
         min=0.0,
         max=1.0,
@@ -62,16 +62,16 @@ PARAMETERS = (
 
 
 class KinectSkeleton(GraphNode):
-    """Publishes the frames of a source as they come."""
+    """Publishes the frames of a sensor or a recording."""
 
     NAME = "kinect_skeleton"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Open the source; a thread of its own waits for its frames."""
+        """Open the source, and start the thread that reads its frames."""
         given: dict[str, Any] = dict(self.values)
         self.failure = ""
-        self.untold: dict[str, str] = {}
+        self.source_errors: dict[str, str] = {}
         sensor = check_sensor_name(given["sensor"])
         settings = SourceSettings(
             sensor,
@@ -93,20 +93,19 @@ class KinectSkeleton(GraphNode):
         self.thread.start()
 
     def publish_frames(self) -> None:
-        """Until the source or the node ends, or the source fails: then the node stays, and says why."""
+        """Publish until the source or the node ends. If the source fails, the node stays and reports the error."""
         publish = self.guarded("frames", self.publish_frame)
         try:
             while self.context.ok() and not self.source.ended:
                 frame = self.source.read(timeout=0.2)
-                if frame is None:
-                    continue
-                publish(frame)
-        except Exception as error:  # whatever the library of a sensor raises
-            if self.context.ok():  # not closed while it was being read
+                if frame is not None:
+                    publish(frame)
+        except Exception as error:  # the library of a sensor may raise anything
+            if self.context.ok():  # otherwise the source was closed during the read
                 self.failed(error)
 
     def publish_frame(self, frame: RecordedFrame) -> None:
-        """One message; a frame of which none can be made is left out."""
+        """Publish one frame, stamped in ROS time."""
         skeletons = frame.skeletons
         stamp_ns = self.ros_time.stamp(skeletons[0].stamp_ns, frame.received_ns)
         if stamp_ns != skeletons[0].stamp_ns:
@@ -116,7 +115,7 @@ class KinectSkeleton(GraphNode):
             self.send(self.output, message, stamp_ns)
 
     def failed(self, error: Exception) -> None:
-        """Say what the source has raised, and where, for who writes it; to be called where it is caught."""
+        """Log an error of the source, with a traceback unless it is one of ours; call it in the except clause."""
         failure = described(error)
         self.get_logger().error(failure)
         if not isinstance(error, BodyTrackingError):
@@ -124,30 +123,29 @@ class KinectSkeleton(GraphNode):
         self.failure = failure
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Whether it plays, ended or failed, or what keeps frames from coming."""
-        problem = self.told("problem", "")
+        """Streaming, ended, failed, or the problem of the source."""
+        problem = self.source_value("problem", "")
         if problem:
-            self.log_seldom("problem", problem, _PROBLEM_PERIOD_S)
-        text = self.failure or problem or ("ended" if self.told("ended", False) else "streaming")
-        counters = dict(self.told("counters", {}))
+            self.log_throttled("problem", problem, _PROBLEM_PERIOD_S)
+        text = self.failure or problem or ("ended" if self.source_value("ended", False) else "streaming")
+        counters = dict(self.source_value("counters", {}))
         return (
-            (2 if self.failure else 1 if problem or self.untold else 0),
-            "; ".join([text, *self.untold.values()]),
+            (2 if self.failure else 1 if problem or self.source_errors else 0),
+            "; ".join([text, *self.source_errors.values()]),
             counters,
         )
 
-    def told(self, name: str, otherwise: Any) -> Any:
-        """What the source says of itself; where it raises, that is told for as long as it does, and frames go on."""
-        self.untold.pop(name, None)
+    def source_value(self, name: str, otherwise: Any) -> Any:
+        """A property of the source; if it raises, the default, and the diagnostics report the error."""
+        self.source_errors.pop(name, None)
         try:
             return getattr(self.source, name)
         except Exception as error:
-            self.untold[name] = f"{name}: {described(error)}"
-            self.log_seldom(name, f"{self.untold[name]}\n{traceback.format_exc()}", _PROBLEM_PERIOD_S)
+            self.source_errors[name] = f"{name}: {described(error)}"
+            self.log_throttled(name, f"{self.source_errors[name]}\n{traceback.format_exc()}", _PROBLEM_PERIOD_S)
             return otherwise
 
     def close(self) -> None:
-        """Let the thread end."""
         try:
             self.source.close()
         except Exception as error:

@@ -1,10 +1,9 @@
 """A person's joint angles to the commands of a robot's controller, with a safe stop.
 
-A node of its own, and no part of ``joint_angles``: one job per node, and who holds the robot must not die with what it
-watches. It holds within ``silence`` of the last word however the rest of the graph ends, and by the wall clock, also
-where the time on ``/clock`` stands still. If it ends itself, there are no more commands, and what the robot then does
-is its controller's to decide. It publishes no command while anybody else publishes them. No safety-rated function:
-docs/robots.md.
+A node of its own, so that it does not end with the nodes that it monitors. However the rest of the graph ends, it holds
+the robot ``silence`` seconds after the last input, by the wall clock, also while ``/clock`` stands still. If this node
+ends, the commands end, and the robot's controller decides what follows. It publishes no command while another node
+publishes them. No safety-rated function: docs/robots.md.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -57,18 +56,17 @@ PARAMETERS = (
 _UNPAIRED = 16
 """Angles and standard deviations that may wait for each other."""
 _LOOK_AROUND_NS = 4_000_000_000
-"""A node that has been there for so long has found the other publishers: DDS announces them every 3 s at the latest."""
+"""Time after which a node has found all other publishers: DDS announces them at least every 3 s."""
 _LEVELS = {State.FOLLOWING: 0, State.APPROACHING: 0, State.HOLDING: 1, State.STOPPED: 2}
 
 
 class RobotCommands(GraphNode):
-    """Tells the follower what is heard, and publishes its commands at a steady rate."""
+    """Passes its inputs to the follower, and publishes the follower's commands at a steady rate."""
 
     NAME = "robot_commands"
     PARAMETERS = PARAMETERS
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Read the mapping; what is wrong with it ends the node."""
         given: dict[str, Any] = dict(values)
         if not given["mapping"]:
             raise MappingError("parameter 'mapping': no mapping file of a robot; see docs/robots.md")
@@ -79,7 +77,6 @@ class RobotCommands(GraphNode):
         self.follower.watch_sensors(self.sensors)
 
     def start(self) -> None:
-        """Connect."""
         self.waiting: OrderedDict[int, dict[str, JointState]] = OrderedDict()
         self.command: Command | None = None
         self.switched: Counter[str] = Counter()
@@ -89,23 +86,23 @@ class RobotCommands(GraphNode):
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
         angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
         for topic in angles:
-            self.listen(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
+            self.subscribe(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
         for sensor in self.sensors:
-            self.listen_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
-        self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
+            self.subscribe_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
+        self.subscribe(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE_QOS), self.on_diagnostics)
         if output.state_topic:
-            self.listen(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot, absolute=True)
+            self.subscribe(output.state_topic, JointState, to_profile(RELIABLE_QOS), self.on_robot, absolute=True)
         enable = self.create_service(Trigger, "~/enable", self.on_enable)
         if not self.follower.enabled:
             self.get_logger().warning(
-                f"waits for a person: without a state_topic nobody says where {self.mapping.robot} stands. Once it "
+                f"waits for a person: without a state_topic the position of {self.mapping.robot} is unknown. Once it "
                 f"stands at home: ros2 service call {enable.service_name} std_srvs/srv/Trigger"
             )
-        self.create_timer(1.0 / float(str(self.values["rate"])), self.tell_robot, clock=STEADY)
+        self.create_timer(1.0 / float(str(self.values["rate"])), self.publish_command, clock=STEADY)
 
     def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
-        """Angles, or their standard deviations; both of one stamp go on."""
+        """Pair angles and their standard deviations by stamp, and pass pairs to the follower."""
         if self.sequences.switched[topic] != self.switched[topic]:
             self.switched[topic] = self.sequences.switched[topic]
             self.follower.refuse_angles(f"{topic}: angles of two publishers in turn")
@@ -124,35 +121,30 @@ class RobotCommands(GraphNode):
                 raise
             convention = str(values.header.frame_id)
             if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
-                self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
             self.monitor.totals["unpaired"] += 1
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
-        """A sensor sees somebody."""
         self.follower.hear_sensor(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
 
     def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:
-        """Since when a sensor's pose holds."""
         pose = transform_to_pose(message)
         if pose.sensor in self.sensors:
             self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
 
     def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
-        """How well the sensors are calibrated, if that is what it says."""
         for status in statuses(message, namespace=self.get_namespace()):
             if status.node == "calibration":
                 quality = CalibrationQuality.from_diagnostics(status.values, self.sensors)
                 self.follower.calibration.heard(quality, time.monotonic_ns())
 
     def on_robot(self, message: JointState, sent_ns: int) -> None:
-        """How the robot stands."""
         position = np.array(message.position, dtype=np.float64)
         self.follower.hear_robot(tuple(message.name), position, time.monotonic_ns())
 
     def on_enable(self, _: Any, response: Any) -> Any:
-        """A person says that the robot may move."""
         try:
             self.follower.enable()
             response.success, response.message = True, "enabled"
@@ -161,7 +153,7 @@ class RobotCommands(GraphNode):
         return response
 
     def others(self) -> str:
-        """Who else publishes this robot's commands, or that there was no time yet to find out; empty for nobody."""
+        """The other publishers of this robot's commands, or that the search is not finished; empty for none."""
         topic = self.output.topic_name
         if time.monotonic_ns() - self.started_ns < _LOOK_AROUND_NS:
             return f"looking for other publishers of {topic}"
@@ -173,12 +165,10 @@ class RobotCommands(GraphNode):
         return f"another publisher of {topic}: {', '.join(found)}"
 
     def time_jumped_back(self, topic: str) -> None:
-        """Hold, and wait for angles of the new time."""
         self.waiting.clear()
         self.follower.time_jumped_back()
 
-    def tell_robot(self) -> None:
-        """One command, or none."""
+    def publish_command(self) -> None:
         now_ns = self.now_ns()
         self.follower.hear_publishers(self.others())
         self.command = command = self.follower.step(now_ns, time.monotonic_ns())
@@ -200,10 +190,9 @@ class RobotCommands(GraphNode):
             self._report()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """What the robot is told, and why."""
         command = self.command
         if command is None:
-            return 2, "stopped: nothing heard yet", {}
+            return 2, "stopped: nothing received yet", {}
         values: dict[str, object] = {
             "robot": self.mapping.robot,
             "state": command.state,

@@ -1,4 +1,4 @@
-"""What the ROS driver of another camera publishes of bodies, to ``/<sensor>/skeleton``."""
+"""Bodies from the ROS driver of another camera (``visualization_msgs/MarkerArray``) to ``/<sensor>/skeleton``."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -28,57 +28,55 @@ PARAMETERS = (
     Parameter(
         "topic",
         "body_tracking_data",
-        "what is listened to: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
+        "the input topic: the visualization_msgs/MarkerArray of Microsoft's driver of the Azure Kinect",
     ),
     Parameter(
         "state",
         "tracked",
-        "what is said of every joint: the driver does not tell which ones the camera sees and which it guesses",
+        "the state of every joint: the driver does not report which ones the camera sees and which it infers",
         choices=("tracked", "inferred"),
     ),
     RELIABLE,
 )
 
 SILENCE = 1.0
-"""Seconds without a message from which on the topic is a problem."""
+"""Seconds without a message after which the node reports a warning."""
 
 
 class SkeletonAdapter(GraphNode):
-    """Converts and publishes each message as it comes."""
+    """Converts and publishes each message."""
 
     NAME = "skeleton_adapter"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Connect."""
         given: dict[str, Any] = dict(self.values)
         sensor = check_sensor_name(given["sensor"])
         self.frame_id = optical_frame(sensor)
         self.joint_state = TrackingState[given["state"].upper()]
         self.topic: str = self.resolve_topic_name(given["topic"])
-        self.heard: float | None = None
+        self.last_received: float | None = None
         self.ros_time = RosTime()
         self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
-        self.listen(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
+        self.subscribe(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:
-        """Publish the bodies of one message; nobody in view is no message."""
-        self.heard = time.monotonic()
+        """Publish the bodies of one message; nothing if there are none."""
+        self.last_received = time.monotonic()
         if not message.markers:
             return
         stamp_ns, ids, points = markers_to_points(message)
         if self.monitor.message_in(self.topic, stamp_ns):
-            self.log_seldom("jump", f"{self.topic}: time jumped back", period_s=1.0)
+            self.log_throttled("jump", f"{self.topic}: time jumped back", period_s=1.0)
         stamp_ns = self.ros_time.stamp(stamp_ns, self.arrived_ns)
         skeletons = bodies_of(ids, points, stamp_ns, self.frame_id, self.joint_state)
         if skeletons:
             self.send(self.output, encode_skeletons(skeletons), stamp_ns, sent_ns)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Whether messages come."""
-        if self.heard is None:
+        if self.last_received is None:
             return 1, f"no message on {self.topic} yet", {}
-        silent = time.monotonic() - self.heard
+        silent = time.monotonic() - self.last_received
         return (1, f"no message on {self.topic} for {silent:.0f} s", {}) if silent > SILENCE else (0, "streaming", {})
 
 

@@ -6,8 +6,6 @@ from body_tracking.filters.stage import FilterStage
 from body_tracking.ros.host import StageNode
 from body_tracking.ros.node import run
 
-PARAMETERS = FilterStage.PARAMETERS
-
 
 class SkeletonFilterNode(StageNode):
     STAGE = FilterStage

@@ -1,4 +1,4 @@
-"""Shows the graph on a live page in a browser, and passes on what people press there."""
+"""Shows the graph on a live page in a browser, whose controls call services and set parameters."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -41,7 +41,7 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
-from body_tracking.messages.node_status import NodeStatus, note_statuses
+from body_tracking.messages.node_status import NodeStatus, update_statuses
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES
@@ -67,28 +67,27 @@ PARAMETERS = (
 )
 
 _STALE_S = 1.0
-"""What is older is drawn pale, seconds."""
+"""Age from which skeletons are drawn pale, seconds."""
 _TOGETHER_S = 0.4
-"""Somebody who is not in the messages of a topic any more is shown for this much longer, seconds."""
+"""Time for which a person is shown after the last message with that person, seconds."""
 _ANSWER_S = 30.0
-"""Time that a node has to answer, seconds."""
+"""Timeout of service calls, seconds."""
 _WAITING = 64
-"""Messages of joint angles that may wait for the next drawing; while nobody looks, older ones go."""
+"""Queue of joint angles for the next drawing, messages."""
 _SHARE = 0.25
-"""Share of the time for which the page may be drawn, whatever the rate."""
+"""Largest share of the time that is spent on drawing, whatever the rate."""
 _FAILURES = 10
-"""Drawings that fail one after the other, after which the node ends."""
+"""Consecutive failed drawings after which the node ends."""
 _NICE = 10
 
 
 class ViewerNode(GraphNode):
-    """Keeps the latest message of each topic as it came; a thread of its own reads and draws them."""
+    """Keeps the latest serialised message of each topic; a thread of its own decodes and draws them."""
 
     NAME = "viewer"
     PARAMETERS = PARAMETERS
 
     def start(self) -> None:
-        """Open the page, listen and begin to draw."""
         given: dict[str, Any] = dict(self.values)
         self.sensors = tuple(check_sensor_name(sensor) for sensor in given["sensors"])
         self.latest: dict[str, tuple[bytes, float]] = {}
@@ -108,13 +107,13 @@ class ViewerNode(GraphNode):
         }
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
-            self.listen(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+            self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
         self.codecs = {layer.topic: load(layer.codec)() for layer in systems.LAYERS}
         for topic, codec in self.codecs.items():
             kind = message_class(codec.type_name)
-            self.listen(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
-        self.listen(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
-        self.listen(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
+            self.subscribe(topic, kind, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
+        self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_pose)
+        self.subscribe(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
         self.of_body: list[Any] = []
         self.body = ""
         self.choose_body(graph.check_body(given["body"]))
@@ -123,11 +122,7 @@ class ViewerNode(GraphNode):
         self.thread.start()
 
     def open_page(self, given: dict[str, Any]) -> Any:
-        """The page, at a loopback address unless another was asked for.
-
-        Raises:
-            PageError: there is no viser, or the address is not of this machine.
-        """
+        """The page; PageError without viser, or for an address that is not of this machine."""
         try:
             from body_tracking.viewing.page import Page
         except ImportError as error:
@@ -145,40 +140,35 @@ class ViewerNode(GraphNode):
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
         if not _is_loopback(given["host"]):
-            self.get_logger().warning(
-                f"the page is at {page.address}: whoever reaches that address can press its buttons"
-            )
+            self.get_logger().warning(f"the page is at {page.address}: everyone who reaches that address can use it")
         return page
 
-    # --- what comes
+    # --- inputs
 
     def on_latest(self, topic: str, cdr: bytes, sent_ns: int) -> None:
-        """Keep it as it is; whether it is read, the next drawing decides."""
         self.monitor.totals["received"] += 1
         self.latest[topic] = cdr, time.monotonic()
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
-        """A sensor's pose."""
         pose = transform_to_pose(message)
         if pose.sensor in self.sensors:
             self.poses[pose.sensor] = pose
 
     def on_diagnostics(self, message: Any, sent_ns: int) -> None:
-        """What a node says of itself."""
         statuses_now = dict(self.statuses)  # the other thread reads them
-        note_statuses(statuses_now, statuses(message, time.monotonic(), self.get_namespace()))
+        update_statuses(statuses_now, statuses(message, time.monotonic(), self.get_namespace()))
         self.statuses = statuses_now
 
     # --- drawing, in a thread of its own
 
     def keep_drawing(self) -> None:
-        """Draw while somebody looks; errors that nobody expected, time and again, end the node, which is started anew.
+        """Draw while a browser shows the page; consecutive errors end the node, which ``up`` restarts.
 
-        One alone does not: what is drawn wakes up viser's server in another thread, which now and then goes wrong
-        ("deque mutated during iteration"), and the next drawing shows what that one would have.
+        A single error does not: drawing wakes up viser's server in another thread, which sometimes raises ("deque
+        mutated during iteration"), and the next drawing replaces the failed one.
         """
         rest, failed = 1.0 / float(str(self.values["rate"])), 0
-        self.plotted = self.told = 0.0
+        self.plotted = self.status_drawn = 0.0
         while not self.ended.wait(rest):
             if not self.page.watched:
                 continue
@@ -196,25 +186,25 @@ class ViewerNode(GraphNode):
                     self.get_logger().fatal(f"drawing failed {failed} times: {traceback.format_exc()}")
                     self.context.try_shutdown()
                     return
-                self.log_seldom("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
+                self.log_throttled("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
             spent = time.monotonic() - begin
             self.drawing_s += spent
             rest = max(1.0 / float(str(self.values["rate"])) - spent, spent * (1.0 / _SHARE - 1.0))
 
     def draw(self, now: float) -> None:
-        """What is due at a steady time."""
+        """Draw the scene, and curves and status if they are due."""
         self.page.draw(self.snapshot())
         if now - self.plotted >= 1.0 / float(str(self.values["plot_rate"])):
             self.plotted = now
             self.collect_angles()
             self.page.draw_curves(self.history)
-        if now - self.told >= 1.0:
-            self.told = now
+        if now - self.status_drawn >= 1.0:
+            self.status_drawn = now
             self.page.draw_status(self.statuses, now)
             self.page.draw_bodies(self.bodies(), self.body)
 
     def snapshot(self) -> Snapshot:
-        """What is there now."""
+        """The content of the next drawing."""
         origins, quats = self.segments()
         return Snapshot(
             {sensor: self.seen(graph.skeleton_topic(sensor)) for sensor in self.sensors},
@@ -227,7 +217,7 @@ class ViewerNode(GraphNode):
         )
 
     def seen(self, topic: str) -> Seen:
-        """The latest skeletons of a topic, each message read once; people who come in separate messages, together."""
+        """The latest skeletons of a topic, of all people, who may be in separate messages; decodes a message once."""
         cdr, received = self.latest.get(topic, (b"", -np.inf))
         people = self.people.setdefault(topic, {})
         if cdr and cdr is not self.read.get(topic):
@@ -254,7 +244,7 @@ class ViewerNode(GraphNode):
             return np.empty((0, 3)), np.empty((0, 4))
 
     def payload(self, topic: str) -> Any:
-        """The latest message of a layer's topic; None for none, or none that is new."""
+        """The latest message of a layer's topic; None where it is absent or old."""
         cdr, received = self.latest.get(topic, (b"", -np.inf))
         if time.monotonic() - received > _STALE_S:
             return None
@@ -265,14 +255,14 @@ class ViewerNode(GraphNode):
             return None
 
     def collect_angles(self) -> None:
-        """Take the joint angles that have come, each with its standard deviations."""
+        """Add the received joint angles with their standard deviations to the curves."""
         stddevs: dict[int, tuple[tuple[str, ...], FloatArray]] = {}
         try:
             while self.stddevs:
                 stamp_ns, names, values = joint_state_values(deserialized(self.stddevs.popleft(), JointState))
                 stddevs[stamp_ns] = names, values
             newest = max(stddevs, default=0)
-            # angles are sent before their deviations: those that are newer wait for the next time
+            # angles are sent before their deviations: newer ones wait for the next call
             while self.angles:
                 stamp_ns, names, values = joint_state_values(deserialized(self.angles[0], JointState))
                 if stamp_ns > newest:
@@ -290,29 +280,29 @@ class ViewerNode(GraphNode):
         own = (names.within(topic, self.get_namespace()) for topic, _ in self.get_topic_names_and_types())
         return graph.bodies_among(topic for topic in own if topic is not None)
 
-    # --- what people press, in threads of the page's own
+    # --- controls of the page, called in its threads
 
     def call(self, service: str) -> str:
-        """Call a trigger; what it answers."""
+        """Call a trigger service; returns its message."""
         answer = self.ask(self.triggers[service], Trigger.Request())
         if not answer.success:
             raise PageError(answer.message or f"{service}: refused")
         return str(answer.message) or "done"
 
     def choose_filter(self, name: str) -> str:
-        """Another filter, and what the joint angles then are made of."""
+        """Change the filter, and the input and convention of the joint angles with it."""
         convention = ROLES[name].convention
         self.set_parameters_of("skeleton_filter", filter=name)
         self.set_parameters_of("joint_angles", convention=convention, input=graph.AUTO)
         return f"{name}, with angles {convention}"
 
     def choose_convention(self, name: str) -> str:
-        """Other angles of the filter that runs."""
+        """Change the convention of the joint angles."""
         self.set_parameters_of("joint_angles", convention=name, input=graph.AUTO)
         return f"angles {name}"
 
     def choose_body(self, name: str) -> str:
-        """Another person's joint angles."""
+        """Show another person's joint angles and segments."""
         for subscription in self.of_body:
             self.destroy_subscription(subscription)
         self.body = name
@@ -321,42 +311,34 @@ class ViewerNode(GraphNode):
         qos = to_profile(LATEST)
         segments = graph.segments_topic(name)
         self.of_body = [
-            self.listen(
+            self.subscribe(
                 graph.joint_states_topic(name), JointState, qos, lambda cdr, _: self.angles.append(cdr), raw=True
             ),
-            self.listen(
+            self.subscribe(
                 graph.joint_states_stddev_topic(name),
                 JointState,
                 qos,
                 lambda cdr, _: self.stddevs.append(cdr),
                 raw=True,
             ),
-            self.listen(segments, MultiDOFJointState, qos, partial(self.on_latest, segments), raw=True),
+            self.subscribe(segments, MultiDOFJointState, qos, partial(self.on_latest, segments), raw=True),
         ]
         return f"angles of {name}"
 
     def set_parameters_of(self, node: str, **values: str) -> None:
-        """Set parameters of another node, all or none.
-
-        Raises:
-            PageError: it refuses, with its reason, or does not answer.
-        """
+        """Set parameters of another node, all or none; PageError where it refuses them or does not answer."""
         parameters = [RosParameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         answer = self.ask(self.setters[node], SetParametersAtomically.Request(parameters=parameters))
         if not answer.result.successful:
             raise PageError(f"{node}: {answer.result.reason or 'refused'}")
 
     def ask(self, client: Client, request: Any) -> Any:
-        """Call a service and wait for its answer; not in the executor's thread.
-
-        Raises:
-            PageError: nobody offers it, or nobody answers.
-        """
+        """Call a service and wait for its answer, not in the executor's thread; PageError without server or answer."""
         if not client.service_is_ready():
             raise PageError(f"{client.service_name}: no node that offers it runs")
         future = client.call_async(request)
         end = time.monotonic() + _ANSWER_S
-        # a callback of the future would be a task, which our executor only sees to when nothing else is to be done
+        # a callback of the future would be a task, which our executor runs only when it is idle
         while not future.done():
             if time.monotonic() > end or self.ended.wait(0.02):
                 client.remove_pending_request(future)
@@ -366,7 +348,6 @@ class ViewerNode(GraphNode):
     # --- diagnostics
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Who looks, and what drawing costs."""
         watched = self.page.watched
         values: dict[str, object] = {"browsers": watched, "drawings": self.drawn}
         if self.drawn:
@@ -374,7 +355,6 @@ class ViewerNode(GraphNode):
         return 0, f"{self.page.address}, {watched} browser{'s' * (watched != 1)}", values
 
     def close(self) -> None:
-        """Stop drawing and serving."""
         self.ended.set()
         self.thread.join(timeout=2.0)
         self.page.close()
@@ -388,11 +368,11 @@ def _is_loopback(host: str) -> bool:
 
 
 def give_way() -> None:
-    """Let everybody else have the processor first; a page that comes late harms nobody."""
+    """Lower the priority of this process, because a late page does no harm."""
     for thread in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, int(thread.name), _NICE)
-    # Where the scheduler shares by session, only this counts; but a terminal's session is not ours to slow down.
+    # Where the scheduler groups processes by session, only the group's priority counts; not for a terminal's session.
     if os.getsid(0) == os.getpid():
         with contextlib.suppress(OSError):
             Path("/proc/self/autogroup").write_text(str(_NICE), encoding="ascii")

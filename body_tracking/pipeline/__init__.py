@@ -1,1 +1,1 @@
-"""What the graph consists of: stages, the messages between them, and the offline runner; knows no ROS library."""
+"""The parts of the graph: stages, their topics and parameters, and the offline runner."""

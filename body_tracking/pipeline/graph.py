@@ -1,7 +1,7 @@
-"""Names of the graph: its topics and services, and what parameters say of each other's nodes.
+"""Names of the graph's topics and services, and values of parameters that several nodes share.
 
-Topics have their names in the root namespace; see :mod:`body_tracking.core.names`. Which nodes run is in
-:mod:`body_tracking.systems`. Knows no ROS library.
+Topics have their names in the root namespace; see :mod:`body_tracking.core.names`. :mod:`body_tracking.systems` defines
+which nodes run.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from body_tracking.core.qos import SENSOR_DATA, Qos
 from body_tracking.core.sources import check_sensor_name
 
 PARENT_VARIABLE = "BODY_TRACKING_SUPERVISOR"
-"""Environment variable: the process without which a node is to end."""
+"""Environment variable: id of the process with which a node ends."""
 
 SKELETON = SENSOR_DATA
 RELIABLE_SKELETON = Qos(reliability="reliable", depth=1000)
-"""For skeletons with the parameter ``reliable``: nothing is lost, however long a receiver takes."""
+"""For skeletons with the parameter ``reliable``: no message is lost to a slow subscriber."""
 
 SKELETON_SUFFIX = "/skeleton"
 CALIBRATION = "/calibration"
@@ -53,21 +53,21 @@ RESET_SERVICE = "calibration/reset"
 ALIGN_SERVICE = "imu_skeleton/align"
 DEFAULT_SENSORS = ("kinect1", "kinect2")
 DEFAULT_BODY = "body1"
-SOME_IMUS = ("forearm_left", "forearm_right")
-"""Segments of which wrist-worn inertial sensors tell."""
+EXAMPLE_IMUS = ("forearm_left", "forearm_right")
+"""Segments with wrist-worn inertial sensors."""
 
 
 class GraphError(BodyTrackingError):
-    """A graph that cannot be."""
+    """Options or parameters that do not go together."""
 
 
 def skeleton_topic(sensor: str) -> str:
-    """Where a sensor's skeletons are published."""
+    """The topic of a sensor's skeletons."""
     return f"/{sensor}{SKELETON_SUFFIX}"
 
 
 def orientation_topic(segment: str) -> str:
-    """Where the orientation of a segment by its inertial sensor is published."""
+    """The topic of a segment's orientation by its inertial sensor."""
     return f"/imu/{segment}/orientation"
 
 
@@ -76,17 +76,12 @@ def is_model_covariance(topic: str) -> bool:
     return re.fullmatch(r"(/\w+)*/(filtered|humans/bodies/\w+)/model_covariance", topic) is not None
 
 
-def is_orientation_topic(topic: str) -> bool:
-    """Whether a topic is :func:`orientation_topic` of some segment, and no sensor's own."""
-    return re.fullmatch(r"(/\w+)*/imu/\w+/orientation", topic) is not None
-
-
 @dataclass(frozen=True, slots=True)
 class ImuTopics:
-    """Where the driver of a segment's inertial sensor publishes.
+    """Topics of the driver of a segment's inertial sensor.
 
     Attributes:
-        segment: on which it is.
+        segment: that carries the sensor.
         imu: of ``sensor_msgs/Imu``, with orientation or raw.
         mag: of ``sensor_msgs/MagneticField``.
         absolute: the names hold in every namespace.
@@ -99,14 +94,14 @@ class ImuTopics:
 
 
 def imu_topics(entries: Iterable[str]) -> tuple[ImuTopics, ...]:
-    """The topics of inertial sensors, as a parameter lists them.
+    """The topics of the inertial sensors in a parameter's list.
 
     Args:
         entries: ``SEGMENT`` for ``/SEGMENT/imu/data``, ``data_raw`` and ``mag`` (REP-145), ``SEGMENT:NAME`` for another
-            name there, or ``SEGMENT:/TOPIC`` for a topic of Imu, with ``mag`` beside it.
+            name there, or ``SEGMENT:/TOPIC`` for a topic of Imu, with ``mag`` in the same namespace.
 
     Raises:
-        GraphError: an entry that is none, or a segment twice.
+        GraphError: an invalid entry, or a segment twice.
     """
     found = []
     for entry in entries:
@@ -132,7 +127,7 @@ def played_imu_topics(entries: Iterable[str], there: Collection[str]) -> tuple[s
         there: all topics of the bag.
 
     Raises:
-        GraphError: as above, or a sensor of which the bag has nothing.
+        GraphError: an invalid entry, a segment twice, or a sensor without a topic in the bag.
     """
     found: list[str] = []
     for each in imu_topics(entries):
@@ -149,44 +144,44 @@ def has_one_publisher(topic: str) -> bool:
 
 
 def joint_states_topic(body: str) -> str:
-    """Where a person's joint angles are published."""
+    """The topic of a person's joint angles."""
     return f"/humans/bodies/{body}/joint_states"
 
 
 def joint_states_stddev_topic(body: str) -> str:
-    """Where the standard deviations of a person's joint angles are published."""
+    """The topic of the standard deviations of a person's joint angles."""
     return f"{joint_states_topic(body)}_stddev"
 
 
 def bodies_among(topics: Iterable[str]) -> tuple[str, ...]:
-    """The persons whose joint angles are among these topics, by name."""
+    """The ids of the persons whose joint angles are among these topics, sorted."""
     found = (re.fullmatch(r"/humans/bodies/([A-Za-z]\w*)/joint_states", topic) for topic in topics)
     return tuple(sorted(match[1] for match in found if match))
 
 
 def markers_topic(body: str) -> str:
-    """Where a person's markers for RViz and Foxglove are published."""
+    """The topic of a person's markers for RViz and Foxglove."""
     return f"/humans/bodies/{body}/markers"
 
 
 def urdf_topic(body: str) -> str:
-    """Where the model of a person with measured segment lengths is published."""
+    """The topic of a person's URDF with the measured segment lengths."""
     return f"/humans/bodies/{body}/urdf"
 
 
 def segments_topic(body: str) -> str:
-    """Where the poses of a person's segments are published."""
+    """The topic of the poses of a person's segments."""
     return f"/humans/bodies/{body}/segments"
 
 
 @dataclass(frozen=True, slots=True)
 class ModelTopics:
-    """Where the filter publishes the model of a person.
+    """Topics of the estimated body model of a person.
 
     Attributes:
         state: coordinates and rates.
         stddev: their standard deviations.
-        covariance: the whole of it.
+        covariance: their covariance.
         segments: poses.
         urdf: the model with the person's lengths.
     """
@@ -198,13 +193,13 @@ class ModelTopics:
     urdf: str
 
     def types(self) -> dict[str, str]:
-        """The type of each."""
+        """The message type of each topic."""
         topics = (self.state, self.stddev, self.covariance, self.segments, self.urdf)
         return dict(zip(topics, (JOINT_STATE, JOINT_STATE, IMAGE, SEGMENTS, STRING), strict=True))
 
 
 def model_topics(body: str, several: bool = False) -> ModelTopics:
-    """The topics of a person's model; those of the only subject are not below the person's name, where they can."""
+    """The topics of a person's model; the state of a single subject has fixed topics without the person's id."""
     own = segments_topic(body), urdf_topic(body)
     if not several:
         return ModelTopics(MODEL_STATE, MODEL_STATE_STDDEV, MODEL_COVARIANCE, *own)
@@ -213,19 +208,19 @@ def model_topics(body: str, several: bool = False) -> ModelTopics:
 
 
 def bodies(count: int) -> tuple[str, ...]:
-    """The ids of several people, by their numbers from 1 on."""
+    """The ids of ``count`` people."""
     return tuple(f"body{number}" for number in range(1, count + 1))
 
 
 URDF_QOS = Qos(durability="transient_local", depth=1)
-"""Of a person's model: who comes late gets the latest."""
+"""Of a person's model: a late subscriber gets the latest one."""
 
 
 def check_body(body: str) -> str:
-    """The id of a person, as topics and names of angles take it.
+    """The id, if it can be part of topics and names of angles.
 
     Raises:
-        GraphError: it is none.
+        GraphError: it cannot be.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", body):
         raise GraphError(f"parameter 'body': {body!r}, expected letters, digits and _, a letter first")
@@ -233,7 +228,7 @@ def check_body(body: str) -> str:
 
 
 def sensors_among(topics: Iterable[str]) -> tuple[str, ...]:
-    """The sensors whose skeleton topics are among these, by name."""
+    """The sensors whose skeleton topics are among these, sorted."""
     found = []
     for topic in topics:
         name = topic.removeprefix("/").removesuffix(SKELETON_SUFFIX)
@@ -245,15 +240,14 @@ def sensors_among(topics: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-# --- filters
+# --- inputs and conventions
 
 AUTO = "auto"
-"""What a parameter says to go by the filter's name."""
+"""Value of a parameter whose default follows from the filter."""
 POSITIONAL = "positional"
-"""The convention that is made of positions, of any filter."""
+"""The convention of angles from joint positions, which every filter allows."""
 FUSED_INPUT, SENSORS_INPUT = "fused", "sensors"
 SKELETON_INPUT, MODEL_INPUT = "skeleton", "model_state"
-
 
 _CONVENTIONS: Final = {SKELETON_INPUT: POSITIONAL, MODEL_INPUT: "model"}
 
@@ -263,7 +257,7 @@ def angles_for(convention: str, source: str) -> tuple[str, str]:
 
     Args:
         convention: a convention, or ``AUTO`` for that of the input.
-        source: ``SKELETON_INPUT`` or ``MODEL_INPUT``: what the filter publishes, or what was asked for.
+        source: ``SKELETON_INPUT`` or ``MODEL_INPUT``.
     """
     if convention == AUTO:
         convention = _CONVENTIONS[source]
@@ -271,5 +265,5 @@ def angles_for(convention: str, source: str) -> tuple[str, str]:
 
 
 def convention_of(source: str) -> str:
-    """The convention of angles that are made of this input, where none is asked for."""
+    """The default convention of angles from this input."""
     return _CONVENTIONS[source]

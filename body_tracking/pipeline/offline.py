@@ -1,4 +1,4 @@
-"""The offline runner: stages that are connected by their messages, as nodes are, in one process and one order."""
+"""The offline runner: stages that exchange messages in one process, in a fixed order."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from body_tracking.messages.codecs import Wire
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _LOOKS = 2
-"""What a stage follows has to be the same at so many looks."""
+"""A stage changes its inputs only after it has seen the same topics at so many looks."""
 
 
 def connect(stages: Sequence[Stage], published: Iterable[str] = ()) -> None:
-    """Let each stage follow what the others publish, and who else publishes these topics."""
+    """Let each stage choose its inputs among the outputs of all stages and other published topics."""
     there = {port.topic for stage in stages for port in stage.outputs} | set(published)
     for stage in stages:
         for _ in range(_LOOKS):
@@ -24,15 +24,15 @@ def connect(stages: Sequence[Stage], published: Iterable[str] = ()) -> None:
 
 
 class OfflineRunner:
-    """Feeds stages with messages, and hands over what they publish.
+    """Feeds stages with messages, and passes their outputs to each other and to a sink.
 
-    What a stage publishes goes to the others as the message that it becomes, in single precision where messages have
-    no more, so that the numbers are those of the live graph.
+    Stages exchange serialised messages, with single precision where the messages have it, so that the results are
+    those of the live graph.
 
     Args:
-        stages: in the order in which each message goes to them.
+        stages: in the order in which they take each message.
         wire: for messages that this package does not write itself.
-        sink: gets topic, message and time of everything that is published.
+        sink: gets topic, message and time of every output.
         published: topics that others publish.
 
     Attributes:
@@ -59,29 +59,29 @@ class OfflineRunner:
 
     @property
     def outputs(self) -> tuple[Port, ...]:
-        """Everything that the stages publish."""
+        """The outputs of all stages."""
         return tuple(port for ports in self._outputs for port in ports.values())
 
     def start(self, at_ns: int) -> None:
-        """Publish what holds before the first message."""
+        """Publish the outputs that the stages have before the first message."""
         for number, stage in enumerate(self._stages):
             self._publish(number, stage.start(Now(at_ns, at_ns)), at_ns)
         self._deliver(at_ns)
 
     def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
-        """One message from outside, at the time at which it was recorded."""
+        """Take one message from outside, at the time at which it was recorded."""
         self._poll(at_ns)
         self._queue.append((topic, cdr))
         self._deliver(at_ns)
 
     def finish(self, at_ns: int) -> None:
-        """Publish what still waits for messages that do not come."""
+        """Publish what still waits for later messages."""
         for number, stage in enumerate(self._stages):
             self._publish(number, stage.drain(), at_ns)
             self._deliver(at_ns)
 
     def _poll(self, at_ns: int) -> None:
-        """Let every stage do what is due by now."""
+        """Let every stage publish what is due."""
         for number, stage in enumerate(self._stages):
             due_ns = stage.deadline_ns if stage.deadline_ns is not None else stage.due_ns
             if due_ns is not None and due_ns <= at_ns:
@@ -89,7 +89,7 @@ class OfflineRunner:
                 self._deliver(at_ns)
 
     def _deliver(self, at_ns: int) -> None:
-        """Hand over what is published, and what follows from it, in the order of publication."""
+        """Deliver the queued messages, and the outputs that follow from them, in the order of publication."""
         now = Now(at_ns, at_ns)
         while self._queue:
             topic, cdr = self._queue.popleft()

@@ -1,4 +1,4 @@
-"""Whom to track: parameters that several nodes have, and which of the bodies that a sensor sees is the subject."""
+"""Selection of the tracked person: its parameters, and the choice of the subject among the bodies of a sensor."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from body_tracking.core.parameters import Value, fields_of, parameters_from
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 
 SUBJECTS = NEAREST, FIRST, ALL = "nearest", "first", "all"
-"""Whom to track."""
+"""Values of the parameter ``subject``."""
 
 MAX_PEOPLE = 6
 """As many bodies as a Kinect v2 tracks."""
 
-
 HOLD = 3.0
-"""Seconds for which a person whom no sensor sees keeps the id."""
+"""Seconds for which an unseen person keeps the id."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeopleParameters:
-    """Whom to track."""
+    """Parameters of the selection of people."""
 
     subject: str = field(
         default=NEAREST,
         metadata={
-            "doc": "whom to track: the person who is nearest to the reference sensor at first, or the one who is seen "
+            "doc": "the tracked person: the one nearest to the reference sensor at first, or the one seen "
             "first, for as long as that person is there; or all, each under a number and with topics of their own",
             "choices": SUBJECTS,
         },
@@ -44,7 +43,7 @@ class PeopleParameters:
     hold: float = field(
         default=HOLD,
         metadata={
-            "doc": "a person whom no sensor sees keeps the id for this long; another is chosen, or gets it, then",
+            "doc": "an unseen person keeps the id for this long; then another one is chosen, or gets it",
             "unit": "s",
             "min": 0.5,
             "max": 60.0,
@@ -53,35 +52,24 @@ class PeopleParameters:
 
 
 PEOPLE = parameters_from(PeopleParameters, only=("subject", "people"))
-"""Whom to track: of ``fusion`` and ``skeleton_filter``; ``joint_angles`` needs to know of it."""
+"""Parameters of ``fusion``, ``skeleton_filter`` and ``joint_angles``."""
 
 
 def people_from(values: Mapping[str, Value]) -> PeopleParameters:
-    """Whom to track, of the values of :data:`PEOPLE`.
-
-    Raises:
-        ParameterError: one of them is out of its range.
-    """
+    """The parameters among a node's values; ParameterError for one out of its range."""
     table = parameters_from(PeopleParameters)
     given = {item.name: item.check(values[item.name]) for item in table if item.name in values}
     return PeopleParameters(**fields_of(PeopleParameters, given))
 
 
 class SubjectSelector:
-    """Picks one body per frame of one sensor: the number that was picked last, else the one nearest to the sensor."""
+    """Picks one body per frame of one sensor: the last picked number, else the body nearest to the sensor."""
 
     def __init__(self) -> None:
         self.body: int | None = None
 
     def pick(self, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The subject.
-
-        Args:
-            skeletons: of one instant, in the sensor's own frame.
-
-        Returns:
-            One of them; None where none has a joint with a position.
-        """
+        """The subject among skeletons of one instant, in the sensor's frame; None where none has a valid joint."""
         seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
         if not seen:
             return None
@@ -92,15 +80,15 @@ class SubjectSelector:
         return subject
 
     def reset(self) -> None:
-        """Forget who was picked."""
+        """Forget the picked body."""
         self.body = None
 
 
 class HeldSubject:
-    """Picks one of people with numbers of their own, some of whom may come in one message and others in the next.
+    """Picks one of several people, who may come in separate messages.
 
     Args:
-        hold: seconds without the one who was picked after which another is, the nearest to the frame's origin.
+        hold: seconds without the picked person after which the one nearest to the frame's origin is picked.
     """
 
     def __init__(self, hold: float) -> None:

@@ -1,4 +1,4 @@
-"""What each filter means for the nodes around it."""
+"""The inputs and the angle convention that each filter implies."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from body_tracking.core.parameters import Value
 from body_tracking.pipeline import graph
 
 DEFAULT_FILTER: Final = "lkf_constant_velocity"
-"""The filter of nodes and commands that are given none."""
+"""The filter of nodes and commands unless another is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class FilterRole:
-    """What a filter means for the nodes around it.
+    """Inputs and convention of a filter.
 
     Attributes:
-        input: what ``skeleton_filter`` listens to: the fused skeleton, or every sensor.
-        angles_input: what ``joint_angles`` listens to: the filtered skeleton, or the state of the filter's own model.
-        convention: of the joint angles, where none is asked for.
+        input: of ``skeleton_filter``: the fused skeleton, or every sensor.
+        angles_input: of ``joint_angles``: the filtered skeleton, or the state of the filter's own model.
+        convention: default convention of the joint angles.
     """
 
     input: str = graph.FUSED_INPUT
@@ -36,17 +36,17 @@ ROLES: Final[Mapping[str, FilterRole]] = {
     "thesis_lkf2": FilterRole(),
     "schlagenhauf_ekf": FilterRole(convention="model"),
 }
-"""Of each filter in ``filters.FILTERS``."""
+"""The role of each filter in ``filters.FILTERS``."""
 
 
 def role_of(options: Mapping[str, Value]) -> FilterRole:
-    """What the filter does in a graph with such options: its own role, but for what was asked for otherwise.
+    """The role of the filter in a graph: its own, overridden by options.
 
     Args:
-        options: ``filter``, ``filter_input``, ``convention`` and ``angles_input``; absent or empty for nobody asked.
+        options: ``filter``, ``filter_input``, ``convention`` and ``angles_input``; absent or empty for the default.
 
     Raises:
-        GraphError: it was asked for what this filter cannot do.
+        GraphError: the filter does not support the options.
     """
     name = str(options.get("filter") or DEFAULT_FILTER)
     own = ROLES.get(name, FilterRole())

@@ -33,7 +33,7 @@ BODY = Parameter(
 SENSORS = Parameter(
     "sensors",
     ("kinect1", "kinect2"),
-    "the sensors; the node listens to /<sensor>/skeleton of each",
+    "the sensors; the node takes /<sensor>/skeleton of each",
     fixed="every node of the graph must have the same sensors",
 )
 REFERENCE = Parameter(
@@ -44,8 +44,8 @@ REFERENCE = Parameter(
 )
 
 FRAMES_KEPT = 16
-"""Half a second of a Kinect's frames, more than sensors offer to keep: a node that is held up so long loses none. One
-that is too slow for them drops the oldest (:mod:`body_tracking.ros.backlog`)."""
+"""Half a second of a Kinect's frames, so that a node that is held up for so long loses none; a node that is always too
+slow drops the oldest (:mod:`body_tracking.ros.backlog`)."""
 
 
 def names_in(value: Value) -> tuple[str, ...]:
@@ -54,25 +54,21 @@ def names_in(value: Value) -> tuple[str, ...]:
 
 
 def sensors_of(values: Mapping[str, Value]) -> tuple[str, ...]:
-    """The names of the sensors.
-
-    Raises:
-        SensorNameError: a name that cannot be a sensor's.
-    """
+    """The names of the sensors; SensorNameError for an invalid one."""
     return tuple(check_sensor_name(sensor) for sensor in names_in(values["sensors"]))
 
 
 def skeleton_qos(values: Mapping[str, Value]) -> Qos:
-    """Of skeleton topics."""
+    """The profile of skeleton topics."""
     return graph.RELIABLE_SKELETON if values["reliable"] else graph.SKELETON
 
 
 def result_qos(values: Mapping[str, Value]) -> Qos:
-    """Of results, which are reliable; as deep as those of skeletons by the parameter ``reliable``."""
+    """The profile of results: always reliable, and with the parameter ``reliable`` as deep as that of skeletons."""
     return graph.RELIABLE_SKELETON if values["reliable"] else RELIABLE_QOS
 
 
 def skeleton_input(topic: str, values: Mapping[str, Value]) -> Port:
-    """A skeleton topic that a stage takes."""
+    """The port of a skeleton topic that a stage takes."""
     best_effort = not values["reliable"]
     return Port(topic, Skeletons(), skeleton_qos(values), FRAMES_KEPT, droppable=best_effort, perishable=best_effort)

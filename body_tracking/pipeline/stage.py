@@ -1,7 +1,7 @@
-"""A stage: what one node does, without ROS.
+"""A stage: the processing of one node, without ROS.
 
-A node hosts a stage (:mod:`body_tracking.ros.host`), and the offline runner hosts the same stages
-(:mod:`body_tracking.pipeline.offline`); both decode what a stage takes and encode what it returns.
+A node (:mod:`body_tracking.ros.host`) or the offline runner (:mod:`body_tracking.pipeline.offline`) hosts it: the host
+decodes the stage's inputs and encodes its outputs.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ class Now(NamedTuple):
     """When a message arrived.
 
     Attributes:
-        ros_ns: in ROS time, nanoseconds; in a replay the time at which it was recorded.
-        steady_ns: in a clock that never goes back, nanoseconds; in a replay the same as ``ros_ns``.
+        ros_ns: ROS time, nanoseconds; in a replay the time at which it was recorded.
+        steady_ns: monotonic time, nanoseconds; in a replay the same as ``ros_ns``.
     """
 
     ros_ns: int
@@ -34,13 +34,13 @@ class Port:
     Attributes:
         topic: its name in the root namespace.
         codec: of its messages.
-        qos: what publishers offer.
-        waiting: messages of an input that may wait while the stage is busy; 0 for the depth of ``qos``.
-        droppable: an input of which a node that is too slow drops the oldest messages.
-        perishable: an input that is of no use when it was sent before the process stood still.
+        qos: of the publishers.
+        waiting: least depth of an input's queue, messages; 0 for the depth of ``qos``.
+        droppable: an input whose oldest messages are dropped where the node is too slow.
+        perishable: an input whose messages are dropped if they were sent before a standstill of the process.
         measured: an output whose delay and latency are reported.
-        optional: an output whose message type not every installation has: left out there, and offline.
-        absolute: the user chose the name, which holds in every namespace where it begins with a slash.
+        optional: an output whose message type may not be installed: left out there, and offline.
+        absolute: the user chose the name; with a leading slash it holds in every namespace.
     """
 
     topic: str
@@ -73,15 +73,15 @@ class Stage:
 
     Args:
         values: of :attr:`PARAMETERS`, checked.
-        wanted: whether anybody listens to a topic of this name; nobody needs messages that are not wanted.
+        wanted: whether a topic has a subscriber; outputs without one may be left out.
 
     Attributes:
         NAME: of the node.
         PARAMETERS: of the node.
-        events: lines for the log, which the host takes out.
-        inputs: topics that it takes; may change with the parameters, and when :meth:`look` says so.
+        events: lines for the log, which the host removes.
+        inputs: topics that it takes; may change with the parameters, and by :meth:`look`.
         outputs: topics that it publishes; may change with the parameters.
-        services: what ``std_srvs/Trigger`` services of these names do; each returns a line for whoever called.
+        services: callbacks of ``std_srvs/Trigger`` services; each returns a line for the caller.
 
     Raises:
         BodyTrackingError: the values do not go together.
@@ -98,63 +98,63 @@ class Stage:
         self.services: Mapping[str, Callable[[], str]] = {}
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """Take other values of the parameters that are live.
+        """Change live parameters.
 
         Raises:
-            BodyTrackingError: they do not go together, or not now; nothing has changed.
+            BodyTrackingError: the values do not go together, or not now; nothing has changed.
         """
         self.values = values
 
     def start(self, now: Now) -> Iterable[Output]:
-        """What holds before the first message."""
+        """Outputs before the first message."""
         return ()
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
-        """One message of an input.
+        """Process one message of an input.
 
         Raises:
-            BodyTrackingError: it is of no use.
+            BodyTrackingError: it cannot be used.
         """
         raise NotImplementedError
 
     def poll(self, steady_ns: int) -> Iterable[Output]:
-        """What is due at a time; to be called at :attr:`deadline_ns`, and after messages."""
+        """Outputs that are due; called at :attr:`deadline_ns`, and after messages."""
         return ()
 
     @property
     def deadline_ns(self) -> int | None:
-        """When a message that waits is due, in steady time; None where none waits."""
+        """Steady time at which a waiting message is due; None where none waits."""
         return None
 
     @property
     def due_ns(self) -> int | None:
-        """When :meth:`poll` has something to publish though no message waits; None for never."""
+        """Steady time at which :meth:`poll` has an output although no message waits; None for never."""
         return None
 
     def settle(self) -> None:
-        """Do what the next message would have to wait for; called when there is nothing else to do."""
+        """Do work in advance that the next message would wait for; called when the node is idle."""
 
     def drain(self) -> Iterable[Output]:
-        """At the end: what waits for messages that do not come."""
+        """Outputs that still wait for messages at the end."""
         while (deadline_ns := self.deadline_ns) is not None:
             yield from self.poll(deadline_ns)
 
     def refused(self, topic: str) -> None:
-        """A message of an input could not be decoded."""
+        """Called for a message of an input that could not be decoded."""
 
     def reset(self, topic: str) -> None:
-        """Forget what was seen, because the stamps of an input jumped back."""
+        """Forget the state, because the stamps of an input jumped back."""
 
     def look(self, published: Callable[[str], bool]) -> bool:
-        """Follow what other nodes publish; whether :attr:`inputs` have changed."""
+        """Choose the inputs among the published topics; whether :attr:`inputs` have changed."""
         return False
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """Level, line and values for diagnostics."""
+        """Level, text and values for the diagnostics."""
         return 0, "", {}
 
     def save(self) -> None:
-        """Write to disk what is to outlive the process; called every other second, and at the end.
+        """Write the persistent state to disk; called every other second, and at the end.
 
         Raises:
             BodyTrackingError: it cannot be written.
@@ -162,5 +162,5 @@ class Stage:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """What happened since the construction."""
+        """Counts of events since the construction."""
         return {}

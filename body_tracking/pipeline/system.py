@@ -1,8 +1,8 @@
-"""A system: what one folder of the package adds to the graph and to the commands.
+"""A system: the nodes, options, topics and commands that one folder of the package adds.
 
-Each folder with a ``system.py`` exports one :class:`System` by the name ``SYSTEM``; another package brings one by an
-entry point of the group ``body_tracking.systems``. :mod:`body_tracking.systems` puts them together. A ``system.py``
-imports no more than it needs to describe itself: modules and classes are named, and loaded by who uses them.
+Each folder with a ``system.py`` exports one :class:`System` by the name ``SYSTEM``; another package adds one by an
+entry point of the group ``body_tracking.systems``. :mod:`body_tracking.systems` collects them. A ``system.py`` names
+its modules and classes instead of importing them; the caller loads them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Options: TypeAlias = Mapping[str, Value]
 
 
 class Place(IntEnum):
-    """Where a node stands on the way from the sensors to the angles; none needs what a later one publishes."""
+    """A node's place between the sensors and the angles; no node needs an output of a later one."""
 
     SOURCE = 0
     CALIBRATION = 1
@@ -35,17 +35,17 @@ class Place(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A word by which a user says what the graph is to do: of ``up``, of ``ros2 launch`` and of ``replay``.
+    """An option of ``up``, ``ros2 launch`` and ``replay``.
 
     Attributes:
         name: with underscores; ``--name-with-dashes`` on a command line.
         default: its type is the option's type; a tuple is given several times, a switch has no value.
-        text: what it does, for people.
-        metavar: what stands for its value.
-        choices: the values that it may have, as what returns them; None for any.
+        text: for the help.
+        metavar: placeholder of the value in the help.
+        choices: returns the allowed values; None for any.
         path: it names a file or a folder.
-        parameter: (node, parameter) that says the same in a parameters file; the option overrides it.
-        hidden: only the parameters file says it.
+        parameter: the equivalent (node, parameter) of a parameters file, which the option overrides.
+        hidden: no command has it, only the parameters file.
     """
 
     name: str
@@ -65,7 +65,7 @@ class TopicSpec:
     Attributes:
         name: with ``<sensor>`` and ``<id>`` in place of names.
         type_name: such as ``sensor_msgs/msg/PointCloud2``.
-        qos: what its publishers offer.
+        qos: of its publishers.
         publisher: the executable.
         content: one line.
     """
@@ -92,9 +92,9 @@ class NodeType:
 
     Attributes:
         name: ``ros2 run body_tracking <name>``.
-        place: on the way from the sensors to the angles.
-        stage: ``module:Class`` of the stage that it hosts; empty for a node of its own, ``body_tracking.nodes.<name>``.
-        takes: of a node without a stage, given its parameters and all topics of the graph: those that it takes.
+        place: between the sensors and the angles.
+        stage: ``module:Class`` of the stage that it hosts; empty for a node in ``body_tracking.nodes.<name>``.
+        takes: of a node without a stage: returns its input topics, given its parameters and all topics of the graph.
     """
 
     name: str
@@ -104,7 +104,7 @@ class NodeType:
 
     @property
     def module(self) -> str:
-        """Of a node without a stage."""
+        """The module of a node without a stage."""
         return f"body_tracking.nodes.{self.name}"
 
 
@@ -117,7 +117,7 @@ class NodeSpec:
         executable: ``ros2 run body_tracking <executable>``.
         namespace: of the node.
         defaults: parameters that a parameters file may override.
-        parameters: parameters that it may not, because the graph hangs together by them.
+        parameters: parameters that it may not override, because they connect the graph.
         remappings: (from, to) of topics.
     """
 
@@ -130,26 +130,26 @@ class NodeSpec:
 
     @property
     def full_name(self) -> str:
-        """As in a parameters file: ``/fusion``."""
+        """With the namespace, as in a parameters file: ``/fusion``."""
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
-    def meant_by(self, section: str) -> bool:
-        """Whether a section of a parameters file is about this node; one file serves in every namespace."""
+    def in_section(self, section: str) -> bool:
+        """Whether a section of a parameters file applies to this node, with or without its namespace."""
         return matches(section, self.full_name) or matches(section, f"/{self.name}")
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Something that the viewer can show beside the skeletons.
+    """An additional layer of the viewer's scene.
 
     Attributes:
         name: in the scene.
-        text: what people read.
+        text: label on the page.
         topic: whose latest message is shown.
         codec: ``module:NAME`` of its codec.
         draw: ``module:function``; called with viser's scene, the path of the layer in it, and the payload, or None
-            where the layer is switched off or nothing came for a while.
-        shown: at first.
+            where the layer is switched off or its message is old.
+        shown: whether it is switched on at first.
     """
 
     name: str
@@ -162,7 +162,7 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A subcommand of ``body_tracking``: its name, the module with its ``add_parser(subparsers)``, what it does."""
+    """A subcommand of ``body_tracking``: name, module with ``add_parser(subparsers)``, one line for the help."""
 
     name: str
     module: str
@@ -171,15 +171,14 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """What a folder adds.
+    """The contents of one system.
 
     Attributes:
         name: of the system.
         order: among the systems, in tables.
         nodes: its executables.
-        specs: the nodes that it runs in a graph with such options, without their namespace.
-        options: that it brings.
-        topics, services, commands, layers: likewise.
+        specs: returns the nodes that it runs for given options, without their namespace.
+        options, topics, services, commands, layers: that it adds.
     """
 
     name: str
@@ -204,11 +203,11 @@ def transport(options: Options) -> dict[str, Value]:
 
 
 def asked(options: Options, **parameters: str) -> dict[str, Value]:
-    """Parameters that options say, by the name of the option; what nobody asked for is left out."""
+    """Parameters with the values of options, ``parameter=option``; options without a value are left out."""
     return {name: options[option] for name, option in parameters.items() if options[option]}
 
 
 def load(name: str) -> Any:
-    """What ``module:name`` stands for."""
+    """The object ``module:name``."""
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)

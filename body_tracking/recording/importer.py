@@ -22,6 +22,7 @@ import numpy as np
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.imu import ImuRecording, RecordedAngles, RecordedImu
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
 from body_tracking.core.qos import RELIABLE, SENSOR_DATA, Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.core.sources import RecordedFrame, Recording
@@ -30,7 +31,6 @@ from body_tracking.inertial.mvnx import MvnxRecording
 from body_tracking.kinect.csv_recording import CsvRecording, sensor_column
 from body_tracking.kinect.ntu import NtuRecording
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES

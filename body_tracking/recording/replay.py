@@ -20,12 +20,12 @@ from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.storage import load
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.inertial.parameters import TrackingParameters
-from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.node_parameters import parameters_for as parameters_of_nodes

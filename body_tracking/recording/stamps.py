@@ -23,9 +23,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from body_tracking.core.message_types import TIME_REFERENCE
 from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS, FloatArray, IntArray
 from body_tracking.kinect.ros_time import OTHER_CLOCK_NS
-from body_tracking.messages.base import TIME_REFERENCE
 from body_tracking.pipeline import graph
 from body_tracking.recording.mcap_file import BagError, McapFile
 from body_tracking.recording.rosbag2 import RawMessage, deserialize, first_field, serialize

@@ -1,9 +1,9 @@
-"""Which of the frames that wait to leave out, where a node is too slow for what comes: the oldest, and no more.
+"""Dropping of the oldest waiting frames where a node is too slow for its inputs, and counters of lost messages.
 
-A queue that empties now and then has been of use: it kept what came while its owner was held up. One in which
-everything waits, always, is only delay. So nothing is dropped until even the frames of each look have waited for longer
-than a target for a whole interval (controlled delay: Nichols and Jacobson 2012, "Controlling queue delay"); but never
-is more taken on at once than can be done in a while, by what frames have cost so far.
+A queue that becomes empty now and then only absorbs bursts; a standing queue is only delay. So frames are dropped when
+the oldest one has waited for longer than a target throughout an interval (controlled delay: Nichols and Jacobson 2012,
+"Controlling queue delay"). In addition a batch is limited to what can be done in a given time, by the measured cost of
+a frame.
 """
 
 from __future__ import annotations
@@ -14,36 +14,34 @@ from collections.abc import Sequence
 from body_tracking.core.skeleton import NANOSECONDS
 
 TARGET = 0.1
-"""Seconds that a frame may wait, always."""
+"""Seconds that a frame may always wait."""
 
 INTERVAL = 1.0
-"""Seconds for which it may wait longer: who is held up once is not too slow."""
+"""Seconds for which frames may wait longer: a single delay does not mean that the node is too slow."""
 
 AT_ONCE = 0.5
-"""Seconds that the work on the frames that are here may take at most: as long as readers keep what comes meanwhile."""
+"""Longest work on one batch, seconds; the queues of the subscriptions hold the frames of this time."""
 
 _AGAIN = 10.0
-"""For so long, seconds, after frames were dropped ..."""
-
+"""Seconds after a drop during which only the share ``_SOONER`` of the interval is needed for the next one."""
 _SOONER = 0.1
-"""... this much of the interval is enough to drop some again."""
 
 MAX_AGE = 0.25
-"""Seconds: a longer pause between two messages may be a standstill, and after it older ones are left out. With what the
-nodes behind add it is below the age up to which a robot follows angles (``SafetyLimits.max_age``, 0.3 s)."""
+"""Seconds: a longer pause between two messages may be a standstill, after which older messages are dropped. With the
+delay of the later nodes it is below the age up to which a robot follows angles (``SafetyLimits.max_age``, 0.3 s)."""
 
 _RECOVERY = 1.0
-"""Seconds after a standstill in which messages that were sent before may still come."""
+"""Seconds after a standstill in which older messages may still arrive."""
 
 _SMOOTHING = 0.3
-"""Weight of the last work in what a frame costs."""
+"""Weight of the last batch in the cost of a frame."""
 
 
 class Backlog:
-    """Leaves out the oldest frames of a node that is too slow.
+    """Drops the oldest frames of a node that is too slow.
 
     Attributes:
-        dropped: how many frames of each topic, since the construction.
+        dropped: number of frames by topic.
     """
 
     def __init__(self) -> None:
@@ -54,14 +52,14 @@ class Backlog:
         self._taken, self._taken_ns = 0, 0
 
     def late(self, arrived: Sequence[tuple[str, int]], now_ns: int) -> list[int]:
-        """Those of the frames that are here which are not worth handling any more.
+        """The waiting frames to be dropped.
 
         Args:
-            arrived: topic and time of arrival, nanoseconds, of each frame that waits.
+            arrived: topic and time of arrival, nanoseconds, of each waiting frame.
             now_ns: the time now, by the same clock.
 
         Returns:
-            Their places among those given; never that of a topic's newest frame.
+            Their indices in ``arrived``; never that of a topic's newest frame.
         """
         late: list[int] = []
         if arrived:
@@ -76,13 +74,13 @@ class Backlog:
         return late
 
     def done(self, now_ns: int) -> None:
-        """The others have been handled."""
+        """Update the cost of a frame after the others have been handled."""
         if self._taken:
             cost = max(0.0, (now_ns - self._taken_ns) / self._taken)
             self._cost_ns += _SMOOTHING * (cost - self._cost_ns)
 
     def _too_slow(self, waited_ns: int, now_ns: int) -> bool:
-        """Whether frames have been waiting for too long for some time."""
+        """Whether the oldest frame has been above the target throughout the interval."""
         if waited_ns <= TARGET * NANOSECONDS:
             self._above_since_ns = None
             return False
@@ -92,7 +90,7 @@ class Backlog:
         return now_ns - self._above_since_ns >= INTERVAL * NANOSECONDS * (_SOONER if again else 1.0)
 
     def _beyond(self, arrived: Sequence[tuple[str, int]], work: float, since_ns: int = 0) -> list[int]:
-        """All but the newest of each topic, and as many of the newest as can be done in so many seconds."""
+        """All frames but each topic's newest and the newest ones that fit into ``work`` seconds."""
         kept: list[int] = []
         topics: set[str] = set()
         for place in sorted(range(len(arrived)), key=lambda each: arrived[each][1], reverse=True):
@@ -105,13 +103,13 @@ class Backlog:
 
 
 class Standstill:
-    """Leaves out old messages where a process was stopped (or held up for as long) and goes on.
+    """Drops old messages after a standstill of the process (stopped, or not scheduled for long).
 
-    What was sent meanwhile waits in the socket's buffer, which keeps the oldest of it, whatever the depth of the queue.
-    At other times the rule does not apply: the sender may be another computer whose clock is wrong.
+    The socket's buffer keeps the oldest messages of that time, whatever the depth of the queue. At other times the age
+    of a message does not count, because the sender may be another computer with a wrong clock.
 
     Attributes:
-        left_out: how many messages of each topic, since the construction.
+        left_out: number of messages by topic.
     """
 
     def __init__(self) -> None:
@@ -120,13 +118,7 @@ class Standstill:
         self._over_ns: int | None = None
 
     def is_stale(self, topic: str, sent_ns: int, now_ns: int) -> bool:
-        """Whether a message is to be left out; to be asked of every message.
-
-        Args:
-            topic: on which it came.
-            sent_ns: when it was sent.
-            now_ns: the time now, by the same clock.
-        """
+        """Whether to drop a message; must be called for every message, with both times by the same clock."""
         if self._last_ns is not None and now_ns - self._last_ns > MAX_AGE * NANOSECONDS:
             self._over_ns = now_ns
         self._last_ns = now_ns
@@ -138,12 +130,12 @@ class Standstill:
 
 
 class Sequences:
-    """Counts messages that were sent and never came, by the numbers that their publishers give them.
+    """Counts lost messages by the sequence numbers of their publishers.
 
     Attributes:
-        lost: how many of each topic, since the construction.
-        switched: how often a message of each topic came from another publisher than the one before. Of one publisher
-            numbers only rise; of two that take turns every second message counts.
+        lost: number of lost messages by topic.
+        switched: number of messages by topic whose sequence number did not rise: with one publisher none, with two
+            alternating ones every second message.
     """
 
     def __init__(self) -> None:
@@ -153,12 +145,7 @@ class Sequences:
         self._last: dict[str, list[int]] = {}
 
     def note(self, topic: str, number: int) -> None:
-        """A message came.
-
-        Args:
-            topic: on which.
-            number: its publisher's, which goes up by one from each message to the next.
-        """
+        """Count a message with its sequence number."""
         if number == _UNKNOWN:
             return
         self.switched[topic] += number <= self._latest.get(topic, -1)
@@ -166,7 +153,7 @@ class Sequences:
         last = self._last.setdefault(topic, [])
         before = max((each for each in last if each < number), default=None)
         if before is None or number - before > _MOST_LOST:
-            # a publisher that is new; of more than a few on one topic nobody can tell
+            # a new publisher
             last.append(number)
             del last[:-_PUBLISHERS]
             return
@@ -176,6 +163,6 @@ class Sequences:
 
 
 _UNKNOWN = 2**64 - 1
-"""What a middleware says that gives messages no numbers."""
+"""The number of a middleware without sequence numbers."""
 _PUBLISHERS, _MOST_LOST = 4, 10_000
-"""Publishers of a topic that are told apart, and the largest number of messages lost at once."""
+"""Publishers of a topic that are distinguished, and the largest number of messages lost at once."""

@@ -1,4 +1,4 @@
-"""What both bag nodes need to handle topics of any type: message classes by name, and QoS to and from a bag's form."""
+"""Message classes by name, and conversion of QoS profiles between rclpy and :mod:`body_tracking.core.qos`."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -33,7 +33,7 @@ def message_class(type_name: str) -> Any:
 
 
 def to_profile(qos: Qos) -> QoSProfile:
-    """A bag's QoS as one that a publisher or a subscription takes."""
+    """rclpy's profile."""
     durations = {
         name: Duration(nanoseconds=nanoseconds)
         for name, nanoseconds in (
@@ -59,7 +59,7 @@ def to_profile(qos: Qos) -> QoSProfile:
 
 
 def from_profile(profile: QoSProfile) -> Qos:
-    """What discovery tells of a publisher, in a bag's form."""
+    """The profile of a publisher as discovery reports it."""
     return Qos(
         reliability=profile.reliability.name.lower(),
         durability=profile.durability.name.lower(),

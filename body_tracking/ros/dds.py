@@ -1,11 +1,11 @@
-"""What this package asks of the middleware beyond quality of service, which says nothing of it.
+"""Settings of the middleware that quality of service does not cover.
 
-Fast DDS, the default of ROS 2, is told by files of profiles; other middlewares are left as they are, and so is it where
-somebody else has chosen (``FASTDDS_DEFAULT_PROFILES_FILE`` and the like).
+Fast DDS, the default of ROS 2, reads them from profile files. Other middlewares keep their defaults, and so does Fast
+DDS where the user has chosen profiles (``FASTDDS_DEFAULT_PROFILES_FILE`` and the like).
 
-Where a receiver is too busy to empty its buffers, messages are lost; a reliable writer sends them again when the
-receiver's answer to its next heartbeat says so. Fast DDS has one every three seconds, and for so long all that comes
-after a lost message waits for it. Ours have one every tenth of a second, while there is something to be acknowledged.
+A busy receiver loses messages when its buffers are full; a reliable writer sends them again after the receiver answers
+its next heartbeat. Fast DDS has a heartbeat period of 3 s, for which all messages after a lost one wait. Ours is 0.1 s,
+while there is something to be acknowledged.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
 def prepare() -> None:
-    """Send again soon what was lost: for this process, which has not used ROS yet, and those that it starts."""
+    """Use the short heartbeat period, in this process, which must not have used ROS yet, and its children."""
     if not any(os.environ.get(name) for name in PROFILES):
         _use(_RESEND)
 
 
 def stay_on_this_machine() -> None:
-    """Let this process and those that it starts talk over the loopback interface, unless the user chose otherwise.
+    """Restrict this process and its children to the loopback interface, unless the user chose otherwise.
 
-    A node that was killed leaves shared memory behind that the others go on writing to; until they notice, up to 3 s,
-    whoever takes its place hears nothing. So no shared memory here. With the range ``LOCALHOST`` rmw_fastrtps insists
-    on it; the profile does the same without. (A short lease would let the others forget the dead sooner, and also the
-    living, where the machine is busy: of these they may then never hear again.)
+    A killed node leaves shared memory behind that the others go on writing to; until they notice, up to 3 s, its
+    successor receives nothing. So shared memory is not used. With the range ``LOCALHOST`` rmw_fastrtps insists on it;
+    the profile restricts to this machine without it. (A short lease would remove dead nodes sooner, but on a busy
+    machine also living ones, which may then never be discovered again.)
     """
     chosen = os.environ.get(_RANGE)
     if chosen is None and "ROS_LOCALHOST_ONLY" not in os.environ:

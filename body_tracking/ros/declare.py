@@ -1,4 +1,4 @@
-"""Parameters of nodes, declared and checked over ROS."""
+"""Declaration of the nodes' parameters in ROS."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -28,27 +28,27 @@ from body_tracking.core.parameters import (
 
 
 def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
-    """Declare parameters; the values that they have, with what was given by file or ``-p``.
+    """Declare parameters; returns their values, set by file, by ``-p`` or by default.
 
     Raises:
-        ParameterError: something unknown was given, which rclpy would ignore in silence, or a value is not allowed.
+        ParameterError: an unknown name, which rclpy would silently ignore, or a value that is not allowed.
     """
     overrides: dict[str, RosParameter] = node._parameter_overrides
     known = {parameter.name: parameter for parameter in table}
     given = {name: item.value for name, item in overrides.items() if not is_ros_own(name)}
-    for name in _meant_for_others(node, given.keys() - known.keys()):
+    for name in _of_other_nodes(node, given.keys() - known.keys()):
         del given[name]
     values = check_all(table, given)
     for name, value in values.items():
-        # rclpy would refuse a whole number where a number is expected; check_all has made it one.
+        # rclpy would refuse an integer for a float; check_all has converted it.
         if name in overrides:
             overrides[name] = RosParameter(name, value=to_ros(value))
         node.declare_parameter(name, to_ros(value), _descriptor(known[name]))
     return MappingProxyType(values)
 
 
-def _meant_for_others(node: Node, unknown: Set[str]) -> Set[str]:
-    """Unknown names that a wildcard section of a parameters file gives to all nodes, and that some node knows."""
+def _of_other_nodes(node: Node, unknown: Set[str]) -> Set[str]:
+    """Unknown names in wildcard sections of parameters files that are parameters of other nodes."""
     shared: set[str] = set()
     for file in parameter_files() if unknown else ():
         for pattern, values in read_file(file).items():

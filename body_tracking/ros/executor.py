@@ -1,9 +1,8 @@
-"""An executor for one node that costs little per message.
+"""An executor for one node with little overhead per message.
 
-rclpy's ``SingleThreadedExecutor`` collects the node's entities, makes a wait set, a generator, a task and a coroutine
-for every message: some 0.2 ms, more than most of our nodes work. (``rclpy.experimental.EventsExecutor`` would be the
-remedy; the one of rclpy 7.1.6 on PyPI keeps a processor busy while nothing happens, and its ``spin`` does not return at
-shutdown.)
+rclpy's ``SingleThreadedExecutor`` collects the node's entities and makes a wait set, a generator, a task and a
+coroutine for every message: about 0.2 ms, more than the work of most of our nodes. (``EventsExecutor`` of rclpy 7.1.6
+on PyPI uses a whole processor while idle, and its ``spin`` does not return at shutdown.)
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -25,50 +24,50 @@ from rclpy.timer import Timer
 from rclpy.waitable import NumberOfEntities
 
 _LOOK_PERIOD_NS = 100_000_000
-"""Nanoseconds between two looks at services and events while messages keep coming: each costs as much as a message."""
+"""Nanoseconds between two checks of services and events while messages keep coming; each costs as much as a message."""
 _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
 @runtime_checkable
-class TakesTogether(Protocol):
-    """A node that only notes messages as they are handed over, and then works on all that have come."""
+class HandlesBatches(Protocol):
+    """A node that processes its messages in batches."""
 
-    def messages_taken(self) -> None:
-        """Called after the last callback of all the messages that were there."""
-
-
-@runtime_checkable
-class LeavesOut(Protocol):
-    """A node that does not handle all that has come."""
-
-    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-        """Those of the messages, each with its subscription, that are to be handled, in the same order."""
-
-    def messages_handled(self) -> None:
-        """Called after that."""
+    def batch_done(self) -> None:
+        """Called after the callbacks of all waiting messages."""
 
 
 @runtime_checkable
-class Guards(Protocol):
-    """A node that lets nothing through that its own callbacks raise."""
+class DropsMessages(Protocol):
+    """A node that drops late messages."""
+
+    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """The messages to be handled, each with its subscription, in the same order."""
+
+    def work_done(self) -> None:
+        """Called after they have been handled."""
+
+
+@runtime_checkable
+class GuardsCallbacks(Protocol):
+    """A node that handles the errors of its callbacks."""
 
     def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """A callback that does not raise; None where it would have."""
+        """A callback that returns None instead of raising."""
 
 
 class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
 
-    Messages and timers take a short way with a wait set that is kept; everything else (services, events, guard
-    conditions) goes rclpy's own, and is looked at ten times a second while messages keep coming. Timers come after the
-    messages: one that stands for a message that does not come must not overtake it while the node is busy.
+    Messages and timers are executed directly, with a wait set that is kept. rclpy executes everything else (services,
+    events, guard conditions), which is checked ten times a second while messages keep coming. Timers run after the
+    messages: the timeout of a message must not fire while that message waits in a queue.
     """
 
     def __init__(self, node: Node) -> None:
         super().__init__()
-        self._guarded = node.guarded if isinstance(node, Guards) else lambda where, callback: callback
-        self._taken = self._guarded("messages", node.messages_taken) if isinstance(node, TakesTogether) else None
-        self._leaving_out = node if isinstance(node, LeavesOut) else None
+        self._guarded = node.guarded if isinstance(node, GuardsCallbacks) else lambda where, callback: callback
+        self._taken = self._guarded("messages", node.batch_done) if isinstance(node, HandlesBatches) else None
+        self._leaving_out = node if isinstance(node, DropsMessages) else None
         self._changed = True
         self._stopped = False
         self._until_ns: int | None = None
@@ -86,10 +85,7 @@ class LeanExecutor(SingleThreadedExecutor):
         self.wake()
 
     def finish(self) -> None:
-        """Make :meth:`spin` return once every message that was sent until now and is here is handled; from any thread.
-
-        Timers and services are served as before, but new messages hold nobody up.
-        """
+        """Make :meth:`spin` return after all waiting messages that were sent before this call; from any thread."""
         self._until_ns = time.time_ns()
         self.wake()
 
@@ -105,11 +101,11 @@ class LeanExecutor(SingleThreadedExecutor):
             try:
                 self._spin_same_entities()
             except InvalidHandle:
-                continue  # an entity was destroyed between being looked up and being used
+                continue  # an entity was destroyed before it was used
         raise ExternalShutdownException
 
     def _spin_same_entities(self) -> None:
-        """Until the node's entities change."""
+        """Execute callbacks until the node's entities change."""
         self._changed = False
         node = self._node
         subscriptions, timers = list(node.subscriptions), list(node.timers)
@@ -118,7 +114,7 @@ class LeanExecutor(SingleThreadedExecutor):
         count = NumberOfEntities(len(subscriptions), len(guards), len(timers), len(clients), len(services))
         for waitable in waitables:
             count += waitable.get_num_entities()
-        with ExitStack() as used:  # what somebody destroys meanwhile stays until it is no longer waited for
+        with ExitStack() as used:  # keeps destroyed entities until the wait set no longer needs them
             context: Any = self._context.handle
             used.enter_context(context)
             for entity in (*subscriptions, *timers, *clients, *services, *guards):
@@ -137,7 +133,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 count.num_events,
                 context,
             )
-            # what the middleware cannot make a message of is left out
+            # a message that the middleware cannot deserialise is left out
             takes = [self._guarded(f"taking {each.topic_name}", each.handle.take_message) for each in subscriptions]
             looked_ns = 0
             ready_since_ns: int | None = None
@@ -171,7 +167,7 @@ class LeanExecutor(SingleThreadedExecutor):
                         self._stopped = True
                         return
                 if messages and self._leaving_out is not None:
-                    messages = self._leaving_out.worth_handling(messages)
+                    messages = self._leaving_out.drop_late(messages)
                 for subscription, taken in messages:
                     if self._stopped:
                         return
@@ -180,20 +176,20 @@ class LeanExecutor(SingleThreadedExecutor):
                 if messages and self._taken is not None:
                     self._taken()
                 if messages and self._leaving_out is not None:
-                    self._leaving_out.messages_handled()
+                    self._leaving_out.work_done()
                 executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None
                     continue
-                looked_ns = 0  # there may be several, or they are still ready when there is nothing else to do
+                looked_ns = 0  # check again at once: there may be several
                 ready_since_ns = ready_since_ns or time.monotonic_ns()
-                # a node that messages keep busy all the time answers, too
+                # also in a node that is always busy with messages
                 if not executed or time.monotonic_ns() - ready_since_ns > _LOOK_PERIOD_NS:
                     self._spin_once_impl(0)
 
 
 def _others_ready(wait_set: Any, waitables: list[Any]) -> bool:
-    """Whether anything but messages and timers is; a timer that is set anew wakes us up for nothing."""
+    """Whether anything except messages and timers is ready."""
     kinds = ("guard_condition", "client", "service")
     return any(wait_set.get_ready_entities(kind) for kind in kinds) or any(
         waitable.is_ready(wait_set) for waitable in waitables
@@ -201,15 +197,13 @@ def _others_ready(wait_set: Any, waitables: list[Any]) -> bool:
 
 
 def _take_all(subscriptions: list[Any], takes: list[Callable[..., Any]], wait_set: Any) -> list[tuple[Any, Any]]:
-    """All messages that are there, each with its subscription, in the order in which they were sent.
+    """All waiting messages, each with its subscription, in the order in which they were sent.
 
-    However far a node lags behind, it then handles several sensors' frames as an offline run reads them from the
-    recording.
+    So a node that lags behind handles the frames of several sensors in the same order as an offline run.
     """
     arrived: list[tuple[int, int, Any]] = []
     found = bool(wait_set.get_ready_entities("subscription"))
-    # Until a look at every topic finds nothing: what was sent before a message that is taken has come before it, but
-    # maybe after its own topic was looked at.
+    # Until one pass finds nothing: an earlier message may have arrived on a topic that this pass had already read.
     while found:
         found = False
         for index, (subscription, take) in enumerate(zip(subscriptions, takes, strict=True)):
@@ -223,7 +217,6 @@ def _take_all(subscriptions: list[Any], takes: list[Callable[..., Any]], wait_se
 def _execute_timers(timers: list[Timer]) -> int:
     executed = 0
     for timer in timers:
-        # One that is cancelled is not ready.
         if timer.handle.is_timer_ready():
             executed += 1
             timer.handle.call_timer()

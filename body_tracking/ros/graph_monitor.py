@@ -1,4 +1,4 @@
-"""What ``body_tracking up`` hears of its graph: diagnostics, angles and the clock, as one line."""
+"""Diagnostics, angles and clock of the graph, as the status line of ``body_tracking up``."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -24,7 +24,7 @@ from body_tracking.core.qos import RELIABLE
 from body_tracking.kinect.system import sensors_of
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
-from body_tracking.messages.node_status import NodeStatus, note_statuses
+from body_tracking.messages.node_status import NodeStatus, update_statuses
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES, role_of
 from body_tracking.pipeline.system import Options
@@ -33,36 +33,36 @@ from body_tracking.ros.bag_topics import to_profile
 _CHAIN = ("skeleton_filter", "joint_angles")
 _NAME = "body_tracking_up"
 _FRESH = 3.0
-"""Seconds for which a node's diagnostics count."""
+"""Seconds for which a node's diagnostics are valid."""
 
 
 class GraphMonitor:
-    """Listens in a thread of its own.
+    """Subscribes in a thread of its own.
 
     Args:
-        bodies: the ids of those who may be tracked.
+        bodies: the ids of the people who may be tracked.
         namespace: of the graph.
     """
 
     def __init__(self, bodies: Sequence[str], namespace: str = "/") -> None:
         self.clock_ns = 0
-        """The latest time on ``/clock``; 0 before there is one."""
+        """The latest time on ``/clock``; 0 before the first."""
         self.last_angles = 0.0
-        """Steady time at which the latest angles came, seconds."""
+        """Steady time of receipt of the latest angles, seconds."""
         self.angles = 0
-        """How many angle messages have come."""
+        """Number of received angle messages."""
         self._angles_topics = [graph.joint_states_topic(body) for body in bodies]
         self._statuses: dict[str, NodeStatus] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._namespace = namespace
-        # by the time of its start the older of two can be told
+        # the time in the name shows which of two is older
         self._node = rclpy.create_node(f"{_NAME}_{time.time_ns()}", namespace=namespace, context=self._context)
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
         for topic in self._angles_topics:
-            # deep, so that all are counted though we are held up
+            # a deep queue, so that all are counted
             name, qos = names.relative(topic), to_profile(graph.RELIABLE_SKELETON)
             self._node.create_subscription(JointState, name, self._on_angles, qos)
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -73,10 +73,9 @@ class GraphMonitor:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening."""
         rclpy.try_shutdown(context=self._context)
         self._thread.join(timeout=2.0)
-        self._executor.shutdown()  # before Python takes things down in any order
+        self._executor.shutdown()  # before Python destroys objects in any order
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException):
@@ -84,7 +83,7 @@ class GraphMonitor:
 
     def _on_diagnostics(self, message: Any) -> None:
         known = dict(self._statuses)  # the other thread reads them
-        note_statuses(known, statuses(message, time.monotonic(), self._namespace))
+        update_statuses(known, statuses(message, time.monotonic(), self._namespace))
         self._statuses = known
 
     def _on_angles(self, message: Any) -> None:
@@ -96,9 +95,9 @@ class GraphMonitor:
             self.clock_ns = to_nanoseconds(message.clock)
 
     def has_predecessor(self) -> bool:
-        """Whether another ``up`` was started earlier in this domain and namespace, and is there still.
+        """Whether another ``up`` was started earlier in this domain and namespace and still runs.
 
-        One that was killed is not: it does not answer who comes later.
+        A killed one does not count: it does not answer the discovery of later participants.
         """
         name, namespace = self._node.get_name(), self._node.get_namespace()
         return any(
@@ -106,14 +105,14 @@ class GraphMonitor:
             for other, where in self._node.get_node_names_and_namespaces()
         )
 
-    def listened_to(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
-        """Whether who publishes each of these topics says that it has found at least so many subscribers.
+    def has_subscribers(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
+        """Whether the publishers of these topics report at least so many subscribers.
 
-        That we have found them does not mean that the publisher has.
+        Only the publisher's own report counts, because discovery takes another time in every process.
 
         Args:
-            wanted: topics and numbers; a topic that none of the nodes publishes is not waited for.
-            nodes: all that are to have said something.
+            wanted: numbers by topic; a topic that none of the nodes publishes does not count.
+            nodes: that must all have reported.
         """
         statuses = [self._statuses.get(name) for name in nodes]
         for topic, number in wanted.items():
@@ -123,7 +122,7 @@ class GraphMonitor:
                 return False
         return None not in statuses
 
-    # --- for people
+    # --- texts
 
     def line(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
         """The status line: rates, delay, calibration, restarts."""
@@ -142,7 +141,7 @@ class GraphMonitor:
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
-        values = {f"{key}: {said}" for status in fresh.values() for key, said in status.values.items()}
+        values = {f"{key}: {value}" for status in fresh.values() for key, value in status.values.items()}
         parts += sorted(each for each in values if each.startswith("publishers "))
         if options["robot"]:
             parts.append(f"robot {fresh['robot_commands'].text if 'robot_commands' in fresh else '-'}")
@@ -159,25 +158,24 @@ class GraphMonitor:
         sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in sensors_of(options))
         fused = rate("fusion", "out", graph.FUSED)
         rates = [rate("joint_angles", "out", topic) for topic in self._angles_topics]
-        # those of whom something comes; of nobody at least how it is with the first
+        # the people with angles; the first one if there are none
         angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
         return f"{sensors}, fused {fused}, angles {angles} Hz"
 
     @staticmethod
     def _delay(options: Options, fresh: Mapping[str, NodeStatus]) -> str:
-        """From a sensor's message to the angles: the nodes' own delays, each with the transport to it."""
+        """From a sensor's message to the angles: the sum of the nodes' delays, each with the transport to it."""
         running = fresh.get("skeleton_filter")
-        role = ROLES.get(running.text if running is not None else "")  # it may have changed since the start
-        asked = options["filter_input"]
-        taken = (role or role_of(options)).input if asked in ("", graph.AUTO) else asked
-        by_sensor = taken == graph.SENSORS_INPUT
-        chain = _CHAIN if by_sensor else ("fusion", *_CHAIN)
+        role = ROLES.get(running.text if running is not None else "")  # the filter may have changed since the start
+        option = options["filter_input"]
+        source = (role or role_of(options)).input if option in ("", graph.AUTO) else option
+        chain = _CHAIN if source == graph.SENSORS_INPUT else ("fusion", *_CHAIN)
         values = [fresh[name].values.get("delay median ms") if name in fresh else None for name in chain]
         known = [float(value) for value in values if value is not None]
         return f"delay {sum(known):.1f} ms" if len(known) == len(chain) else ""
 
     def summary(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
-        """What was done."""
+        """The last line of a run."""
         what = f"played {options['bag']}" if options["bag"] else "ran"
         text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
         if options["record"]:

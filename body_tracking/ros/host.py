@@ -22,17 +22,13 @@ from body_tracking.ros.wire import WIRE
 from body_tracking.systems import stage_class
 
 _LOOK_S = 0.1
-"""Seconds between two looks for what other nodes publish."""
+"""Seconds between two checks of the published topics."""
 _SAVE_S = 2.0
-"""Seconds between two writings to disk at least."""
+"""Seconds between two writes of the stage's state to disk."""
 
 
 class StageNode(GraphNode):
-    """Hosts a stage.
-
-    Attributes:
-        STAGE: its class.
-    """
+    """Base of the nodes that host a stage of the class ``STAGE``."""
 
     STAGE: ClassVar[type[Stage]]
 
@@ -44,20 +40,17 @@ class StageNode(GraphNode):
         self.inputs: dict[str, tuple[Port, Subscription]] = {}
         self.outputs: dict[str, tuple[Port, Publisher | None]] = {}
         self.sent_ns: int | None = None
-        """Wall time at which the message in hand was sent."""
+        """Wall time at which the current message was sent."""
         super().__init__()
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Make the stage."""
         self.stage = self.STAGE(values, self.wanted)
 
     def reconfigure(self, values: Mapping[str, Value]) -> None:
-        """From the next message on."""
         self.stage.change(values)
         self.connect()
 
     def start(self) -> None:
-        """Connect."""
         self.due = self.make_alarm(self.poll)
         self.connect()
         for name, action in self.stage.services.items():
@@ -69,7 +62,7 @@ class StageNode(GraphNode):
         self.publish(self.stage.start(Now(self.now_ns(), self.waiting_ns())))
 
     def connect(self) -> None:
-        """Publish and take what the stage does now, and nothing else: other nodes go by what there is."""
+        """Make and destroy publishers and subscriptions so that they match the stage's outputs and inputs."""
         offered = {port.topic: port for port in self.stage.outputs}
         for topic in self.outputs.keys() - offered.keys():
             _, publisher = self.outputs.pop(topic)
@@ -97,20 +90,20 @@ class StageNode(GraphNode):
         qos.depth = max(qos.depth, port.waiting)
         kind = message_class(port.codec.type_name)
         handle = partial(self.on_message, port.topic)
-        subscription = self.listen(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
+        subscription = self.subscribe(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
         if port.droppable:
             self._droppable[subscription] = self.full_name(port.topic)
         return subscription
 
     def wanted(self, topic: str) -> bool:
-        """Whether anybody listens."""
+        """Whether a topic has subscribers."""
         _, publisher = self.outputs[topic]
         return publisher is not None and publisher.get_subscription_count() > 0
 
     # --- messages
 
     def on_message(self, topic: str, cdr: bytes, sent_ns: int) -> None:
-        """Hand a message to the stage."""
+        """Decode a message, pass it to the stage and publish its outputs."""
         port, _ = self.inputs[topic]
         if port.perishable and self.is_stale(self.full_name(topic), sent_ns):
             return
@@ -121,21 +114,21 @@ class StageNode(GraphNode):
             raise
         stamp_ns = port.codec.stamp_ns(payload)
         if stamp_ns is not None and self.monitor.message_in(topic, stamp_ns):
-            self.log_seldom("jump", f"{self.full_name(topic)}: time jumped back, starting anew", period_s=1.0)
+            self.log_throttled("jump", f"{self.full_name(topic)}: time jumped back, resetting", period_s=1.0)
             self.stage.reset(topic)
         self.sent_ns = sent_ns
         self.publish(self.stage.take(topic, payload, Now(self.arrived_ns, self.arrived_waiting_ns)))
-        if self.simulated:  # each in its own time, as offline
+        if self.simulated:  # after each message, as offline
             self.poll()
 
-    def messages_taken(self) -> None:
-        """Do what follows from all messages that were there; called by the executor."""
+    def batch_done(self) -> None:
+        """Publish what is due after a batch of messages; called by the executor."""
         self.poll()
         self.stage.settle()
         self.sent_ns = None
 
     def poll(self) -> None:
-        """Publish what is due, and set the alarm for what is due next."""
+        """Publish what is due, and set the alarm for the next deadline."""
         try:
             self.publish(self.stage.poll(self.waiting_ns()))
         except BodyTrackingError as error:
@@ -145,7 +138,7 @@ class StageNode(GraphNode):
             self.due.at(self.stage.due_ns if deadline_ns is None else deadline_ns)
 
     def publish(self, outputs: Iterable[Output]) -> None:
-        """Publish what the stage says, and log its events."""
+        """Publish outputs of the stage, and log its events."""
         for output in outputs:
             port, publisher = self.outputs[output.topic]
             if publisher is None:
@@ -158,39 +151,33 @@ class StageNode(GraphNode):
         self.log_events()
 
     def log_events(self) -> None:
-        """Write what the stage has to say to the log."""
         while self.stage.events:
             self.get_logger().info(self.stage.events.pop(0))
 
-    # --- all else
+    # --- everything else
 
     def look(self) -> None:
-        """Follow what other nodes publish."""
+        """Let the stage choose its inputs among the published topics."""
         if self.stage.look(lambda topic: self.count_publishers(self.full_name(topic)) > 0):
             self.connect()
 
     def answer(self, action: Callable[[], str], request: Any, response: Any) -> Any:
-        """A service."""
         response.message, response.success = action(), True
         self.get_logger().info(response.message)
         return response
 
     def finish(self) -> None:
-        """What waits for a message that does not come."""
         self.publish(self.stage.drain())
 
     def time_jumped_back(self, topic: str) -> None:
-        """Start anew."""
         self.stage.reset(topic)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """The stage's own."""
         found = self.stage.state(self.now_ns())
         self.log_events()
         return found
 
     def close(self) -> None:
-        """Save the last state."""
         try:
             self.stage.save()
         except BodyTrackingError as error:
@@ -198,7 +185,7 @@ class StageNode(GraphNode):
 
 
 def host_of(executable: str) -> Callable[[], None]:
-    """What runs the node that hosts the stage of this name."""
+    """``main`` of the node that hosts the stage of this executable."""
     hosted = stage_class(executable)
 
     class Host(StageNode):

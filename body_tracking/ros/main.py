@@ -1,4 +1,4 @@
-"""How a node starts and ends."""
+"""Start and end of a node's process."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -23,10 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import (
-    as_yaml,
-    read_file,
-)
+from body_tracking.core.parameters import as_yaml, read_file
 from body_tracking.core.signals import ENDING, release_signals
 from body_tracking.ros import dds
 from body_tracking.ros.declare import parameter_files
@@ -37,26 +34,25 @@ if TYPE_CHECKING:
 
 RCLError: type[Exception] = _rclpy.RCLError
 _LEAVE_S = 5.0
-"""Seconds for the middleware to let a node go that is closed."""
+"""Seconds for the middleware to destroy a closed node."""
 
 
-class _Ending:
+class _SignalHandler:
     """Waits for SIGINT and SIGTERM in a thread of its own, and then ends the executor.
 
-    SIGINT (Ctrl-C, the end of a recording in ``body_tracking up``) lets a node finish what it has been sent; SIGTERM,
-    or a second SIGINT, does not.
+    After SIGINT (Ctrl-C, the end of a recording in ``body_tracking up``) a node handles the messages that were already
+    sent; after SIGTERM, or a second SIGINT, it does not.
 
-    rclpy's own handler shuts the context down at once, from another thread; the main thread may then be destroying the
-    node, and the process crashes now and then. Here everything ends in its order, and a second Ctrl-C waits until a
-    recording is closed.
+    rclpy's own handler shuts down the context at once from another thread, which crashes the process if the main thread
+    destroys the node at that moment.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._asked = 0
         self._executor: LeanExecutor | None = None
-        # Python runs its handlers only between two steps of the main thread, which mostly waits below Python; the byte
-        # that it writes for each signal comes through at once.
+        # Python runs its handlers only in the main thread, which mostly waits in C code; but it writes a byte for each
+        # signal at once.
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
@@ -65,10 +61,10 @@ class _Ending:
         threading.Thread(target=self._wait, daemon=True).start()
         release_signals()
 
-    def over(self) -> None:
-        """Everything has ended: another Ctrl-C, as ``ros2 launch`` passes it on, must not kill what shuts down.
+    def ignore_sigint(self) -> None:
+        """Ignore another Ctrl-C, as ``ros2 launch`` passes it on, while Python shuts down.
 
-        Python lets go of its handlers then, but for signals that are ignored.
+        Python removes its handlers then, except for ignored signals.
         """
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -82,24 +78,24 @@ class _Ending:
                 self._end()
 
     def watch(self, executor: LeanExecutor) -> LeanExecutor:
-        """End this executor; at once, if a signal has come already."""
+        """End this executor on a signal; at once if one has been received already."""
         with self._lock:
             self._executor = executor
             self._end()
         return executor
 
     @property
-    def in_order(self) -> bool:
-        """Whether there is time to finish."""
+    def graceful(self) -> bool:
+        """Whether the node may handle its remaining messages."""
         return self._asked < 2
 
     def _end(self) -> None:
         if self._executor is not None and self._asked:
-            (self._executor.finish if self.in_order else self._executor.stop)()
+            (self._executor.finish if self.graceful else self._executor.stop)()
 
 
 def usage(node_class: type[GraphNode]) -> str:
-    """What ``--help`` prints."""
+    """The text of ``--help``."""
     name = node_class.NAME
     return (
         f"usage: ros2 run body_tracking {name} [--ros-args [-p PARAMETER:=VALUE ...] [--params-file FILE]]\n\n"
@@ -111,25 +107,25 @@ def usage(node_class: type[GraphNode]) -> str:
 def run(node_class: type[GraphNode]) -> None:
     """``main`` of every node: exit code 0 at its end or on Ctrl-C, 2 with one line when it cannot start."""
     if signal.sigpending() & set(ENDING):
-        return  # it was to end while it was imported
-    asked = {"-h", "--help"}
-    if asked & set(sys.argv) and asked & set(remove_ros_args(sys.argv)[1:]):  # the latter reads parameters files
+        return  # a signal during the imports
+    flags = {"-h", "--help"}
+    if flags & set(sys.argv) and flags & set(remove_ros_args(sys.argv)[1:]):  # the latter reads parameters files
         print(usage(node_class))
         return
     code, node = 0, None
-    faulthandler.enable()  # a crash below Python says where it was
-    ending = _Ending()
+    faulthandler.enable()  # prints a traceback after a crash in C code
+    handler = _SignalHandler()
     try:
         for file in parameter_files():
-            read_file(file)  # rcl's own complaint takes several lines
+            read_file(file)  # for an error in one line, where rcl's takes several
         dds.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
-        # What is there now stays: the collector need not look at it again while frames wait.
+        # The present objects stay; later collections skip them.
         gc.collect()
         gc.freeze()
-        ending.watch(LeanExecutor(node)).spin()
-        if ending.in_order:
+        handler.watch(LeanExecutor(node)).spin()
+        if handler.graceful:
             node.hand_over()
     except ExternalShutdownException:
         pass
@@ -142,17 +138,17 @@ def run(node_class: type[GraphNode]) -> None:
             code = 2
         elif node.context.ok():
             raise
-        # else the node shut itself down between two steps of the executor: the end, like any other
+        # otherwise the node shut itself down between two steps of the executor
     finally:
         if node is not None:
             node.close()
-        # Nothing is lost any more: what waits for ever, below Python, is told and ended.
+        # The middleware may block forever while it destroys the node; nothing is lost by then.
         faulthandler.dump_traceback_later(_LEAVE_S, exit=True)
         if node is not None:
             with contextlib.suppress(InvalidHandle):
                 node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
-        ending.over()
+        handler.ignore_sigint()
     if code:
         sys.exit(code)

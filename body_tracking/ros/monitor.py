@@ -1,4 +1,4 @@
-"""What a node counts and measures of its messages, for diagnostics."""
+"""Counters, rates and delays of a node's messages, for its diagnostics."""
 
 # rclpy is only partly typed, and absent where there is no ROS.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -14,17 +14,17 @@ from body_tracking.core.clocks import JUMP_BACK_NS
 from body_tracking.core.skeleton import NANOSECONDS
 
 GAP_NS = 50_000_000
-"""Two frames of a sensor further apart than this have a gap between them: one frame of 30 Hz is missing."""
+"""Least distance of two stamps of a sensor with a gap between them: at 30 Hz one frame is missing."""
 
 
 class Monitor:
-    """Counts what goes through a node, for its diagnostics."""
+    """Counts the messages of a node."""
 
     def __init__(self) -> None:
         self.totals: Counter[str] = Counter()
         self.last_reason = ""
         self.failures: Counter[str] = Counter()
-        """Of each input and kind of error how many callbacks raised one that nobody expected."""
+        """Number of unexpected errors by callback and kind of error."""
         self._window: Counter[str] = Counter()
         self._delays_ns: list[int] = []
         self._latencies_ns: list[int] = []
@@ -38,7 +38,7 @@ class Monitor:
         self.totals["received"] += 1
 
     def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Look at the stamp of a message of an input; True when time jumped back."""
+        """Check the stamp of a message of an input; True when time jumped back."""
         last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
         if last is None:
             return False
@@ -56,19 +56,19 @@ class Monitor:
 
         Args:
             topic: its name.
-            delay_ns: since the input that it answers was sent: transport and processing.
+            delay_ns: since the input that caused it was sent: transport and processing.
             latency_ns: since capture, by ROS time.
         """
         self._window[f"out {topic}"] += 1
         self.totals["published"] += 1
         if delay_ns is not None:
             self._delays_ns.append(delay_ns)
-        # A sensor that counts from its own start tells nothing about how long ago that was.
+        # Stamps of a sensor that counts from its own start give no latency.
         if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
             self._latencies_ns.append(latency_ns)
 
     def wants_latency(self) -> bool:
-        """Whether to look at the clock for this message: a few a second will do, and looking takes its time."""
+        """Whether to measure the latency of this message: reading the clock costs time, so only of a few per second."""
         self._looks += 1
         return self._looks <= 5
 

@@ -1,6 +1,6 @@
-"""What every node does the same way: parameters, diagnostics, surviving bad messages, starting and ending.
+"""The base of all nodes: parameters, diagnostics, callbacks that cannot end the node, start and end.
 
-Over 500 lines: the base of all nodes: what it overrides of rclpy.node.Node belongs together.
+Over 500 lines: the methods that override rclpy.node.Node belong together.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -38,13 +38,7 @@ from sensor_msgs.msg import PointCloud2
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import (
-    Parameter,
-    ParameterError,
-    Value,
-    to_ros,
-    unknown_parameter,
-)
+from body_tracking.core.parameters import Parameter, ParameterError, Value, to_ros, unknown_parameter
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.core.qos import SENSOR_DATA, Qos
 from body_tracking.core.skeleton import Skeleton
@@ -68,12 +62,11 @@ RCLError: type[Exception] = _rclpy.RCLError
 ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _TICKS = 1000
-"""Ticks of simulated time that may wait while a node is busy: each message is to be handled by the time at which it was
-sent."""
+"""Queue of simulated time, ticks: a busy node must still handle each message at the time at which it was sent."""
 _ACKNOWLEDGE_S = 2.0
-"""Seconds for those who listen to take a node's last messages."""
+"""Seconds for subscribers to acknowledge a node's last messages."""
 _FORGOTTEN_S = 25.0
-"""Seconds after which DDS has forgotten a process that was killed: Fast DDS's lease of 20 s, and some more."""
+"""Seconds after which DDS has removed a killed process: Fast DDS's lease of 20 s, and a margin."""
 
 _EVERYWHERE = frozenset({"/rosout", "/parameter_events", graph.DIAGNOSTICS_TOPIC})
 """Outputs that every node has."""
@@ -81,21 +74,21 @@ _LOG_PERIOD_S, _DOUBLED_PERIOD_S = 5.0, 30.0
 _REPORT_S = 1.0
 """Seconds between two reports of a node in ``/diagnostics``."""
 _LOOK_S = 0.2
-"""Seconds between two looks whether to report."""
+"""Seconds between two checks whether to report."""
 _FAILURES = 10
-"""Callbacks of one input that fail one after the other, after which the node forgets its state."""
+"""Consecutive failed callbacks of one input after which the node resets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
 
 
 class Alarm:
-    """Calls once when a time has come, by :meth:`GraphNode.waiting_ns`.
+    """A one-shot timer by :meth:`GraphNode.waiting_ns`.
 
-    To set a timer wakes the node up and costs more than to let it go off in vain: one that goes off earlier than it is
-    needed is left as it is, and set anew then. Simulated time needs no timer: it goes on with its ticks.
+    Setting a timer wakes up the node and costs more than one superfluous expiry. So a timer that expires too early is
+    left alone and set again when it expires. Simulated time needs no timer: every tick checks the alarms.
 
     Args:
-        node: whose.
-        ring: what is called.
+        node: the owner.
+        ring: the callback.
         simulated: whether time is simulated.
     """
 
@@ -108,13 +101,13 @@ class Alarm:
             self._timer.cancel()
 
     def at(self, time_ns: int | None) -> None:
-        """Call at this time instead of any that was given before; None for not at all."""
+        """Set the time of the call, in place of an earlier one; None cancels it."""
         self._wanted_ns = time_ns
         if time_ns is not None and (self._set_ns is None or time_ns < self._set_ns):
             self._set(time_ns)
 
     def look(self) -> None:
-        """Whether it is time."""
+        """Call if the time has come."""
         wanted_ns = self._wanted_ns
         if wanted_ns is None:
             return
@@ -140,8 +133,8 @@ class Alarm:
 class GraphNode(Node):
     """Base of the nodes.
 
-    A node names itself, lists its parameters, sets itself up in ``configure`` and ``start``, and hands its callbacks
-    through :meth:`listen`, so that no message can end it.
+    A node has a name and parameters, and overrides ``configure`` and ``start``. It subscribes by :meth:`subscribe`, so
+    that no message can end it.
     """
 
     NAME: ClassVar[str]
@@ -150,27 +143,27 @@ class GraphNode(Node):
     def __init__(self) -> None:
         self.monitor = Monitor()
         self._failed_in_a_row: Counter[str] = Counter()
-        self._told_failures = 0
+        self._reported_failures = 0
         super().__init__(self.NAME)
         self.backlog = Backlog()
         self.sequences = Sequences()
         self.standstill = Standstill()
         self._droppable: dict[Subscription, str] = {}
-        self._told_dropped: Counter[str] = Counter()
+        self._reported_dropped: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
         self._switched: Counter[str] = Counter()
         self._several_since: dict[str, float] = {}
         self.simulated = bool(self.get_parameter("use_sim_time").value)
         self._simulated_ns = 0
-        self._sent_ns = 0  # wall time at which the newest message that was handled had been sent
+        self._sent_ns = 0  # wall time at which the newest handled message was sent
         self._alarms: list[Alarm] = []
         self.arrived_ns = 0
-        """ROS time at which the message in hand came; nanoseconds."""
+        """ROS time of arrival of the current message, nanoseconds."""
         self.arrived_waiting_ns = 0
-        """The same by :meth:`waiting_ns`."""
+        """Time of its arrival by :meth:`waiting_ns`."""
         self.values: Mapping[str, Value] = declare(self, self.PARAMETERS)
         if self.simulated:
-            # after a lost tick the next message would seem to come earlier, which a clock's least delay is sensitive to
+            # a lost tick would make the next message seem early, which disturbs estimates of a clock's least delay
             transport = RELIABLE_QOS if self.values.get("reliable") else SENSOR_DATA
             qos = to_profile(Qos(transport.reliability, transport.durability, _TICKS))
             self.create_subscription(ClockMessage, graph.CLOCK_TOPIC, self._on_clock, qos)
@@ -179,49 +172,40 @@ class GraphNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, to_profile(RELIABLE_QOS))
         self.start()
         self._reported = -_REPORT_S
-        self._told_listeners: dict[str, object] = {}
+        self._reported_subscribers: dict[str, object] = {}
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
 
-    # --- to be written by a node
+    # --- overridden by nodes
 
     def configure(self, values: Mapping[str, Value]) -> None:
-        """Take the parameters at the start.
-
-        Raises:
-            BodyTrackingError: they do not go together, and the node ends.
-        """
+        """Apply the parameters at the start; a BodyTrackingError ends the node."""
 
     def reconfigure(self, values: Mapping[str, Value]) -> None:
-        """Take the parameters when some of them have changed; as at the start, unless a node knows better.
-
-        Raises:
-            BodyTrackingError: they do not go together, or not now; the change is refused for this reason.
-        """
+        """Apply changed parameters; a BodyTrackingError refuses the change."""
         self.configure(values)
 
     def start(self) -> None:
         """Make publishers, subscriptions, services and timers."""
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        """Level, line and values that the node adds to its diagnostics."""
+        """Level, text and values for the node's diagnostics."""
         return 0, "", {}
 
     def finish(self) -> None:
-        """Publish what still waits for something that does not come, at the end."""
+        """Publish at the end what still waits for messages."""
 
     def close(self) -> None:
-        """Finish what the node has in hand, at its end; also where there is no time for :meth:`finish`."""
+        """Release resources at the end, also where there is no time for :meth:`finish`."""
 
     # --- parameters
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """As the parameter services call it: what is refused is refused with our reason, not rcl's."""
+        """Called by the parameter services; a refusal states our reason, not rcl's."""
         table = {parameter.name: parameter for parameter in self.PARAMETERS}
         changes = []
         for change in parameter_list:
             try:
                 if change.name in table:
-                    # a whole number serves as a number here, too
                     value = table[change.name].check_change(change.value)
                     change = RosParameter(change.name, value=to_ros(value))
                 elif not self.has_parameter(change.name):
@@ -247,7 +231,7 @@ class GraphNode(Node):
         return SetParametersResult(successful=True)
 
     def hand_over(self) -> None:
-        """At the end: the last messages, and until those who listen reliably have them, or do not answer."""
+        """Publish the last messages, and wait until reliable subscribers have acknowledged them or a timeout ends."""
         self.finish()
         end = time.monotonic() + _ACKNOWLEDGE_S
         for publisher in self.publishers:
@@ -256,26 +240,23 @@ class GraphNode(Node):
     # --- time
 
     def now_ns(self) -> int:
-        """ROS time: the wall clock, or ``/clock`` with ``use_sim_time``: by its last tick that was sent before the
-        message in hand, however late that is handled.
-        """
+        """ROS time: the wall clock, or with ``use_sim_time`` the last tick before the current message was sent."""
         return self._simulated_ns if self.simulated else int(self.get_clock().now().nanoseconds)
 
     def waiting_ns(self) -> int:
-        """The clock by which a node waits: one that nobody sets, or ``/clock`` with ``use_sim_time``.
-
-        What a node makes of a recording then does not depend on how busy the machine is.
+        """The clock for timeouts: monotonic, or ``/clock`` with ``use_sim_time``, so that the load of the machine does
+        not change the results of a recording.
         """
         return self._simulated_ns if self.simulated else time.monotonic_ns()
 
     def _arrived(self, info: Mapping[str, int]) -> None:
-        """Note when the message in hand came, which may be well before it is handled."""
+        """Note the time of arrival of the current message, which may be well before it is handled."""
         if self.simulated:
             self.arrived_ns = self.arrived_waiting_ns = self._simulated_ns
             self._sent_ns = max(self._sent_ns, info["source_timestamp"])
             return
         now_ns = time.time_ns()
-        self.arrived_ns = info["received_timestamp"] or now_ns  # not every RMW tells
+        self.arrived_ns = info["received_timestamp"] or now_ns  # not every RMW reports it
         self.arrived_waiting_ns = time.monotonic_ns() - max(0, now_ns - self.arrived_ns)
 
     def _on_clock(self, clock: ClockMessage, info: Mapping[str, int]) -> None:
@@ -287,19 +268,19 @@ class GraphNode(Node):
             alarm.look()
 
     def make_alarm(self, ring: Callable[[], None]) -> Alarm:
-        """Something that rings by :meth:`waiting_ns`."""
+        """An alarm with this callback."""
         alarm = Alarm(self, ring, simulated=self.simulated)
         self._alarms.append(alarm)
         return alarm
 
-    # --- callbacks, whatever they raise
+    # --- callbacks
 
     def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """A callback that does not raise: what it raises is counted and logged, and the node goes on.
+        """Wrap a callback so that its errors are counted and logged, and never end the node.
 
         Args:
-            where: the topic, the service, or what else calls it, for people.
-            callback: takes anything.
+            where: its topic, service or other caller, for the log.
+            callback: takes any arguments.
         """
 
         @wraps(callback)
@@ -321,7 +302,7 @@ class GraphNode(Node):
         return guard
 
     def _failed(self, where: str, error: Exception) -> None:
-        """Count an error that nobody expected; where the same goes wrong time and again, forget the state."""
+        """Count and log an unexpected error; after consecutive failures of one callback reset the state."""
         kind = type(error).__name__
         self.monitor.failures[f"{where} {kind}"] += 1
         self._failed_in_a_row[where] += 1
@@ -330,24 +311,24 @@ class GraphNode(Node):
             trace = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {kind} in a callback, which is left out: {error}\n{trace}")
         if self._failed_in_a_row[where] % _FAILURES == 0:
-            self.log_seldom(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; starting anew")
+            self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; resetting")
             with contextlib.suppress(Exception):
                 self.time_jumped_back(where)
 
     def create_subscription(self, msg_type: Any, topic: str, callback: Any, *given: Any, **named: Any) -> Subscription:
-        """Subscribe with a callback that cannot end the node."""
+        """As rclpy's, with a guarded callback."""
         if msg_type is ClockMessage and callback != self._on_clock:
-            callback = self._without_false_times(callback)
+            callback = self._valid_times_only(callback)
         guard = self.guarded(self.resolve_topic_name(topic), callback)
         return super().create_subscription(msg_type, topic, guard, *given, **named)
 
     def create_timer(self, timer_period_sec: float, callback: Any, *given: Any, **named: Any) -> Timer:
-        """A timer with a callback that cannot end the node."""
+        """As rclpy's, with a guarded callback."""
         guard = self.guarded(f"timer {getattr(callback, '__name__', 'callback')}", callback)
         return super().create_timer(timer_period_sec, guard, *given, **named)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, *given: Any, **named: Any) -> Service:
-        """A service with a callback that cannot end the node; where that raises, whoever called gets an answer."""
+        """As rclpy's, with a guarded callback; if it raises, the caller gets a response that says so."""
         guard = self.guarded(f"service {srv_name}", callback)
 
         def answer(request: Any, response: Any) -> Any:
@@ -360,8 +341,8 @@ class GraphNode(Node):
 
         return super().create_service(srv_type, srv_name, answer, *given, **named)
 
-    def _without_false_times(self, callback: Callable[[ClockMessage], None]) -> Callable[[ClockMessage], None]:
-        """rclpy's own reader of ``/clock`` without times that there are not, for which it would raise."""
+    def _valid_times_only(self, callback: Callable[[ClockMessage], None]) -> Callable[[ClockMessage], None]:
+        """Wrap rclpy's own subscriber of ``/clock``, which would raise for an invalid time."""
 
         def checked(message: ClockMessage) -> None:
             with contextlib.nullcontext() if not self.simulated else contextlib.suppress(MessageError):
@@ -373,22 +354,22 @@ class GraphNode(Node):
     # --- messages
 
     def skeleton_qos(self) -> QoSProfile:
-        """Of skeleton topics, by the parameter ``reliable``."""
+        """The profile of skeleton topics, by the parameter ``reliable``."""
         return to_profile(shared_skeleton_qos(self.values))
 
     def result_qos(self) -> QoSProfile:
-        """Of results, which are reliable; as deep as skeletons by the parameter ``reliable``."""
+        """The profile of results, by the parameter ``reliable``."""
         return to_profile(shared_result_qos(self.values))
 
     def full_name(self, topic: str) -> str:
-        """The full name of a topic of the graph, in this node's namespace and as it is remapped."""
+        """The full name of a topic of the graph, with this node's namespace and remappings."""
         return str(self.resolve_topic_name(names.relative(topic)))
 
     def make_publisher(self, kind: type[Any], topic: str, qos: QoSProfile) -> Publisher:
-        """Publish on a topic of the graph."""
+        """A publisher of a topic of the graph."""
         return self.create_publisher(kind, names.relative(topic), qos)
 
-    def listen(
+    def subscribe(
         self,
         topic: str,
         kind: type[Any],
@@ -398,15 +379,15 @@ class GraphNode(Node):
         raw: bool = False,
         absolute: bool = False,
     ) -> Subscription:
-        """Subscribe, so that a message which is not as it should be is counted and logged, and never ends the node.
+        """Subscribe; a malformed message is counted and logged, and never ends the node.
 
         Args:
             topic: of the graph.
             kind: the message class.
             qos: the profile.
-            handle: takes the message, and the wall time in nanoseconds at which it was sent.
-            raw: hand over the message as CDR bytes.
-            absolute: the name was chosen by the user, and one with a leading slash holds in every namespace.
+            handle: callback of the message and the wall time in nanoseconds at which it was sent.
+            raw: pass the message as CDR bytes.
+            absolute: the user chose the name; with a leading slash it holds in every namespace.
         """
         name = self.resolve_topic_name(topic) if absolute else self.full_name(topic)
 
@@ -419,7 +400,7 @@ class GraphNode(Node):
         checked: Any = callback  # rclpy passes the message info to callbacks of two arguments
         return self.create_subscription(kind, topic if absolute else names.relative(topic), checked, qos, raw=raw)
 
-    def listen_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
+    def subscribe_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
         name = self.full_name(topic)
 
@@ -428,23 +409,23 @@ class GraphNode(Node):
                 return
             skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
-                self.log_seldom("jump", f"{name}: time jumped back, starting anew", period_s=1.0)
+                self.log_throttled("jump", f"{name}: time jumped back, resetting", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
         qos = self.skeleton_qos()
         qos.depth = max(qos.depth, FRAMES_KEPT)
-        subscription = self.listen(topic, PointCloud2, qos, convert, raw=True)
+        subscription = self.subscribe(topic, PointCloud2, qos, convert, raw=True)
         if not self.values["reliable"]:
             self._droppable[subscription] = name
         return subscription
 
     def is_stale(self, topic: str, sent_ns: int) -> bool:
-        """Whether a frame was sent before this process stood still, and is too old now; never with ``reliable``."""
+        """Whether a frame was sent before a standstill of this process and is too old; never with ``reliable``."""
         return not self.values["reliable"] and self.standstill.is_stale(topic, sent_ns, time.time_ns())
 
-    def worth_handling(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-        """All messages but frames that are too late where the node is too slow; called by the executor."""
+    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """The messages without the late frames of a node that is too slow; called by the executor."""
         frames = [place for place, (subscription, _) in enumerate(messages) if subscription in self._droppable]
         if not frames:
             self.backlog.late((), time.time_ns())
@@ -457,22 +438,22 @@ class GraphNode(Node):
             self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
         return [each for place, each in enumerate(messages) if place not in late] if late else messages
 
-    def messages_handled(self) -> None:
-        """Note how long that took; called by the executor."""
+    def work_done(self) -> None:
+        """Note the duration of the work on a batch; called by the executor."""
         if self._droppable:
             self.backlog.done(time.time_ns())
 
     def time_jumped_back(self, topic: str) -> None:
-        """Forget the state, because the stamps of an input jumped back."""
+        """Reset the state, because the stamps of an input jumped back."""
 
     def send(self, publisher: Publisher, message: Any, stamp_ns: int | None = None, sent_ns: int | None = None) -> bool:
-        """Publish and count; nothing is published if the process stood still since it received the input.
+        """Publish and count; nothing is published if the input became stale by a standstill of the process.
 
         Args:
-            publisher: where to.
-            message: what; a message, or one as CDR bytes.
+            publisher: of the topic.
+            message: a message, or its CDR bytes.
             stamp_ns: its capture time, for the latency.
-            sent_ns: wall time at which the input that it answers was sent, for the delay.
+            sent_ns: wall time at which the input that caused it was sent, for the delay.
 
         Returns:
             Whether the message was published.
@@ -488,18 +469,18 @@ class GraphNode(Node):
         return True
 
     def malformed(self, topic: str, reason: str, what: str = "malformed") -> None:
-        """Count a message that is not used, and why."""
+        """Count and log a message that is not used."""
         self.monitor.totals[what] += 1
         self.monitor.last_reason = f"{topic}: {reason}"
-        self.log_seldom(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
+        self.log_throttled(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
 
-    def log_seldom(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
-        """Warn, but not again about the same within some seconds."""
+    def log_throttled(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
+        """Warn at most once per key and period."""
         if self._may_log(key, period_s):
             self.get_logger().warning(text)
 
     def _may_log(self, key: str, period_s: float = _LOG_PERIOD_S) -> bool:
-        """Whether something is to be logged: not again within some seconds."""
+        """Whether the period of a key is over; if so, it begins again."""
         now = time.monotonic()
         due = now - self._logged.get(key, -period_s) >= period_s
         if due:
@@ -513,49 +494,49 @@ class GraphNode(Node):
         return f"{self.get_fully_qualified_name().removeprefix('/')}: stream"
 
     def _look(self) -> None:
-        """Report every second, and at once when somebody else listens: a source may wait for that."""
-        if time.monotonic() - self._reported >= _REPORT_S or self._told_listeners != self._listeners():
+        """Report every second, and at once when the number of subscribers changes: a source may wait for that."""
+        if time.monotonic() - self._reported >= _REPORT_S or self._reported_subscribers != self._subscriber_counts():
             self._report()
 
     def _report(self) -> None:
         self._reported = time.monotonic()
-        self._told_listeners = self._listeners()
+        self._reported_subscribers = self._subscriber_counts()
         level, text, values = self.state()
-        values = {**self.monitor.values(), **self._told_listeners, **values}
+        values = {**self.monitor.values(), **self._reported_subscribers, **values}
         values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
         values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
         values |= {f"left out after a standstill {topic}": n for topic, n in self.standstill.left_out.items()}
         for topic, nodes in self._doubled().items():
             values[f"publishers {topic}"] = ", ".join(nodes)
-            said = f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
-            level, text = max(level, 1), said + (f"; {text}" if text else "")
-            self.log_seldom(f"publishers {topic}", said, _DOUBLED_PERIOD_S)
-        dropped = self.backlog.dropped - self._told_dropped
+            problem = f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
+            level, text = max(level, 1), problem + (f"; {text}" if text else "")
+            self.log_throttled(f"publishers {topic}", problem, _DOUBLED_PERIOD_S)
+        dropped = self.backlog.dropped - self._reported_dropped
         if dropped:
-            self._told_dropped = Counter(self.backlog.dropped)
-            said = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
-            level, text = max(level, 1), f"too slow: dropped {said}" + (f"; {text}" if text else "")
-            self.log_seldom("dropped", text)
+            self._reported_dropped = Counter(self.backlog.dropped)
+            counts = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
+            level, text = max(level, 1), f"too slow: dropped {counts}" + (f"; {text}" if text else "")
+            self.log_throttled("dropped", text)
         failures = self.monitor.failures.total()
-        if failures > self._told_failures:
-            self._told_failures = failures
-            said = f"{failures} callbacks failed, lately of {next(reversed(self.monitor.failures))}"
-            level, text = max(level, 2), said + (f"; {text}" if text else "")
+        if failures > self._reported_failures:
+            self._reported_failures = failures
+            problem = f"{failures} callbacks failed, lately of {next(reversed(self.monitor.failures))}"
+            level, text = max(level, 2), problem + (f"; {text}" if text else "")
         if self.monitor.totals["malformed"] and level == 0:
             text = text or f"{self.monitor.totals['malformed']} malformed messages"
         message = diagnostics(self.now_ns(), self._status_name, "", level, text or _STATE_LEVELS[level], values, ROS)
         self._diagnostics.publish(message)
 
     def publishers_of(self, topic: str) -> list[str]:
-        """Full names of the nodes that publish a topic, this one's among them; one that was killed for 20 s more."""
+        """Full names of the nodes that publish a topic, this one included; DDS lists a killed node for 20 s more."""
         found = self.get_publishers_info_by_topic(topic)
         return sorted(f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in found)
 
     def _doubled(self) -> dict[str, list[str]]:
-        """Who publishes the inputs that should have one publisher and have several.
+        """The publishers of inputs that must have one publisher and have several.
 
-        Where their nodes have the same name, one may be what DDS still knows of a node that was killed and started
-        again. They count once messages come from them in turn, or when DDS would have forgotten the dead one.
+        Two publishers with the same node name may be one node that was killed and started again, and that DDS still
+        lists. They count only when their messages alternate, or after DDS would have removed the dead one.
         """
         now, found = time.monotonic(), {}
         inputs = {each.topic_name for each in self.subscriptions}
@@ -570,8 +551,8 @@ class GraphNode(Node):
                 found[topic] = nodes
         return found
 
-    def _listeners(self) -> dict[str, object]:
-        """How many subscribers this node has found of each of its outputs: none yet is why nothing arrives."""
+    def _subscriber_counts(self) -> dict[str, object]:
+        """The number of subscribers that this node has found for each of its outputs."""
         return {
             f"subscribers {each.topic_name}": each.get_subscription_count()
             for each in self.publishers
@@ -580,12 +561,8 @@ class GraphNode(Node):
 
 
 def deserialized(cdr: bytes, kind: type[Any]) -> Any:
-    """A message of CDR bytes.
-
-    Raises:
-        MessageError: they are no such message.
-    """
+    """A message from CDR bytes; MessageError where they are not of this type."""
     try:
         return deserialize_message(cdr, kind)
-    except Exception as error:  # the client library's own kinds of errors, one per RMW
+    except Exception as error:  # each RMW raises errors of its own
         raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error

@@ -1,4 +1,4 @@
-"""Ending with the supervisor: no node outlives the ``body_tracking up`` that started it."""
+"""No node outlives the ``body_tracking up`` that started it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Have this process killed when the one that started it ends, however that ends. Linux only."""
+    """Let the kernel kill this process when its parent ends. Linux only."""
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
         return
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != int(parent):  # it ended before the line above
+    if os.getppid() != int(parent):  # the parent ended before the line above
         os.kill(os.getpid(), signal.SIGKILL)

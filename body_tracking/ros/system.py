@@ -1,4 +1,4 @@
-"""The graph as a whole: how it is started, and looked after."""
+"""Start and monitoring of the whole graph."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""``body_tracking up``: the graph as separate processes, kept alive, with one line that says how it is doing.
+"""``body_tracking up``: starts and supervises the graph's nodes as processes, and shows a status line.
 
-Over 500 lines: the supervisor and the command; both go with the processes that it starts.
+Over 500 lines: the supervisor and its command belong together.
 """
 
 # rclpy is only partly typed, and absent where there is no ROS.
@@ -57,28 +57,28 @@ if TYPE_CHECKING:
     from body_tracking.ros.graph_monitor import GraphMonitor
 
 BACKOFFS = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Seconds before a node that died is started again: at once, and later with each death soon after a start."""
+"""Seconds before a node is restarted, by the number of deaths in a row soon after a start."""
 
 SETTLED = 10.0
-"""A node that has run for this long, seconds, is started again at once."""
+"""A node that has run for this long, seconds, is restarted at once."""
 
 IN_FLIGHT = 0.3
-"""Angles that come sooner after the start of a node were on their way when its predecessor died, seconds."""
+"""Angles received within this time after a restart, seconds, may be from before the node's death."""
 
 LISTENERS_TIMEOUT = 30.0
-"""A source starts after this time even if somebody who should listen does not, seconds."""
+"""Seconds after which a source starts even if subscribers are missing."""
 
 START_DELAY = 5.0
-"""Recordings in place of sensors begin this long after the start, in step, seconds; by then every node is there."""
+"""Seconds from the start until recordings in place of sensors begin, in step; by then every node runs."""
 
 CANNOT_START = 2
-"""Exit code of a node that has said in one line why it cannot start."""
+"""Exit code of a node that cannot start; its last line of output states the reason."""
 
 STOP_TIMEOUT = 8.0
-"""Seconds for a node to end after it was asked to."""
+"""Seconds for a node to end after a signal."""
 
 FINISH_TIMEOUT = 60.0
-"""After the end of a bag: seconds for a node to finish what it has been sent."""
+"""Seconds for a node to handle its remaining messages after the end of a bag."""
 
 LINE_PERIOD = 5.0
 """Seconds between status lines where stdout is no terminal."""
@@ -88,18 +88,18 @@ _FAST_DDS = re.compile(r"RTPS_|\[[A-Z_]+ (?:Error|Warning)\]")
 
 
 class UpError(BodyTrackingError):
-    """The graph cannot be started as asked for."""
+    """The graph cannot be started with these options."""
 
 
-# --- what to start
+# --- options and parameters
 
 
 def options_for(args: argparse.Namespace) -> Options:
-    """The graph that a command line, of ``up`` or of ``ros2 launch``, asks for.
+    """The graph's options from a command line of ``up`` or of ``ros2 launch``.
 
     Raises:
-        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording is there already, the robot's
-            mapping is none or is about angles of another convention.
+        BodyTrackingError: the bag cannot be read or lacks the sensors, the recording exists already, the robot's
+            mapping is invalid or for angles of another convention.
     """
     given = options_from(args)
     topics: frozenset[str] = frozenset()
@@ -118,13 +118,13 @@ def options_for(args: argparse.Namespace) -> Options:
             there = graph.sensors_among(reader.topics)
         if not there:
             raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
-        asked = given.get("sensors", there)
-        missing = [sensor for sensor in asked if sensor not in there] if isinstance(asked, tuple) else []
+        sensors = given.get("sensors", there)
+        missing = [sensor for sensor in sensors if sensor not in there] if isinstance(sensors, tuple) else []
         if missing:
             raise UpError(
                 f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
             )
-        given["sensors"] = asked
+        given["sensors"] = sensors
     if args.robot is not None:
         given["convention"] = convention_of(args.robot, args.convention or "")
     given["namespace"] = names.check_namespace(args.namespace or "/")
@@ -141,7 +141,7 @@ def all_parameters(
     file: Path | None,
     defaults: Mapping[str, Mapping[str, Value]] | None = None,
 ) -> dict[str, dict[str, Value]]:
-    """The parameters of every node; the file may be about every node that there can be.
+    """The parameters of every node; the file may have sections for every node that the graph could have.
 
     Args:
         options: the graph.
@@ -150,9 +150,9 @@ def all_parameters(
         defaults: more defaults by node name.
 
     Raises:
-        ParameterError: the file is none, is about a node that there cannot be, has unknown names or values that are not
+        ParameterError: the file is invalid, has a section for an unknown node, unknown names or values that are not
             allowed.
-        UpError: a sensor node has nothing to read: there is no bag, and the file does not say.
+        UpError: a sensor node has nothing to read: neither a bag nor the file names a source.
     """
     result = parameters_for(specs, file, defaults, all_nodes_for(options))
     for spec in specs:
@@ -183,14 +183,14 @@ class Child:
     """A node's process.
 
     Attributes:
-        spec: what it runs.
-        parameters: what it is told.
+        spec: of the node.
+        parameters: of the node.
         process: None while it is not running.
         started: steady time of its last start, seconds.
-        restarts: how often it was started again.
-        deaths: how often in a row it died soon after its start.
-        died: steady time of its last death, seconds, while nobody has said that angles come again; else None.
-        due: steady time of the next start; None while it runs, or when it is not to run any more.
+        restarts: number of restarts.
+        deaths: number of deaths in a row soon after a start.
+        died: steady time of its last death, seconds, until the console has reported that angles come again; else None.
+        due: steady time of the next start; None while it runs, or when it must not run any more.
         done: it has ended on purpose.
     """
 
@@ -217,7 +217,7 @@ class Console:
         self._last = time.monotonic()
 
     def line(self, text: str, *, error: bool = False) -> None:
-        """A line that stays."""
+        """Print a line above the status line."""
         with self._lock:
             if self._terminal and self._status:
                 print("\r\x1b[K", end="", flush=True)
@@ -248,7 +248,7 @@ class Console:
 
 
 class Supervisor:
-    """Starts the nodes, starts those again that die, and leaves none behind.
+    """Starts the nodes, restarts those that die, and ends all of them.
 
     Args:
         options: the graph.
@@ -277,7 +277,7 @@ class Supervisor:
                 self._bag_start_ns = reader.start_ns
 
     def run(self, monitor: GraphMonitor) -> int:
-        """Until the bag ends, a signal comes or a node cannot start; the exit code."""
+        """Run until the bag ends, a signal is received or a node cannot start; returns the exit code."""
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
         begin = time.monotonic()
@@ -291,7 +291,7 @@ class Supervisor:
                         "end it, or give this one another ROS_DOMAIN_ID"
                     )
                     break
-                self._look_after(monitor)
+                self._supervise(monitor)
                 self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
                 if any(child.done for child in self.children):
                     self._finish()
@@ -316,7 +316,7 @@ class Supervisor:
 
     # --- starting
 
-    def _look_after(self, monitor: GraphMonitor) -> None:
+    def _supervise(self, monitor: GraphMonitor) -> None:
         now = time.monotonic()
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
@@ -328,12 +328,12 @@ class Supervisor:
                 self._start(child)
 
     def _may_start(self, child: Child, now: float, monitor: GraphMonitor) -> bool:
-        """Whether everybody listens whom the node is to wait for; one who does not come holds nobody up forever."""
+        """Whether the node is no source, or its subscribers are there or have timed out."""
         assert child.due is not None
         if not is_source(child.spec):
             return True
         others = [other.spec.name for other in self.children if not is_source(other.spec)]
-        return now - child.due > LISTENERS_TIMEOUT or monitor.listened_to(self.subscribers, others)
+        return now - child.due > LISTENERS_TIMEOUT or monitor.has_subscribers(self.subscribers, others)
 
     def _start(self, child: Child) -> None:
         spec = child.spec
@@ -351,8 +351,8 @@ class Supervisor:
             "RCUTILS_COLORIZED_OUTPUT": "0",
             "PYTHONUNBUFFERED": "1",
         }
-        # A group of its own: Ctrl-C in the terminal goes to us alone, and we end the nodes in order.
-        with signals_held():  # a node that is to end while it starts does so in order
+        # A group of its own: Ctrl-C in the terminal goes only to the supervisor, which ends the nodes in order.
+        with signals_held():  # so that a node ends in order also while it starts
             child.process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -388,7 +388,7 @@ class Supervisor:
         self.console.line(f"{child.spec.name} died ({how}); starting it again", error=True)
 
     def _read(self, child: Child, process: subprocess.Popen[bytes]) -> None:
-        """Write a node's output to its log, and show what somebody should know."""
+        """Write a node's output to its log, and warnings and errors to the console."""
         assert process.stdout is not None
         with (self.folder / f"{child.spec.name}.log").open("a", encoding="utf-8") as log, process.stdout:
             for raw in process.stdout:
@@ -404,10 +404,7 @@ class Supervisor:
     # --- ending
 
     def _finish(self) -> None:
-        """The recording is played: end the nodes from source to angles, each of which finishes what it was sent.
-
-        However far one lags behind, what was played comes out.
-        """
+        """End the nodes from source to angles after the bag, so that each handles all its remaining messages."""
         for executable in FLOW:
             running = [child for child in self.children if child.spec.executable == executable and child.process]
             for child in running:
@@ -425,7 +422,7 @@ class Supervisor:
         self.stopping.set()
         recorders = [child for child in self.children if child.spec.executable == "bag_recorder"]
         others = [child for child in self.children if child not in recorders]
-        for group in (others, recorders):  # the recorder last, so that it has everything
+        for group in (others, recorders):  # the recorder last, so that it records everything
             running = [child.process for child in group if child.process is not None]
             for process in running:
                 with contextlib.suppress(ProcessLookupError):
@@ -446,7 +443,7 @@ class Supervisor:
 
 
 def _log_folder(given: Path | None) -> Path:
-    """Where ROS keeps its logs (``ROS_LOG_DIR``, ``ROS_HOME/log``, ``~/.ros/log``), else a temporary folder."""
+    """A new folder below ROS's logs (``ROS_LOG_DIR``, ``ROS_HOME/log``, ``~/.ros/log``), else a temporary one."""
     name = f"body_tracking_up_{datetime.now():%Y%m%d_%H%M%S}_{os.getpid()}"
     home = os.environ.get("ROS_HOME")
     base = given or Path(os.environ.get("ROS_LOG_DIR") or (Path(home) if home else Path.home() / ".ros") / "log")
@@ -480,11 +477,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def arguments_from(words: Sequence[str]) -> argparse.Namespace:
-    """The options of ``body_tracking up`` in these words, for another program that starts the graph.
-
-    Raises:
-        UpError: an option has a value that it cannot have.
-    """
+    """The parsed arguments of ``body_tracking up``, for another program; UpError for an invalid one."""
     parser: argparse.ArgumentParser = _Parser()
     add_parser(parser.add_subparsers())
     return parser.parse_args(["up", *words])
@@ -498,12 +491,12 @@ def run(args: argparse.Namespace) -> int:
         from body_tracking.ros.graph_monitor import GraphMonitor
     except ImportError as error:
         raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
-    all_parameters(options, specs, args.params_file)  # what is wrong is reported before a folder is made
+    all_parameters(options, specs, args.params_file)  # raises before a folder is made
     folder = _log_folder(args.log_dir)
     dds.stay_on_this_machine()
     dds.prepare()
     defaults: dict[str, dict[str, Value]] = {
-        # A calibration node that is started again goes on from here.
+        # from which a restarted calibration node continues
         "calibration": {"calibration_file": str(folder / "calibration.yaml")}
     }
     parameters = all_parameters(options, specs, args.params_file, defaults)

@@ -14,7 +14,7 @@ from body_tracking.ros.node import ROS, deserialized
 
 
 class RosWire:
-    """Serialisation by the client library."""
+    """The :class:`~body_tracking.messages.codecs.Wire` of rclpy."""
 
     types = ROS
 

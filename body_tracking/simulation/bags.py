@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.kinect.simulated import KinectErrors, read_errors
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages.base import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
 from body_tracking.messages.cdr import encode_angles, encode_skeletons
 from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.message_types import MARKERS, TF, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.messages.base import MARKERS, TF, TRANSFORM, MessageTypes, to_header, to_vector
+from body_tracking.messages.base import MessageTypes, to_header, to_vector
 from body_tracking.viewing.colours import Colour
 from body_tracking.viewing.shapes import Ellipsoids, Figure
 

@@ -14,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from body_tracking.cli import main
+from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD
 from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
 from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.reading import read_estimate, read_markers, read_truth
 from body_tracking.evaluation.report import facts, tables, text
-from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from body_tracking.cli import main
+from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD
 from body_tracking.core.skeleton import N_JOINTS, Skeleton, TrackingState
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, nearest, read
 from body_tracking.evaluation.show import summarise, summary
@@ -17,7 +18,6 @@ from body_tracking.filters import make_filter
 from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.messages.angles import angles_to_joint_states
-from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagWriter

@@ -1,4 +1,4 @@
-"""Messages that nobody should send: fields drawn at random, right ones with some fields changed, and bytes."""
+"""Hostile messages: random fields, valid messages with some fields changed, and random bytes."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def environment() -> dict[str, str]:
-    """Of processes that only hear each other."""
+    """Environment of processes that only communicate with each other."""
     return {
         **os.environ,
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -166,11 +166,11 @@ class Running:
         return self.start_module(name, "body_tracking.kinect.kinect_sender", *words)
 
     def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
-        """Until nodes have found who is to hear them.
+        """Wait until nodes have found their subscribers.
 
         Args:
-            links: of nodes the number of subscribers of each topic.
-            timeout: seconds until that is an error.
+            links: number of subscribers by node and topic.
+            timeout: seconds, after which the test fails.
         """
 
         def missing() -> list[str]:
@@ -184,9 +184,9 @@ class Running:
         assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)
 
     def call(self, kind: type[Any], name: str, request: Any, timeout: float = 60.0) -> Any:
-        """What a service answers; it may be asked several times.
+        """The response of a service, which may be called several times.
 
-        One of a node that was killed is known for a while, and the first request may go to nobody else.
+        DDS lists the service of a killed node for a while, and a request may go to it alone.
         """
         client = self.node.create_client(kind, name)
         assert client.wait_for_service(timeout), name

@@ -127,21 +127,21 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         yield bench
 
 
-EVERYBODY = [f"{topic}:1" for topic in TOPICS]
+ALL_SUBSCRIBERS = [f"{topic}:1" for topic in TOPICS]
 
 
 # --- bytes
 
 
-def test_what_is_played_is_recorded_byte_by_byte(bench, tmp_path):
+def test_recording_of_a_played_bag_is_identical(bench, tmp_path):
     stored = write_bag(tmp_path / "original", 240)
     recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS))
     began = time.monotonic()
     player = bench.start(
-        "bag_player", bag=tmp_path / "original", rate=2.0, reliable=True, wait_for_subscribers=EVERYBODY
+        "bag_player", bag=tmp_path / "original", rate=2.0, reliable=True, wait_for_subscribers=ALL_SUBSCRIBERS
     )
     bench.finished(player)
-    assert time.monotonic() - began >= 239 * STEP_NS / 1e9 / 2, "never faster than told"
+    assert time.monotonic() - began >= 239 * STEP_NS / 1e9 / 2, "never faster than the rate"
     bench.finished(recorder, signal.SIGINT)
     with BagReader(tmp_path / "copy") as reader:
         found = [(item.topic, item.cdr, item.log_time_ns) for item in reader.messages()]
@@ -179,7 +179,7 @@ def test_recorded_qos_is_offered_again(bench, tmp_path):
 def test_a_recorder_with_simulated_time_follows_the_clock(bench, tmp_path):
     stored = write_bag(tmp_path / "original", 90)
     recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS), use_sim_time=True)
-    player = bench.start("bag_player", bag=tmp_path / "original", reliable=True, wait_for_subscribers=EVERYBODY)
+    player = bench.start("bag_player", bag=tmp_path / "original", reliable=True, wait_for_subscribers=ALL_SUBSCRIBERS)
     bench.finished(player)
     bench.finished(recorder, signal.SIGTERM)
     found = read_bag(tmp_path / "copy")
@@ -332,7 +332,7 @@ def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
 @pytest.mark.parametrize(
     "parameters", [{}, {"model_covariance": True}, {"topics": [MODEL_COVARIANCE, "/talk"]}], ids=str
 )
-def test_the_covariance_of_a_model_is_recorded_only_where_asked_for(bench, tmp_path, parameters):
+def test_model_covariance_is_recorded_only_by_option(bench, tmp_path, parameters):
     bench.publish(100.0, lambda: "x", MODEL_COVARIANCE, "/talk")
     recorder = bench.start("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.05, **parameters)
     bench.wait_until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 30, "the other topic")
@@ -341,7 +341,7 @@ def test_the_covariance_of_a_model_is_recorded_only_where_asked_for(bench, tmp_p
         assert (MODEL_COVARIANCE in reader.topics) == bool(parameters)
 
 
-def test_a_type_that_is_not_known_is_counted_and_the_rest_recorded(bench, tmp_path):
+def test_unknown_message_type_is_counted_and_other_topics_recorded(bench, tmp_path):
     bench.node.create_publisher(Goals, "/goals", RELIABLE_QOS)
     bench.publish(50.0, lambda: "still here", "/talk")
     recorder = bench.start("bag_recorder", folder=tmp_path / "bag", chunk_seconds=0.1)
@@ -355,7 +355,7 @@ def test_a_type_that_is_not_known_is_counted_and_the_rest_recorded(bench, tmp_pa
     bench.finished(recorder, signal.SIGINT)
 
 
-def test_a_full_disk_is_said_and_not_a_crash(bench, tmp_path):
+def test_full_disk_is_reported_without_a_crash(bench, tmp_path):
     bench.publish(200.0, lambda: os.urandom(400).hex(), "/talk")
     # shared memory is made of files too, and would meet the limit first
     bench.environment["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"

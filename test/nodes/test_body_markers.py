@@ -32,7 +32,7 @@ def standing(body: int, frame_id: str, covariance: bool) -> Skeleton:
     return Skeleton(5, frame_id, positions, np.full(N_JOINTS, 2, np.uint8), body, covariances)
 
 
-def test_what_is_seen_becomes_markers_and_what_is_silent_does_not(tmp_path: Path) -> None:
+def test_markers_show_only_topics_with_new_messages(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.start("body_markers", rate=10.0)
         arrays = running.collect(MarkerArray, graph.markers_topic("body1"), RELIABLE)

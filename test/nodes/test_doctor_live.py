@@ -18,9 +18,10 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from running import environment  # noqa: E402
 from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
 
+from body_tracking.core.message_types import IMU, POINT_CLOUD  # noqa: E402
 from body_tracking.core.qos import RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.core.skeleton import N_JOINTS, Skeleton  # noqa: E402
-from body_tracking.messages.base import IMU, POINT_CLOUD, RosMessages  # noqa: E402
+from body_tracking.messages.base import RosMessages  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
 from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, live  # noqa: E402
@@ -58,7 +59,7 @@ def bench(domain: None) -> Iterator[Any]:
     rclpy.try_shutdown(context=context)
 
 
-def test_faults_of_a_graph_are_named(bench: Any) -> None:
+def test_faults_of_a_graph_are_reported(bench: Any) -> None:
     def publish(kind: type, topic: str, hertz: float, make: Callable[[], Any], qos: Any = 10) -> None:
         publisher = bench.create_publisher(kind, topic, qos)
         bench.create_timer(1.0 / hertz, lambda: publisher.publish(make()))
@@ -84,13 +85,13 @@ def test_faults_of_a_graph_are_named(bench: Any) -> None:
     watcher.destroy_node()
     assert judged("2 other nodes in this domain") == {OK}, found
     assert not judged("/clock"), found
-    assert judged("/kinect1/skeleton from /bench to nobody: ") <= {OK, WARNING}, found  # slow, on a busy machine
+    assert judged("/kinect1/skeleton from /bench to no subscriber: ") <= {OK, WARNING}, found  # slow, on a busy machine
     assert judged("/kinect2/skeleton: 2 publishers, /bench") == {PROBLEM}, found
-    assert judged("/kinect3/skeleton from /bench to nobody: malformed") == {PROBLEM}, found
+    assert judged("/kinect3/skeleton from /bench to no subscriber: malformed") == {PROBLEM}, found
     assert judged("/kinect5/skeleton: nothing goes from bench to bench: ") == {PROBLEM}, found
-    assert judged("/kinect6/skeleton: nobody publishes it, wanted by /bench") == {PROBLEM}, found
-    assert judged("/silent/imu/data from /bench to nobody: nothing came") == {PROBLEM}, found
-    assert judged("/slow/imu/data from /bench to nobody: ") == {WARNING}, found
+    assert judged("/kinect6/skeleton: no publisher, wanted by /bench") == {PROBLEM}, found
+    assert judged("/silent/imu/data from /bench to no subscriber: nothing came") == {PROBLEM}, found
+    assert judged("/slow/imu/data from /bench to no subscriber: ") == {WARNING}, found
     assert judged("bench: stream: broken") == {PROBLEM}, found
 
 
@@ -111,7 +112,7 @@ def test_rate_and_stamps_are_judged(kind: str, hertz: float, stamp: float, age: 
     assert said in found.found + found.remedy
 
 
-def test_a_sensor_that_begins_late_is_waited_for(bench: Any) -> None:
+def test_doctor_waits_for_a_late_sensor(bench: Any) -> None:
     def begin() -> None:
         timer.cancel()
         publisher = bench.create_publisher(PointCloud2, "/kinect1/skeleton", 10)
@@ -119,13 +120,13 @@ def test_a_sensor_that_begins_late_is_waited_for(bench: Any) -> None:
 
     timer = bench.create_timer(1.0, begin)
     found = list(live.domain(["kinect1"], 0.5))
-    assert [each for each in found if each.found.startswith("/kinect1/skeleton from /bench to nobody: ")], found
+    assert [each for each in found if each.found.startswith("/kinect1/skeleton from /bench to no subscriber: ")], found
 
 
-def test_an_empty_domain_is_named_and_so_is_an_absent_sensor(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_domain_and_absent_sensor_are_reported(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "PATIENCE", 0.0)
     found = [(each.level, each.found) for each in live.domain(["kinect4"], 0.5)]
-    assert found == [(WARNING, "0 other nodes in this domain"), (PROBLEM, "/kinect4/skeleton: nobody publishes it")]
+    assert found == [(WARNING, "0 other nodes in this domain"), (PROBLEM, "/kinect4/skeleton: no publisher")]
 
 
 def test_a_client_library_that_ends_its_process_is_a_finding(domain: None, monkeypatch: pytest.MonkeyPatch) -> None:

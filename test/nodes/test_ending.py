@@ -41,7 +41,7 @@ def said(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("after", [0.0, 0.05, 0.3, 0.7, 1.2, 2.0])
-def test_a_node_that_starts_ends_at_once(started: list[subprocess.Popen[bytes]], tmp_path: Path, after: float) -> None:
+def test_starting_node_ends_at_once(started: list[subprocess.Popen[bytes]], tmp_path: Path, after: float) -> None:
     time.sleep(after)
     for process in started:
         process.send_signal(signal.SIGINT)
@@ -49,7 +49,7 @@ def test_a_node_that_starts_ends_at_once(started: list[subprocess.Popen[bytes]],
     assert not said(tmp_path)
 
 
-def test_ctrl_c_again_and_again_is_as_once(started: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
+def test_repeated_ctrl_c_is_like_one(started: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
     """From the first instruction until nothing is left of the process, shutdown of Python included."""
     end = time.monotonic() + 60.0
     while any(process.poll() is None for process in started):
@@ -61,7 +61,7 @@ def test_ctrl_c_again_and_again_is_as_once(started: list[subprocess.Popen[bytes]
     assert not said(tmp_path)
 
 
-def test_a_node_that_runs_takes_any_number_of_them(tmp_path: Path) -> None:
+def test_running_node_survives_many_signals_until_its_end(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         for name in NODES:
             running.start(name)

@@ -1,4 +1,4 @@
-"""The lean executor runs what rclpy's would: messages, timers, services, and entities that come and go."""
+"""The lean executor behaves like rclpy's, with messages, timers, services, and entities that come and go."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
     for topic in topics:
         node.create_subscription(String, topic, lambda message: handled.append(int(message.data)), 100)
     assert until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
-    # Not in turn: some topics have more to tell, and first others.
+    # Not in turn: the topics have different numbers of messages.
     order = random.Random(3).choices(range(3), weights=(1, 3, 6), k=120)
     for number, topic in enumerate(order):
         publishers[topic].publish(String(data=str(number)))
@@ -122,7 +122,7 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
 
 
 class Noting(rclpy.node.Node):  # type: ignore[misc]
-    """Notes what comes, and when all has come; one who waits in vain for a message overtakes none that is here."""
+    """Records messages, ends of batches and timeouts; a timeout must not overtake a waiting message."""
 
     def __init__(self) -> None:
         super().__init__("noting")
@@ -131,11 +131,11 @@ class Noting(rclpy.node.Node):  # type: ignore[misc]
             self.create_subscription(String, topic, lambda message: self.said.append(message.data), 10)
         self.create_timer(0.02, lambda: self.said.append("timer"), clock=STEADY)
 
-    def messages_taken(self) -> None:
+    def batch_done(self) -> None:
         self.said.append("all")
 
 
-def test_a_node_is_told_when_it_has_all_messages_that_were_there(node: rclpy.node.Node) -> None:
+def test_batch_callback_follows_all_waiting_messages(node: rclpy.node.Node) -> None:
     noting = Noting()
     publishers = [node.create_publisher(String, topic, 10) for topic in ("one", "two")]
     assert until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
@@ -151,7 +151,7 @@ def test_a_node_is_told_when_it_has_all_messages_that_were_there(node: rclpy.nod
 
 
 @pytest.mark.parametrize("work", [0.0, 0.03])
-def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> None:
+def test_busy_node_answers_services(node: rclpy.node.Node, work: float) -> None:
     publisher = node.create_publisher(String, "text", 10)
     node.create_subscription(String, "text", lambda message: time.sleep(work), 10)
     node.create_timer(0.02, lambda: publisher.publish(String(data="more")), clock=STEADY)
@@ -161,7 +161,7 @@ def test_a_busy_node_answers_all_who_ask(node: rclpy.node.Node, work: float) -> 
 
 
 @pytest.mark.alone
-def test_an_idle_node_costs_nothing(node: rclpy.node.Node) -> None:
+def test_idle_node_uses_no_cpu(node: rclpy.node.Node) -> None:
     with Spinning(node):
         time.sleep(0.3)
         before = time.process_time()
@@ -186,14 +186,14 @@ def test_a_timer_that_is_set_anew_fires_once_each_time(node: rclpy.node.Node) ->
     assert len(fired) == 5
 
 
-def test_what_was_sent_before_the_end_is_handled_and_what_comes_after_is_not(node: rclpy.node.Node) -> None:
+def test_finish_handles_only_messages_sent_before_it(node: rclpy.node.Node) -> None:
     handled: list[str] = []
     publisher = node.create_publisher(String, "text", 100)
 
     def handle(message: String) -> None:
         handled.append(message.data)
         time.sleep(0.02)
-        publisher.publish(String(data="later"))  # whoever keeps sending does not hold up the end
+        publisher.publish(String(data="later"))  # later messages must not delay the end
 
     node.create_subscription(String, "text", handle, 100)
     assert until(lambda: publisher.get_subscription_count() == 1)

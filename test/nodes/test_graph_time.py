@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy")
 from running import environment
 
+from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.messages.base import TRANSFORM
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
@@ -22,7 +22,7 @@ from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
 MOST_S, LATEST_S = 1.0, 10.0
 """From capture to the log, as a rule and on a machine with much else to do."""
 TICK_S = 0.05
-"""Of ``/clock``: the recorder may have heard one less than who publishes."""
+"""Of ``/clock``: the recorder may have received one tick less than the publisher of a stamp."""
 HOLD_FROM_S = 1.0
 """Calibration is stamped with the time from which on it holds, half a second ahead."""
 

@@ -61,7 +61,7 @@ def misstated(sec: int, nanosec: int = 0) -> TimeReference:
     return reference
 
 
-def test_clocks_and_poses_that_cannot_be_end_no_node_and_none_that_is_started_later(tmp_path: Path) -> None:
+def test_invalid_clocks_and_poses_end_no_node(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         clocks = running.node.create_publisher(TimeReference, graph.CALIBRATION_CLOCK, LATCHED)
         poses = running.node.create_publisher(TransformStamped, graph.CALIBRATION, LATCHED)
@@ -81,7 +81,7 @@ def test_clocks_and_poses_that_cannot_be_end_no_node_and_none_that_is_started_la
             assert "expected 0 to 2147483647 s" in running.log(node)
 
 
-def test_the_fusion_follows_the_reference_again_once_a_misstated_clock_is_put_right(tmp_path: Path) -> None:
+def test_fusion_recovers_after_a_wrong_clock_is_corrected(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.start("fusion", reliable=True)
         fused = running.collect(PointCloud2, graph.FUSED)
@@ -120,25 +120,25 @@ def test_the_fusion_follows_the_reference_again_once_a_misstated_clock_is_put_ri
         assert int(running.diagnostics["fusion"].get("other_clock", 0)) > 0
 
 
-def test_a_simulated_time_that_cannot_be_is_left_out(tmp_path: Path) -> None:
+def test_invalid_simulated_time_is_ignored(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.start("fusion", use_sim_time=True)
         ticks = running.node.create_publisher(Clock, graph.CLOCK_TOPIC, RELIABLE)
         assert running.until(lambda: ticks.get_subscription_count() == 2)
 
-        def told() -> int:
+        def malformed() -> int:
             for sec, nanosec in ((100, 0), (-1, 0), (-(2**31), 0), (101, 2_000_000_000), (102, 0)):
                 tick = Clock()
                 tick.clock.sec, tick.clock.nanosec = sec, nanosec
                 ticks.publish(tick)
             return int(running.number("fusion", "malformed"))
 
-        assert running.until(lambda: told() >= 3)
+        assert running.until(lambda: malformed() >= 3)
         assert running.processes["fusion"].poll() is None
         assert "/clock: malformed message ignored: a stamp of" in running.log("fusion")
 
 
-def test_a_recorder_without_its_clock_keeps_nothing_and_says_why(tmp_path: Path) -> None:
+def test_recorder_without_clock_records_nothing_and_reports_it(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.start("bag_recorder", folder=tmp_path / "bag", topics="[/text,/latched]", use_sim_time=True)
         texts = running.node.create_publisher(String, "/text", RELIABLE)
@@ -177,19 +177,19 @@ def test_a_recorder_without_its_clock_keeps_nothing_and_says_why(tmp_path: Path)
 
 
 class Failing(GraphNode):
-    """Raises where nobody expects it: in a message's callback, a timer's, a service's."""
+    """Raises in the callbacks of a message, a timer and a service."""
 
     NAME = "failing"
     PARAMETERS = ()
 
     def start(self) -> None:
         self.restarts: list[str] = []
-        self.listen("/one", String, RELIABLE, self.on_one)
+        self.subscribe("/one", String, RELIABLE, self.on_one)
         self.create_timer(0.02, self.on_timer, clock=STEADY)
         self.create_service(Trigger, "~/ask", self.on_ask)
 
-    def on_one(self, told: Any, sent_ns: int) -> None:
-        raise {"value": ValueError, "memory": MemoryError, "key": KeyError}[told.data]("as told")
+    def on_one(self, message: Any, sent_ns: int) -> None:
+        raise {"value": ValueError, "memory": MemoryError, "key": KeyError}[message.data]("on purpose")
 
     def on_timer(self) -> None:
         raise ZeroDivisionError
@@ -201,7 +201,7 @@ class Failing(GraphNode):
         self.restarts.append(topic)
 
 
-def test_whatever_a_callback_raises_is_counted_by_its_input_and_kind_and_the_node_goes_on(tmp_path: Path) -> None:
+def test_callback_errors_are_counted_by_input_and_kind(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         rclpy.init(domain_id=running.context.get_domain_id())
         node = Failing()
@@ -217,16 +217,16 @@ def test_whatever_a_callback_raises_is_counted_by_its_input_and_kind_and_the_nod
         assert "failed" in answer.message
         wanted = {"raised /one ValueError": 2, "raised /one MemoryError": 1, "raised /one KeyError": 9}
         wanted |= {"raised service ~/ask OSError": 1, "raised timer on_timer ZeroDivisionError": 2}
-        told: dict[str, str] = {}
+        counts: dict[str, str] = {}
 
         def all_counted() -> bool:
-            told.update(running.diagnostics.get("failing", {}))
-            return all(int(told.get(key, 0)) >= count for key, count in wanted.items())
+            counts.update(running.diagnostics.get("failing", {}))
+            return all(int(counts.get(key, 0)) >= count for key, count in wanted.items())
 
-        assert running.until(all_counted), told
-        assert all(told[key] == str(wanted[key]) for key in wanted if "/one" in key)
-        assert "callbacks failed" in told[""]
-        # one that fails time and again begins anew: its state may be what is wrong
+        assert running.until(all_counted), counts
+        assert all(counts[key] == str(wanted[key]) for key in wanted if "/one" in key)
+        assert "callbacks failed" in counts[""]
+        # consecutive failures reset the node, because its state may be the cause
         assert node.restarts.count("/one") == 1
         assert thread.is_alive()
         executor.stop()
@@ -248,9 +248,7 @@ def test_whatever_a_callback_raises_is_counted_by_its_input_and_kind_and_the_nod
         ("/fusion: {ros__parameters: {? [a]: b}}", "is not YAML"),
     ],
 )
-def test_a_node_refuses_a_parameters_file_that_nobody_writes_in_one_line(
-    tmp_path: Path, content: str, said: str
-) -> None:
+def test_hostile_parameters_file_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "bad.yaml").write_text(content)
     assert said in refusal(tmp_path, "fusion", "--params-file", str(tmp_path / "bad.yaml"))
 
@@ -345,7 +343,7 @@ def test_no_message_drawn_at_random_ends_a_node_or_takes_memory(
         topics = listening()
         assert len(topics) > 25, topics
         qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        sender = rclpy.create_node("sender", context=running.context)  # which is not spun, and hears nothing
+        sender = rclpy.create_node("sender", context=running.context)  # not spun, receives nothing
         publishers = {topic: sender.create_publisher(class_of(kind), topic, qos) for topic, kind in topics.items()}
         rights = {topic: right(topic, kind) for topic, kind in topics.items()}
         print(f"{len(topics)} topics after {time.monotonic() - started:.1f} s")

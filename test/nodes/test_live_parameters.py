@@ -76,7 +76,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
 # --- /diagnostics
 
 
-def test_every_node_reports_what_comes_in_and_goes_out(running: Graph) -> None:
+def test_every_node_reports_rates_of_inputs_and_outputs(running: Graph) -> None:
     flows = {
         "bag_player": f"rate out {graph.skeleton_topic('kinect1')}",
         "kinect_skeleton": f"rate out {graph.skeleton_topic('kinect9')}",
@@ -102,12 +102,12 @@ def test_every_parameter_is_live_or_has_a_reason(executable: str) -> None:
             assert item.check_change(item.default) == item.default
             assert not item.fixed, item.name
         else:
-            with pytest.raises(ParameterError, match=r"cannot change while the node runs: .+ Start it anew"):
+            with pytest.raises(ParameterError, match=r"cannot change while the node runs: .+ Restart it"):
                 item.check_change(item.default)
 
 
 @pytest.mark.parametrize("node", sorted(PARAMETERS))
-def test_what_is_live_is_taken_and_the_rest_says_why_not_and_what_to_do(running: Graph, node: str) -> None:
+def test_live_parameters_change_and_others_state_reason_and_remedy(running: Graph, node: str) -> None:
     table = systems.parameters_of(node)
     names = [item.name for item in table]
     values = dict(zip(names, running.get(node, names), strict=True))
@@ -117,12 +117,12 @@ def test_what_is_live_is_taken_and_the_rest_says_why_not_and_what_to_do(running:
         if not item.live:
             assert reason == (
                 f"{node}: parameter {item.name!r} cannot change while the node runs: "
-                f"{item.fixed or 'it is read at the start'}. Start it anew with the value in --params-file, or with "
+                f"{item.fixed or 'it is read at the start'}. Restart it with the value in --params-file, or with "
                 f"-p {item.name}:=VALUE"
             )
 
 
-def test_a_wrong_name_or_value_is_refused_in_our_words_and_nothing_changes(running: Graph) -> None:
+def test_wrong_name_or_value_is_refused_with_our_reason(running: Graph) -> None:
     refused = {
         "silense": (0.2, "fusion: unknown parameter 'silense'; did you mean 'silence'?"),
         "silence": (99.0, "fusion: parameter 'silence': 99.0, expected 0.02 to 5"),
@@ -137,7 +137,7 @@ def test_a_wrong_name_or_value_is_refused_in_our_words_and_nothing_changes(runni
     assert running.get("fusion", ["silence", "method", "max_wait"]) == before
 
 
-def test_a_whole_number_serves_as_a_number(running: Graph) -> None:
+def test_integer_is_accepted_for_a_float(running: Graph) -> None:
     assert running.set("fusion", max_wait=1) == [(True, "")]
     [wait] = running.get("fusion", ["max_wait"])
     assert wait.type == ParameterType.PARAMETER_DOUBLE

@@ -77,16 +77,16 @@ class Tracking(Running):
             if not topic.endswith("clock"):
                 self.poses.publish(message)
 
-    def wait_for_listeners(self) -> None:
-        """Until the nodes have found each other and the test."""
+    def wait_for_subscribers(self) -> None:
+        """Wait until the nodes and the test have found each other."""
         outputs = dict.fromkeys((graph.FILTERED, graph.MODEL_STATE_STDDEV, graph.segments_topic("body1")), 1)
         angles = (graph.joint_states_topic("body1"), graph.joint_states_stddev_topic("body1"))
         self.wait_for_links(
             {"skeleton_filter": outputs | {STATE: 2, COVARIANCE: 2}, "joint_angles": dict.fromkeys(angles, 1)}
         )
 
-    def heard(self) -> bool:
-        """Whether the filter listens to both sensors, and the calibration has reached it."""
+    def connected(self) -> bool:
+        """Whether the filter has subscribed to both sensors, which it does after the calibration."""
         return all(publisher.get_subscription_count() == 1 for publisher in self.publishers.values())
 
     def play(self, count: int) -> None:
@@ -118,8 +118,8 @@ class Tracking(Running):
 @pytest.fixture(scope="module")
 def tracking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tracking]:
     with Tracking(tmp_path_factory.mktemp("tracking")) as running:
-        assert running.until(running.heard)
-        running.wait_for_listeners()
+        assert running.until(running.connected)
+        running.wait_for_subscribers()
         yield running
 
 
@@ -127,7 +127,7 @@ def stamps(messages: list[Any]) -> list[int]:
     return [to_nanoseconds(message.header.stamp) for message in messages]
 
 
-def test_before_the_calibration_nothing_comes_and_then_each_sensors_frames(tracking: Tracking) -> None:
+def test_filter_publishes_only_after_the_calibration(tracking: Tracking) -> None:
     tracking.play(10)
     assert tracking.until(lambda: "10" in tracking.diagnostics.get("skeleton_filter", {}).get("received", ""))
     assert tracking.until(lambda: tracking.diagnostics["skeleton_filter"].get("alignment uncalibrated") == "10"), (
@@ -145,7 +145,7 @@ def test_before_the_calibration_nothing_comes_and_then_each_sensors_frames(track
     )
 
 
-def test_the_messages_tell_of_one_and_the_same_state(tracking: Tracking) -> None:
+def test_all_messages_describe_the_same_state(tracking: Tracking) -> None:
     for cloud, state, deviation, image, segments in list(
         zip(
             tracking.skeletons, tracking.states, tracking.stddevs, tracking.covariances, tracking.segments, strict=False
@@ -169,7 +169,7 @@ def test_the_messages_tell_of_one_and_the_same_state(tracking: Tracking) -> None
         np.testing.assert_allclose([forearm.x, forearm.y, forearm.z], skeleton.positions[Joint.ELBOW_LEFT], atol=1e-5)
 
 
-def test_who_comes_late_gets_the_persons_model(tracking: Tracking) -> None:
+def test_late_subscriber_gets_the_urdf(tracking: Tracking) -> None:
     models = tracking.collect(String, graph.urdf_topic("body1"), LATCHED)
     assert tracking.until(lambda: models)
     robot = ElementTree.fromstring(models[-1].data)
@@ -177,7 +177,7 @@ def test_who_comes_late_gets_the_persons_model(tracking: Tracking) -> None:
     assert any(joint.get("name") == "elbow_flexion_left_body1" for joint in robot.iter("joint"))
 
 
-def test_in_a_silence_it_says_what_is_to_be_expected_until_it_does_not_know(tracking: Tracking) -> None:
+def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -> None:
     tracking.cut_short()
     tracking.play(40)
 
@@ -210,7 +210,7 @@ def test_in_a_silence_it_says_what_is_to_be_expected_until_it_does_not_know(trac
     assert tracking.until(lambda: tracking.angles)
 
 
-def test_a_filter_that_was_killed_goes_on_with_the_calibration_of_before(tracking: Tracking) -> None:
+def test_restarted_filter_gets_the_latched_calibration(tracking: Tracking) -> None:
     process = tracking.processes["skeleton_filter"]
     process.kill()
     process.wait()
@@ -226,7 +226,7 @@ def test_a_filter_that_was_killed_goes_on_with_the_calibration_of_before(trackin
     assert tracking.until(back)
 
 
-def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tracking) -> None:
+def test_invalid_state_or_covariance_is_counted(tracking: Tracking) -> None:
     tracking.until(lambda: False, timeout=0.5)
     state, image = tracking.states[-1], tracking.covariances[-1]
     states = tracking.node.create_publisher(JointState, STATE, RELIABLE)
@@ -267,7 +267,7 @@ def test_a_state_or_covariance_that_is_none_is_counted_and_survived(tracking: Tr
     assert tracking.until(lambda: tracking.angles)
 
 
-def test_after_another_filter_it_goes_on_with_the_poses_of_before(tracking: Tracking) -> None:
+def test_change_of_filter_keeps_the_sensor_poses(tracking: Tracking) -> None:
     for name, sensors in (("lkf_constant_velocity", 0), ("ekf", 1)):  # a linear filter takes what the fusion makes
         assert tracking.set_parameter("skeleton_filter", "filter", ParameterValue(type=4, string_value=name))[0]
         assert tracking.until(

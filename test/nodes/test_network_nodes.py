@@ -37,18 +37,18 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
             "kinect_skeleton", sensor="left", device="kinect1", backend="network", port=port, reliable=True
         )
 
-        def told() -> dict[str, str]:
+        def said() -> dict[str, str]:
             return running.said("kinect_skeleton")
 
-        assert running.until(lambda: "no frame yet" in told().get("", ""), 60.0)
+        assert running.until(lambda: "no frame yet" in said().get("", ""), 60.0)
         for session in ("1", "2"):
             clouds_wanted = len(clouds) + 60
             sender = running.replay(f"sender{session}", port)
-            assert running.until(lambda wanted=clouds_wanted: len(clouds) > wanted, 60.0), told()
-            assert running.until(lambda: told()[""] == "streaming", 30.0), told()
-            assert told()["sessions"] == session
+            assert running.until(lambda wanted=clouds_wanted: len(clouds) > wanted, 60.0), said()
+            assert running.until(lambda: said()[""] == "streaming", 30.0), said()
+            assert said()["sessions"] == session
             assert stop(sender) == 0
-            assert running.until(lambda: told()[""].startswith(f"127.0.0.1 port {port}: no frame for"), 30.0), told()
+            assert running.until(lambda: said()[""].startswith(f"127.0.0.1 port {port}: no frame for"), 30.0), said()
         assert node.poll() is None
         stamps = [to_nanoseconds(cloud.header.stamp) for cloud in clouds]
         assert (np.diff(stamps) > 0).all()
@@ -56,7 +56,7 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
         # a stranger's packet is counted and named
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(b"x" * 500, ("127.0.0.1", port))
-        assert running.until(lambda: told().get("rejected, not ours") == "1", 30.0), told()
+        assert running.until(lambda: said().get("rejected, not ours") == "1", 30.0), said()
         assert "no frame" in running.log("kinect_skeleton")
 
 
@@ -85,10 +85,10 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
         running.start("skeleton_adapter", sensor="azure", topic="/k4a/body_tracking_data", reliable=True)
         publisher = running.node.create_publisher(MarkerArray, "/k4a/body_tracking_data", RELIABLE)
 
-        def told() -> dict[str, str]:
+        def said() -> dict[str, str]:
             return running.said("skeleton_adapter")
 
-        assert running.until(lambda: told().get("") == "no message on /k4a/body_tracking_data yet", 60.0)
+        assert running.until(lambda: said().get("") == "no message on /k4a/body_tracking_data yet", 60.0)
         assert running.until(lambda: publisher.get_subscription_count() == 1, 30.0)
         now = int(time.time())  # a stamp a minute old is of another clock
         two_times = MarkerArray(markers=markers(now - 3).markers + markers(now - 2, (4,)).markers)
@@ -100,7 +100,7 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
         sent: list[Any] = [MarkerArray(), two_times, unknown, markers(now - 1, (3, 4)), gone]
         for message in sent:
             publisher.publish(message)
-        assert running.until(lambda: len(clouds) == 2, 30.0), told()
+        assert running.until(lambda: len(clouds) == 2, 30.0), said()
         first, second = (cloud_to_skeletons(cloud) for cloud in clouds)
         assert [skeleton.body for skeleton in first] == [3, 4]
         assert [skeleton.body for skeleton in second] == [3]
@@ -108,8 +108,8 @@ def test_markers_of_an_azure_kinect_come_out_as_skeletons(tmp_path: Path) -> Non
         assert clouds[0].header.frame_id == "azure_optical_frame"
         np.testing.assert_allclose(first[1].positions[Joint.HEAD], [0.26, 0.4, 2.0], atol=1e-6)
         assert (first[0].states == TrackingState.TRACKED).all()
-        assert running.until(lambda: told().get("malformed") == "1" and told().get("refused") == "1", 30.0), told()
-        assert running.until(lambda: "no message on /k4a/body_tracking_data for" in told()[""], 30.0), told()
+        assert running.until(lambda: said().get("malformed") == "1" and said().get("refused") == "1", 30.0), said()
+        assert running.until(lambda: "no message on /k4a/body_tracking_data for" in said()[""], 30.0), said()
 
 
 # --- two hosts

@@ -80,7 +80,7 @@ def test_a_node_refuses_bad_parameters_in_one_line(tmp_path: Path, executable: s
     assert said in refusal(tmp_path, executable, *words)
 
 
-def test_a_section_for_all_nodes_may_hold_what_only_some_know(tmp_path: Path) -> None:
+def test_wildcard_section_may_have_parameters_of_some_nodes(tmp_path: Path) -> None:
     def reason(name: str) -> str:
         file = tmp_path / f"{name}.yaml"
         file.write_text(f"/**:\n  ros__parameters:\n    {name}: map\n")
@@ -162,7 +162,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 @pytest.mark.parametrize("topic", sorted(set(INPUTS.values())))
-def test_every_malformed_message_is_counted_and_survived(nodes: Running, topic: str) -> None:
+def test_every_malformed_message_is_counted(nodes: Running, topic: str) -> None:
     readers = [name for name, own in INPUTS.items() if own == topic]
     publisher = nodes.node.create_publisher(PointCloud2, topic, RELIABLE)
     assert nodes.until(lambda: publisher.get_subscription_count() == len(readers))
@@ -179,7 +179,7 @@ def test_every_malformed_message_is_counted_and_survived(nodes: Running, topic: 
     nodes.node.destroy_publisher(publisher)
 
 
-def test_a_pose_that_is_none_is_counted(nodes: Running) -> None:
+def test_invalid_pose_is_counted(nodes: Running) -> None:
     before = nodes.number("fusion", "malformed")
     publisher = nodes.node.create_publisher(TransformStamped, graph.CALIBRATION, LATCHED)
     assert nodes.until(lambda: publisher.get_subscription_count() == 1)
@@ -254,7 +254,7 @@ def test_a_t_pose_that_is_held_is_logged(nodes: Running) -> None:
     nodes.node.destroy_publisher(publisher)
 
 
-def test_who_comes_late_gets_the_calibration_and_services_answer(nodes: Running) -> None:
+def test_late_subscriber_gets_the_calibration_and_services_answer(nodes: Running) -> None:
     poses = nodes.collect(TransformStamped, graph.CALIBRATION, LATCHED)
     assert nodes.until(lambda: poses)
     assert poses[0].child_frame_id == "kinect1_optical_frame"
@@ -334,19 +334,19 @@ def installed(folder: Path, entry: str) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
 
 
-def test_a_backend_of_another_package_is_found_and_its_failure_told(tmp_path: Path) -> None:
+def test_backend_of_another_package_is_found_and_its_failure_reported(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Camera")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
-        told = "OSError: the cable was pulled"
-        assert running.until(lambda: running.said("kinect_skeleton").get("") == told, 60.0)
+        failure = "OSError: the cable was pulled"
+        assert running.until(lambda: running.said("kinect_skeleton").get("") == failure, 60.0)
         assert running.diagnostics["kinect_skeleton"]["published"] == "3"
         assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
         assert process.poll() is None
         assert stop(process) == 0
 
 
-def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
+def test_backend_whose_status_raises_keeps_publishing(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Mute")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
@@ -358,9 +358,7 @@ def test_a_backend_that_cannot_say_how_it_is_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("entry", "said"), [("nowhere:Camera", "nowhere"), ("mycamera:Film", "Film")])
-def test_a_backend_of_another_package_that_cannot_be_loaded_is_told_in_a_line(
-    tmp_path: Path, entry: str, said: str
-) -> None:
+def test_backend_that_cannot_be_loaded_is_reported_in_one_line(tmp_path: Path, entry: str, said: str) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, entry)
         assert running.start_interpreter("kinect_skeleton", backend="mine").wait(60.0) == 2
@@ -389,7 +387,7 @@ common.run(Stuck)
 """
 
 
-def test_a_node_that_the_middleware_does_not_let_go_says_where_it_is_and_ends(tmp_path: Path) -> None:
+def test_node_blocked_in_the_middleware_prints_a_traceback_and_ends(tmp_path: Path) -> None:
     file = tmp_path / "stuck.py"
     file.write_text(NEVER_LEAVES)
     with (tmp_path / "log").open("wb") as log:
@@ -403,7 +401,7 @@ def test_a_node_that_the_middleware_does_not_let_go_says_where_it_is_and_ends(tm
     assert "in destroy_node" in said
 
 
-def test_a_calibration_is_saved_and_taken_up_again(tmp_path: Path) -> None:
+def test_calibration_is_saved_and_loaded(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     with Running(tmp_path) as running:
         poses = running.collect(TransformStamped, graph.CALIBRATION, LATCHED)

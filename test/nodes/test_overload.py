@@ -1,4 +1,4 @@
-"""A node that is too slow for what comes drops the oldest frames, handles those of now, and says so."""
+"""A node that is too slow for its inputs drops the oldest frames, handles the newest, and reports it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Slow(GraphNode):
     def start(self) -> None:
         self.waited: list[tuple[str, float]] = []
         for topic in TOPICS:
-            self.listen_to_skeletons(topic, lambda skeletons, sent_ns, topic=topic: self.work(topic, sent_ns))
+            self.subscribe_to_skeletons(topic, lambda skeletons, sent_ns, topic=topic: self.work(topic, sent_ns))
 
     def work(self, topic: str, sent_ns: int) -> None:
         self.waited.append((topic, (time.time_ns() - sent_ns) / 1e9))
@@ -50,9 +50,9 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Slow]:
 
 
 @pytest.mark.alone
-def test_who_is_too_slow_handles_what_is_new_and_says_what_was_dropped(slow: Slow) -> None:
-    told: list[Any] = []
-    slow._diagnostics.publish = told.append
+def test_slow_node_drops_old_frames_and_reports_them(slow: Slow) -> None:
+    reports: list[Any] = []
+    slow._diagnostics.publish = reports.append
     source = rclpy.create_node("source")
     publishers = [source.create_publisher(PointCloud2, topic, slow.skeleton_qos()) for topic in TOPICS]
     executor = LeanExecutor(slow)
@@ -72,17 +72,17 @@ def test_who_is_too_slow_handles_what_is_new_and_says_what_was_dropped(slow: Slo
         sent += 1
         time.sleep(max(0.0, begin + sent / 30 - time.monotonic()))
     before = len(slow.waited)
-    time.sleep(1.5)  # what is left is worked on, and told of
+    time.sleep(1.5)  # for the remaining frames and the report
     backlog, lost = slow.backlog.dropped, slow.sequences.lost
     assert set(backlog) == set(TOPICS)
     for topic in TOPICS:
         handled = sum(each == topic for each, _ in slow.waited)
         assert handled + backlog[topic] + lost[topic] == sent
         assert backlog[topic] > lost[topic]
-    # no queue that lasts: what was handled at the end is of now, and little is left
+    # no standing queue: the frames handled last are recent, and few remain
     late = [seconds for _, seconds in slow.waited[before // 2 : before]]
     assert np.median(late) < 0.3 and len(slow.waited) - before <= 16
-    statuses = [message.status[0] for message in told]
+    statuses = [message.status[0] for message in reports]
     warned = [status for status in statuses if status.message.startswith("too slow: dropped ")]
     assert warned and all(status.level == b"\x01" and TOPICS[0] in status.message for status in warned)
     values = {item.key: item.value for item in statuses[-1].values}

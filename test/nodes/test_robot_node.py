@@ -81,23 +81,23 @@ def write_angles(path: Path, seconds: float = np.inf) -> None:
 
 @dataclass
 class Arm:
-    """A simulated arm and what it was told."""
+    """A simulated arm and its received commands: (wall time, stamp, position)."""
 
     mapping: RobotMapping
     body: SimulatedArm
-    told: list[tuple[float, float, FloatArray]] = field(default_factory=list)
+    commands: list[tuple[float, float, FloatArray]] = field(default_factory=list)
     """When a command came and when it was made (wall time, seconds; NaN where it does not say), and what it was."""
     stood: list[tuple[float, FloatArray]] = field(default_factory=list)
 
     def moving(self) -> bool:
         """Whether the last commands move a joint by more than 0.15 rad/s."""
-        if len(self.told) < 11:
+        if len(self.commands) < 11:
             return False
-        return bool(np.abs(self.told[-1][2] - self.told[-11][2]).max() > 0.015)
+        return bool(np.abs(self.commands[-1][2] - self.commands[-11][2]).max() > 0.015)
 
 
 class Robots(Running):
-    """Two arms in this process that follow what they are told."""
+    """Two arms in this process that follow their commands."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -119,17 +119,17 @@ class Robots(Running):
             (point,) = message.points
             assert message.joint_names == list(arm.mapping.joints)
             self._told(arm, to_nanoseconds(message.header.stamp) / NANOSECONDS, point.positions)
-            arm.body.go_to(arm.told[-1][2], point.time_from_start.nanosec / NANOSECONDS)
+            arm.body.go_to(arm.commands[-1][2], point.time_from_start.nanosec / NANOSECONDS)
 
         def on_array(message: Float64MultiArray) -> None:
             self._told(arm, np.nan, message.data)
-            arm.body.go_to(arm.told[-1][2])
+            arm.body.go_to(arm.commands[-1][2])
 
         return on_trajectory if arm.mapping.output.kind == "joint_trajectory" else on_array
 
     @staticmethod
     def _told(arm: Arm, stamp: float, position: Any) -> None:
-        arm.told.append((time.time(), stamp, np.array(position)))
+        arm.commands.append((time.time(), stamp, np.array(position)))
 
     def _advance(self) -> None:
         now = time.monotonic()
@@ -224,15 +224,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         for _ in range(2):
             robots.play()
             killed.append(robots.kill_while_moving())
-            followed = len(robots.arms["iiwa7"].told)
+            followed = len(robots.arms["iiwa7"].commands)
             assert robots.until(lambda: robots.in_state(State.HOLDING)), robots.diagnostics
             assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.diagnostics
             for robot in BODIES:
                 reasons[robot].append(robots.robot(robot)[""])
             robots.until(lambda: False, timeout=1.0)  # commands that were on their way
-            quiet.append({robot: len(arm.told) for robot, arm in robots.arms.items()})
+            quiet.append({robot: len(arm.commands) for robot, arm in robots.arms.items()})
             robots.until(lambda: False, timeout=0.5)
-            assert quiet[-1] == {robot: len(arm.told) for robot, arm in robots.arms.items()}
+            assert quiet[-1] == {robot: len(arm.commands) for robot, arm in robots.arms.items()}
         for name in (*(f"{robot}_commands" for robot in BODIES), "calibration"):
             assert stop(robots.processes.pop(name)) == 0, robots.log(name)
         logs = {robot: robots.log(f"{robot}_commands") for robot in BODIES}
@@ -242,7 +242,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 def of_one_run(run: Run, arm: Arm, number: int) -> list[tuple[float, float, FloatArray]]:
     """The commands up to a stop, from the one before."""
     robot = arm.mapping.robot
-    return arm.told[run.quiet_at[number - 1][robot] if number else 0 : run.quiet_at[number][robot]]
+    return arm.commands[run.quiet_at[number - 1][robot] if number else 0 : run.quiet_at[number][robot]]
 
 
 def stall(times: list[float]) -> float:
@@ -253,12 +253,12 @@ def stall(times: list[float]) -> float:
 @pytest.mark.alone
 def test_both_arms_follow_the_recorded_motion(run: Run) -> None:
     for arm in run.arms.values():
-        told = np.array([position for _, _, position in arm.told])
-        assert np.ptp(told, axis=0).max() > 0.5
-        times = np.array([came for came, _, _ in arm.told])
+        commanded = np.array([position for _, _, position in arm.commands])
+        assert np.ptp(commanded, axis=0).max() > 0.5
+        times = np.array([came for came, _, _ in arm.commands])
         stood_at = np.array([at for at, _ in arm.stood])
         stood = np.array([position for _, position in arm.stood])
-        behind = [np.interp(times + 0.04, stood_at, stood[:, k]) - told[:, k] for k in range(told.shape[1])]
+        behind = [np.interp(times + 0.04, stood_at, stood[:, k]) - commanded[:, k] for k in range(commanded.shape[1])]
         assert np.median(np.abs(behind)) < 0.03
         assert np.sqrt(np.mean(np.square(behind))) < 0.15
 
@@ -266,13 +266,13 @@ def test_both_arms_follow_the_recorded_motion(run: Run) -> None:
 @pytest.mark.alone
 def test_commands_are_within_every_limit_and_jump_nowhere(run: Run) -> None:
     for arm in run.arms.values():
-        told = np.array([position for _, _, position in arm.told])
-        assert np.isfinite(told).all()
-        assert (told >= arm.mapping.lower).all()
-        assert (told <= arm.mapping.upper).all()
-        np.testing.assert_allclose(told[0], arm.mapping.home, atol=0.05)
+        commanded = np.array([position for _, _, position in arm.commands])
+        assert np.isfinite(commanded).all()
+        assert (commanded >= arm.mapping.lower).all()
+        assert (commanded <= arm.mapping.upper).all()
+        np.testing.assert_allclose(commanded[0], arm.mapping.home, atol=0.05)
         # over the stops and new beginnings, too: the arm stands where it was left
-        assert (np.abs(np.diff(told, axis=0)) <= arm.mapping.rate * 2 * PERIOD + 0.05).all()
+        assert (np.abs(np.diff(commanded, axis=0)) <= arm.mapping.rate * 2 * PERIOD + 0.05).all()
         within = [np.diff([p for _, _, p in of_one_run(run, arm, number)], axis=0) for number in range(2)]
         for moved in within:
             assert (np.abs(moved) <= arm.mapping.rate * 2 * PERIOD + 1e-9).all()
@@ -292,7 +292,7 @@ def test_the_arm_stands_within_a_tenth_of_a_second_of_the_sensors_death(run: Run
 
 
 @pytest.mark.alone
-def test_it_stops_as_stated_and_says_why(run: Run) -> None:
+def test_stops_within_the_stated_time_and_reports_the_reason(run: Run) -> None:
     for robot, arm in run.arms.items():
         for number, said in enumerate(run.reasons[robot]):
             assert said.startswith("stopped: held for 2."), said
@@ -306,10 +306,10 @@ def test_it_stops_as_stated_and_says_why(run: Run) -> None:
 
 
 @pytest.mark.alone
-def test_it_recovers_after_good_data_alone_and_slowly(run: Run) -> None:
+def test_recovers_slowly_and_only_after_good_data(run: Run) -> None:
     for robot, arm in run.arms.items():
-        told = run.logs[robot]
-        assert told.count("stopped -> approaching: everything was good for 0.5") >= 2
+        log = run.logs[robot]
+        assert log.count("stopped -> approaching: everything was good for 0.5") >= 2
         commands = of_one_run(run, arm, 1)
         before = of_one_run(run, arm, 0)[-1][2]
         np.testing.assert_allclose(commands[0][2], before, atol=0.05)
@@ -369,23 +369,23 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
             return robots.diagnostics.get("robot_commands", {}).get("state")
 
         assert robots.until(lambda: state() == State.FOLLOWING, 60.0), (robots.log("up"), robots.diagnostics)
-        begun = len(arm.told)
-        assert robots.until(lambda: len(arm.told) > begun + 350 and arm.moving(), 60.0), robots.log("up")
+        begun = len(arm.commands)
+        assert robots.until(lambda: len(arm.commands) > begun + 350 and arm.moving(), 60.0), robots.log("up")
         (player,) = [each for each in psutil.Process(up.pid).children() if "bag_player" in each.cmdline()]
         killed = time.time()
         player.kill()
         assert robots.until(lambda: state() == State.HOLDING), robots.log("up")
-        followed = [each for each in arm.told[begun:] if each[0] < killed]
-        after = [each for each in arm.told if each[0] >= killed]
+        followed = [each for each in arm.commands[begun:] if each[0] < killed]
+        after = [each for each in arm.commands if each[0] >= killed]
         assert robots.until(lambda: state() == State.FOLLOWING), robots.log("up")
         assert robots.until(lambda: "| robot following: " in robots.log("up"), 10.0)  # the status line, every 5 s
         assert stop(up) == 0, robots.log("up")
-    told, came = np.array([each[2] for each in followed]), np.array([each[0] for each in followed])
+    commanded, came = np.array([each[2] for each in followed]), np.array([each[0] for each in followed])
     # how late a command is depends on the machine, where it leads does not
     late = [joints_of(arm.mapping, angles, came - delay) for delay in np.arange(0.0, 0.5, 0.02)]
-    wanted = min(late, key=lambda each: float(np.square(told - each).mean()))
-    off = np.degrees(np.sqrt(np.mean(np.square(told - wanted), axis=0)))
-    assert np.ptp(told[:, 1]) > np.radians(50.0)
+    wanted = min(late, key=lambda each: float(np.square(commanded - each).mean()))
+    off = np.degrees(np.sqrt(np.mean(np.square(commanded - wanted), axis=0)))
+    assert np.ptp(commanded[:, 1]) > np.radians(50.0)
     assert (off < 8.0).all(), off  # a waving elbow is faster than the robot's limits: 5 deg are theirs
     # up to when diagnostics said that it held, its commands changed for a tenth of a second
     last = max((k for k in range(1, len(after)) if (after[k][2] != after[k - 1][2]).any()), default=0)

@@ -1,4 +1,4 @@
-"""The real ``robot_commands`` never follows what is stale, foreign or doubled, and begins only where the robot is."""
+"""``robot_commands`` never follows stale, foreign or doubled angles, and begins at the robot's position."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def mapping(name: str, folder: Path, *, state: bool) -> Path:
 
 
 class Robot:
-    """One arm with its node, and the person whom it follows.
+    """One arm with its node, and the angles of the person that it follows.
 
     Attributes:
         angle: radians, the person's.
@@ -78,8 +78,8 @@ class Robot:
         convention: of the angles.
         names: of the angles.
         doubled: whether a second publisher says the opposite angle.
-        position: radians at which the arm stands; it goes where it is told while ``released``.
-        commands: radians, as they came.
+        position: of the arm, radians; it follows the commands while ``released``.
+        commands: received ones, radians.
     """
 
     def __init__(self, bench: Bench, name: str, node: RobotCommands) -> None:
@@ -100,11 +100,11 @@ class Robot:
             self.position = message.data[0]
 
     def said(self) -> str:
-        """Its state and the reason, as diagnostics say them."""
+        """Its state and the reason, from the diagnostics."""
         return str(self.node.state()[1])
 
-    def tell(self, now_ns: int) -> None:
-        """The person's angles and where the arm stands."""
+    def publish(self, now_ns: int) -> None:
+        """Publish the person's angles and the arm's position."""
         self.states.publish(JointState(name=["shoulder"], position=[self.position]))
         stamp_ns = now_ns - round(self.age * NANOSECONDS)
         for number, publishers in enumerate(self.publishers[: 1 + self.doubled]):
@@ -189,7 +189,7 @@ class Bench:
         body = Skeleton(now_ns, "kinect1_optical_frame", np.ones((25, 3)), np.full(25, 2, np.uint8))
         self.frames.publish(encode_skeletons([body]))
         if self._active is not None:
-            self._active.tell(now_ns)
+            self._active.publish(now_ns)
 
     def until(self, condition: Callable[[], object], timeout: float = 30.0) -> bool:
         return spin_until(self.executor, condition, timeout)
@@ -248,7 +248,7 @@ def test_stamps_by_another_clock_stop_the_robot(bench: Bench) -> None:
 # --- H2: foreign angles
 
 
-def test_another_convention_is_not_followed(bench: Bench) -> None:
+def test_angles_of_another_convention_are_refused(bench: Bench) -> None:
     robot = bench.robot("convention")
     robot.until_it_follows()
     robot.convention, robot.names, robot.angle = "positional", angle_names("positional"), -0.5
@@ -261,7 +261,7 @@ def test_another_convention_is_not_followed(bench: Bench) -> None:
     robot.until_it_follows()
 
 
-def test_another_list_of_names_is_not_followed(bench: Bench) -> None:
+def test_angles_with_other_names_are_refused(bench: Bench) -> None:
     robot = bench.robot("names")
     robot.until_it_follows()
     robot.names, robot.angle = angle_names("isb")[:-1], -0.5
@@ -276,7 +276,7 @@ def test_another_list_of_names_is_not_followed(bench: Bench) -> None:
 # --- H3: doubled commands and doubled angles
 
 
-def test_of_two_that_command_one_robot_neither_does(bench: Bench) -> None:
+def test_two_commanders_of_one_robot_both_stop(bench: Bench) -> None:
     robot = bench.robot("doubled")
     robot.until_it_follows()
     second = bench.start("second")
@@ -288,7 +288,7 @@ def test_of_two_that_command_one_robot_neither_does(bench: Bench) -> None:
     robot.until_it_follows()
 
 
-def test_angles_of_two_in_turn_are_not_followed(bench: Bench) -> None:
+def test_angles_of_two_alternating_publishers_are_refused(bench: Bench) -> None:
     robot = bench.robot("angles")
     robot.until_it_follows()
     robot.doubled = True
@@ -326,10 +326,10 @@ def test_commands_do_not_run_on_while_the_robot_stands_still(bench: Bench) -> No
     assert np.abs(np.diff(commands)).max() < 0.35
 
 
-# --- H5: where the robot stands nobody knows
+# --- H5: the robot's position is unknown
 
 
-def test_without_a_state_of_the_robot_a_person_has_to_say_that_it_is_at_home(bench: Bench) -> None:
+def test_robot_without_state_topic_waits_for_the_enable_service(bench: Bench) -> None:
     robot = bench.robot("unknown")
     robot.until_it_says("stopped", "waits for a person", "enable", "home")
     bench.go_on(2.0)

@@ -1,4 +1,4 @@
-"""Two of what there should be one of: every reader of a topic names them, and a second ``up`` ends."""
+"""Topics with two publishers: every subscriber reports them; a second ``up`` ends."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def readers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Readers
     made.close()
 
 
-def test_every_reader_names_a_second_publisher(readers: Readers) -> None:
+def test_every_subscriber_reports_a_second_publisher(readers: Readers) -> None:
     readers.one.create_publisher(PointCloud2, SENSOR, to_profile(graph.SKELETON))
     readers.one.create_publisher(JointState, ANGLES, 10)
     latest = readers.latest
@@ -123,12 +123,12 @@ def test_every_reader_names_a_second_publisher(readers: Readers) -> None:
     assert readers.until(lambda: not readers.doubled()), latest
 
 
-def test_a_node_that_was_killed_and_started_again_is_none_and_two_that_both_speak_are(readers: Readers) -> None:
+def test_restarted_publisher_is_not_a_second_one_but_two_active_ones_are(readers: Readers) -> None:
     profile = to_profile(graph.SKELETON)
     both = [node.create_publisher(PointCloud2, SENSOR, profile) for node in (readers.one, readers.same)]
     cloud = encode_skeletons([Skeleton(5, "kinect1_optical_frame", np.ones((25, 3)), np.full(25, 2, np.uint8))])
     assert readers.until(lambda: READERS.keys() <= readers.latest.keys())
-    # all that was heard of the first one came before the second
+    # all messages of the first one were received before the second started
     for publisher in both:
         for _ in range(30):
             publisher.publish(cloud)
@@ -142,7 +142,7 @@ def test_a_node_that_was_killed_and_started_again_is_none_and_two_that_both_spea
     readers.two.destroy_timer(timer)
 
 
-def test_a_second_up_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_up_in_a_domain_ends_with_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = environment()
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.setenv(name, found[name])
@@ -162,7 +162,7 @@ def test_a_second_up_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.Monkey
         first.close()
 
 
-def test_of_two_that_start_together_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_two_simultaneous_ups_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in environment().items():
         monkeypatch.setenv(name, value)
     monitors = [GraphMonitor(["body1"]) for _ in range(2)]

@@ -59,7 +59,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
 
 
 @pytest.mark.parametrize("name", ["kinect_skeleton", "fusion", "skeleton_filter", "joint_angles"])
-def test_after_a_standstill_no_old_angles_are_published(live: Live, name: str) -> None:
+def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -> None:
     process = live.processes[name]
     process.send_signal(signal.SIGSTOP)
     live.until(lambda: False, STOPPED)

@@ -1,6 +1,6 @@
-"""The viewer in a real browser: what is drawn is what the graph says, it moves, and its buttons do what they say.
+"""The viewer in a real browser: it draws the graph's messages, and its buttons work.
 
-With ``BODY_TRACKING_SCREENSHOTS=docs/images`` the pictures of the documentation are written there on the way.
+With ``BODY_TRACKING_SCREENSHOTS=docs/images`` it writes the pictures of the documentation there.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ CURVES = """() => Object.values(window.__viserTestpoints?.uplots ?? {})
 
 
 class Browser:
-    """A page and the graph that it shows; what that says is heard in a thread of its own, however slow the page is."""
+    """A page and the graph that it shows, whose messages are received in a thread of their own."""
 
     def __init__(self, running: Running, page: Any, clouds: list[PointCloud2]) -> None:
         self.running, self.page, self.clouds = running, page, clouds
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
-        """Wait for something to be so; it failing is the test failing."""
+        """Wait for a condition; a timeout fails the test."""
         end = time.monotonic() + PATIENCE
         while not (found := condition()):
             assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log('viewer')}"
@@ -66,7 +66,7 @@ class Browser:
         return found
 
     def joints(self, name: str) -> np.ndarray | None:
-        """(n, 3) what the page draws there."""
+        """(n, 3) points that the page draws there."""
         numbers = self.page.evaluate(JOINTS, name)
         return None if numbers is None else np.array(numbers).reshape(-1, 3)
 

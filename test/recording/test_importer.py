@@ -12,9 +12,9 @@ import pytest
 
 from body_tracking.cli import main
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.skeleton import JOINT_NAMES, Skeleton
 from body_tracking.inertial.mvnx import MvnxRecording
-from body_tracking.messages.base import POINT_CLOUD
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.importer import import_files

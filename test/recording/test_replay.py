@@ -21,13 +21,14 @@ import pytest
 
 from body_tracking import cli
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import ParameterError
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.base import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM, to_nanoseconds
+from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from body_tracking.core.message_types import TIME_REFERENCE
 from body_tracking.core.qos import SENSOR_DATA
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
-from body_tracking.messages.base import TIME_REFERENCE
 from body_tracking.messages.calibration import time_reference_to_clock
 from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader

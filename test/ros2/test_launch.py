@@ -69,7 +69,7 @@ WRONG = {
 }
 
 
-def test_wrong_values_end_it_in_one_line(tools: Tools) -> None:
+def test_wrong_values_end_the_launch_in_one_line(tools: Tools) -> None:
     (tools.folder / "there").mkdir()
     (tools.folder / "there" / "file").touch()
     launches = {
@@ -82,7 +82,7 @@ def test_wrong_values_end_it_in_one_line(tools: Tools) -> None:
         assert len(lines) == 1 and text in lines[0], lines
 
 
-def test_what_a_node_finds_wrong_ends_it_too(tools: Tools) -> None:
+def test_node_that_refuses_its_parameters_ends_the_launch(tools: Tools) -> None:
     """Instead of starting the node again for ever."""
     (tools.folder / "calibration.yaml").write_text("[" * 10)
     launch = tools.launch(f"bag:={tools.bag()}", "calibration:=calibration.yaml")

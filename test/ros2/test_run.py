@@ -1,4 +1,4 @@
-"""``ros2 run`` of every node at once, and every service of docs/reference.md, as somebody types them."""
+"""``ros2 run`` of every node, and ``ros2 service call`` of every service of docs/reference.md."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
 """Nodes that do nothing without a parameter."""
 
 
-class Everybody:
-    """All nodes in one domain, each started by itself."""
+class AllNodes:
+    """All nodes in one domain, each in a process of its own."""
 
     def __init__(self, tools: Tools) -> None:
         self.tools = tools
@@ -38,38 +38,38 @@ class Everybody:
 
 
 @pytest.fixture(scope="module")
-def everybody(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Everybody]:
-    with Tools(workspace, tmp_path_factory.mktemp("everybody")) as tools:
-        yield Everybody(tools)
+def all_nodes(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[AllNodes]:
+    with Tools(workspace, tmp_path_factory.mktemp("all_nodes")) as tools:
+        yield AllNodes(tools)
 
 
-def test_every_node_tells_of_itself(everybody: Everybody) -> None:
-    seen = everybody.tools.bench.diagnostics
+def test_every_node_publishes_diagnostics(all_nodes: AllNodes) -> None:
+    seen = all_nodes.tools.bench.diagnostics
     wanted = set(systems.EXECUTABLES)
-    assert everybody.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), everybody.text())
+    assert all_nodes.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), all_nodes.text())
 
 
-def test_every_service_answers(everybody: Everybody) -> None:
+def test_every_service_answers(all_nodes: AllNodes) -> None:
     calls = [
         ("service", "call", f"/{name}", "std_srvs/srv/Trigger") for name in [each.name for each in systems.SERVICES]
     ]
     # The recorder is to start before it stops.
     first, later = [call for call in calls if "start" in call[2]], [call for call in calls if "start" not in call[2]]
-    for text in (*everybody.tools.all(first), *everybody.tools.all(later)):
+    for text in (*all_nodes.tools.all(first), *all_nodes.tools.all(later)):
         answer = text.partition("response:")[2]
         assert "success=True" in answer or ("success=False" in answer and "message=''" not in answer), text
 
 
-def test_ctrl_c_ends_every_node_in_order(everybody: Everybody) -> None:
-    assert [tool.process.poll() for tool in everybody.tools_of.values()] == [None] * len(systems.EXECUTABLES)
-    for tool in everybody.tools_of.values():
+def test_ctrl_c_ends_every_node_in_order(all_nodes: AllNodes) -> None:
+    assert [tool.process.poll() for tool in all_nodes.tools_of.values()] == [None] * len(systems.EXECUTABLES)
+    for tool in all_nodes.tools_of.values():
         tool.interrupt()
-    codes = {name: tool.ended() for name, tool in everybody.tools_of.items()}
-    assert set(codes.values()) == {0}, (codes, everybody.text())
-    assert "Traceback" not in everybody.text()
+    codes = {name: tool.ended() for name, tool in all_nodes.tools_of.items()}
+    assert set(codes.values()) == {0}, (codes, all_nodes.text())
+    assert "Traceback" not in all_nodes.text()
 
 
-def test_what_a_node_cannot_do_without_is_said(tools: Tools) -> None:
+def test_missing_required_parameter_is_reported(tools: Tools) -> None:
     for name, tool in {name: tools.run(name) for name in some(LACKING)}.items():
         assert tool.ended() == 2
         said, of_ros2_run = tool.text().splitlines()

@@ -16,21 +16,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from body_tracking.cli import main
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.kinect.simulated import KinectErrors, errors_as_yaml, parameters, read_errors
 from body_tracking.kinect.simulated_sensor import RATE
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from body_tracking.messages.base import (
-    IMU,
-    JOINT_STATE,
-    MAGNETIC_FIELD,
-    POINT_CLOUD,
-    TIME_REFERENCE,
-    TRANSFORM,
-    to_nanoseconds,
-)
+from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.model import joint_state_to_model
 from body_tracking.messages.skeletons import cloud_to_skeletons

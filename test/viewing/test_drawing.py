@@ -43,7 +43,7 @@ class Drawing(SimpleNamespace):
     def get_logger(self) -> Any:
         return SimpleNamespace(fatal=self.said.append)
 
-    def log_seldom(self, key: str, text: str) -> None:
+    def log_throttled(self, key: str, text: str) -> None:
         self.said.append(f"warned of {key}")
 
 

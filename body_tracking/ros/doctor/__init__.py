@@ -1,7 +1,6 @@
-"""``body_tracking doctor``: why nothing comes, and what to do about it.
+"""``body_tracking doctor``: finds out why no data arrive, and states a remedy.
 
-``environment`` looks at the shell, ``bags`` at a recording, ``live`` at the ROS domain; each yields findings. Only
-``cli`` imports it.
+``environment`` checks the shell, ``bags`` a recording, ``live`` the ROS domain; each yields findings.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ PROBLEM: Final = "problem"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a check says: where, how it is, and the one thing to do; a problem keeps the graph from working."""
+    """The result of a check, with a remedy; a problem keeps the graph from working."""
 
     level: Literal["OK", "warning", "problem"]
     found: str

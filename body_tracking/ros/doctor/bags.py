@@ -1,4 +1,4 @@
-"""A bag: does it open, is it whole, does it have what the graph needs."""
+"""Checks of a bag: it can be read, is complete, and has the topics and rates that the graph needs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.messages.base import IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
 from body_tracking.recording.info import bag_info
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding
@@ -19,7 +19,7 @@ GAP = 0.5
 
 
 def bag(path: Path) -> Iterator[Finding]:
-    """Whether a folder, or a single mcap file, can be read, and what it lacks."""
+    """Findings on a folder or a single mcap file."""
     recover = f"body_tracking bag recover {path}"
     try:
         info = bag_info(path)

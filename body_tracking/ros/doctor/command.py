@@ -1,4 +1,4 @@
-"""``body_tracking doctor``: all checks, and what they say."""
+"""The command ``body_tracking doctor``: runs the checks and prints their findings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from body_tracking.ros.doctor.environment import client_library, clock, environm
 
 
 def examine(args: argparse.Namespace) -> Iterator[Finding]:
-    """All findings, as they come; what needs a missing library is imported only where that is not missing."""
+    """All findings; modules that need ROS are imported only after the libraries were found."""
     if args.bag is not None:
         from body_tracking.ros.doctor.bags import bag
 

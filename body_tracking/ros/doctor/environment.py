@@ -1,4 +1,4 @@
-"""The shell: which ROS it finds, whether that works, whom its nodes hear, and the clock that they stamp with."""
+"""Checks of the shell: ROS variables, client library, other libraries, and the clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding
 
 NEEDED = ("filterpy", "vqf", "mcap", "lz4", "zstandard", "rosbags")
-"""Libraries without which nothing works and that no ROS install brings."""
+"""Required libraries that no ROS install contains."""
 OPTIONAL = {
     "viser": ("no live page", "pip install 'body_tracking[viewer]'"),
     "ezc3d": ("no import of C3D files", "pip install 'body_tracking[c3d]'"),
@@ -27,11 +27,11 @@ _REMEDIES = {
     "RMW": "unset RMW_IMPLEMENTATION, or install the middleware that it names",
     "shared object file": "unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH, in a shell without another ROS",
 }
-"""By a part of what the client library says when it does not start."""
+"""By a part of the client library's error message."""
 
 
 def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
-    """Variables that contradict each other, and domain and discovery range, which all computers must share."""
+    """Contradictory variables, and domain and discovery range, which must be the same on all computers."""
     domain = variables.get("ROS_DOMAIN_ID") or "0"
     if not (domain.isdecimal() and int(domain) <= 232):  # those beyond have no UDP ports
         yield Finding(PROBLEM, f"ROS_DOMAIN_ID is {domain!r}, expected 0 to 232", "export ROS_DOMAIN_ID=0")
@@ -44,11 +44,11 @@ def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
     for name in ("ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER", *_FAST_DDS):
         if variables.get(name):
             remedy = f"unset {name}, or set it alike in every shell"
-            yield Finding(WARNING, f"{name}={variables[name]} decides who hears whom", remedy)
+            yield Finding(WARNING, f"{name}={variables[name]} limits which nodes find each other", remedy)
 
 
 def client_library() -> Finding:
-    """Whether a node can be made; in a process of its own, which a broken client library ends."""
+    """Whether a node can be made; in a child process, because a broken client library may end it."""
     code = "import rclpy; rclpy.init(); rclpy.create_node('doctor'); print(rclpy.get_rmw_implementation_identifier())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if done.returncode == 0:
@@ -59,7 +59,7 @@ def client_library() -> Finding:
 
 
 def libraries() -> Iterator[Finding]:
-    """What is not installed."""
+    """Libraries that are not installed."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         yield Finding(PROBLEM, f"not installed: {', '.join(missing)}", f"pip install {' '.join(missing)}")
@@ -69,7 +69,7 @@ def libraries() -> Iterator[Finding]:
 
 
 def clock() -> Finding:
-    """The real-time clock, which stamps refer to."""
+    """The real-time clock, which stamps messages."""
     if time.time() < Path(__file__).stat().st_mtime:
         return Finding(PROBLEM, f"the clock is in the past: {time.ctime()}", "sudo timedatectl set-ntp true")
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(1024)) == 5:  # TIME_ERROR

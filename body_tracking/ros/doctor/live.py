@@ -1,4 +1,4 @@
-"""The ROS domain: who publishes what, who waits in vain, what comes, and what the nodes say of themselves."""
+"""Checks of the ROS domain: publishers and subscribers of each topic, received messages, and status of the nodes."""
 
 # rclpy is only partly typed.
 # mypy: disable-error-code="no-untyped-call, attr-defined, misc"
@@ -20,9 +20,10 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from body_tracking.core import names
+from body_tracking.core.message_types import IMU, POINT_CLOUD, SEGMENTS
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.kinect.ros_time import OTHER_CLOCK_NS
-from body_tracking.messages.base import IMU, POINT_CLOUD, SEGMENTS, MessageError, to_nanoseconds
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.skeletons import cloud_to_skeletons
@@ -32,9 +33,9 @@ from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding
 from body_tracking.ros.doctor.bags import LEAST_RATE
 
 PATIENCE = 10.0
-"""Seconds for a sensor that was asked for to begin."""
+"""Seconds for a required sensor to begin."""
 OLD = 0.5
-"""Seconds; a stamp that is further from now is of another clock, not delayed."""
+"""Seconds; a greater age of a stamp means another clock, not a delay."""
 _WATCHERS = ("body_tracking_doctor_", "body_tracking_up_")
 _QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -45,7 +46,7 @@ class Listener(Node):
     def __init__(self) -> None:
         super().__init__(f"{_WATCHERS[0]}{time.time_ns()}")
         self.came: dict[str, list[tuple[float, float, float]]] = {}
-        """By topic: steady time, stamp and age of each message, seconds; the age by ``/clock`` where there is one."""
+        """By topic: steady time of receipt, stamp and age of each message, seconds; age by ``/clock`` if it exists."""
         self.malformed: dict[str, str] = {}
         self.statuses: dict[str, NodeStatus] = {}
         self._clock_ns = 0
@@ -54,7 +55,7 @@ class Listener(Node):
         self.create_timer(0.3, self._look)
 
     def _look(self) -> None:
-        """Subscribe to what is new."""
+        """Subscribe to new topics."""
         for topic, (kind, *_) in self.get_topic_names_and_types():
             wanted = kind == IMU or (kind in LEAST_RATE and graph.has_one_publisher(topic))
             if wanted and topic not in self.came and self.count_publishers(topic):
@@ -80,7 +81,7 @@ class Listener(Node):
 
 
 def domain(sensors: Sequence[str], seconds: float = 3.0) -> Iterator[Finding]:
-    """Listen for three reports of each node, after the sensors that must be there have begun, and judge."""
+    """Findings after receiving for some seconds, which begin when all required sensors have begun."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node, wanted = Listener(), {graph.skeleton_topic(sensor) for sensor in sensors}
     try:
@@ -109,14 +110,14 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
     publishers = node.get_publishers_info_by_topic(topic)
     readers = [each for each in node.get_subscriptions_info_by_topic(topic) if not each.node_name.startswith(_WATCHERS)]
     by, to = (
-        ", ".join(sorted({f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in side})) or "nobody"
+        ", ".join(sorted({f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in side})) or "no subscriber"
         for side in (publishers, readers)
     )
     if not publishers:
-        if wanted or (readers and SEGMENTS not in kinds):  # segments are of filters on a body model only
+        if wanted or (readers and SEGMENTS not in kinds):  # only filters with a body model publish segments
             remedy = "start its publisher; where it runs, compare env | grep ROS_ in both shells"
             source = wanted or topic == names.CLOCK or kinds[0] in (POINT_CLOUD, IMU)
-            found = f"{topic}: nobody publishes it" + (f", wanted by {to}" if readers else "")
+            found = f"{topic}: no publisher" + (f", wanted by {to}" if readers else "")
             yield Finding(PROBLEM if source else WARNING, found, remedy)
         return
     if len(publishers) > 1 and graph.has_one_publisher(topic):
@@ -137,9 +138,9 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
 
 
 def stream(text: str, kind: str, came: Sequence[tuple[float, float, float]]) -> Finding:
-    """Rate and stamps of messages, which :class:`Listener` describes, against what is expected of their type."""
+    """Rate and stamps of received messages (:attr:`Listener.came`), compared with the least rate of their type."""
     if not came:
-        remedy = "is somebody in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+        remedy = "is a person in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
         return Finding(PROBLEM if kind == IMU else WARNING, f"{text}: nothing came", remedy)
     times, _, ages = zip(*came, strict=True)
     rate = (len(came) - 1) / max(times[-1] - times[0], 1e-3)
