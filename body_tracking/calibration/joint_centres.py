@@ -8,7 +8,7 @@ angle to the thorax, and left and right are alike, but for what a person who is 
 
 With joints at ``m = p + b + e`` in the axes that they show, ``p`` the anatomical ones, ``b ~ N(0, P)`` what stays and
 ``e ~ N(0, T)`` what does not, and a pose that says ``H p = c + w``, ``w ~ N(0, R)``, in the body's own axes, which are
-turned by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the offsets are known by
+in_current_pose by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the offsets are known by
 (conditional normal distribution; ``G a = -H (a x m)``)
 
     r = H m - c,  S = H (P + T) H^T + G A G^T + R                                                                  (1)
@@ -72,14 +72,14 @@ _CHAINS = len(_TRUNK) + np.arange(8).reshape(2, 4)
 """(2, 4) places of shoulder, elbow, wrist and hand in them."""
 _THORAX = np.array([_J.SPINE_SHOULDER, _J.SPINE_MID, _J.SHOULDER_LEFT, _J.SHOULDER_RIGHT], dtype=np.intp)
 _THIRD = math.sqrt(1.0 / 3.0)
-_LEAST = 1e-6
+_MIN_LENGTH = 1e-6
 """Metres: a shorter bone points nowhere."""
 
 HOLD = 0.7
 """Seconds for which a pose has to be held."""
-_FEWEST = 5
+_MIN_FRAMES = 5
 """Frames in it."""
-_STRAY = 0.025
+_MAX_MOTION = 0.025
 """Metres (root mean square) by which elbows and wrists may move meanwhile against the shoulders."""
 _CHECK_NS, _CHECK_AGAIN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
 """How long until it is looked for again in what a sensor sees: where there was none, and where one was learnt from."""
@@ -87,29 +87,29 @@ _BREAK_NS, _LATE_NS = NANOSECONDS // 3, NANOSECONDS // 2
 """Frames farther apart do not show one pose; one that is older than the last by more is of a time that jumped back."""
 _ANOTHER_NS = 2 * _CHECK_AGAIN_NS
 """A pose that is held so much later than the last one is another."""
-_EASE = 0.3
+_FADE_IN = 0.3
 """Seconds (time constant) in which offsets that were learnt come into force: nothing jumps."""
-_PROBABLE = 0.999
+_GATE_QUANTILE = 0.999
 """Quantile of chi-square beyond which it was another pose."""
 POSE_STDDEV = math.radians(6.0)
 """Radians by which a person's joints are off a T-pose, per axis."""
-_STRETCHED = math.radians(4.0)
+_STRAIGHT_ELBOW = math.radians(4.0)
 """Radians by which elbows that are meant to be stretched are bent, palms down: forward, on average and by the standard
 deviation. They come to a stop at 0.6 +- 3.1 degrees (Boone and Azen 1979)."""
-_ALIKE = 0.01
+_SYMMETRY_STDDEV = 0.01
 """Metres by which left and right of a person's bones, and of where these meet, differ."""
 _ROLL_STDDEV = math.radians(40.0)
 """Radians by which a bone is rotated about itself that points at a right angle to where it did, or farther: of an even
 distribution over the +-70 degrees that a shoulder allows."""
-_SLOW = 0.3
+_TRANSIENT_SHARE = 0.3
 """Share of a joint's stated variance that comes and goes (``slow_scale`` of the extended filter)."""
-_TOGETHER = 0.8
+_ARM_CORRELATION = 0.8
 """Correlation of what comes and goes between the joints of an arm. With these two an arm's elevation varies by 6
 degrees and the elbow's flexion by 5; that real Kinect's errors vary by 3 to 8 and by 3 to 6.5 about their means, in
 each of six clips."""
 _AXES_STDDEV = 0.3
-"""Radians by which the axes of the joints are turned against the body's: more than is ever the case."""
-_SHOWN = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
+"""Radians by which the axes of the joints are in_current_pose against the body's: more than is ever the case."""
+_OBSERVED = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
 """(11, 3) in which of the directions forward, left and up a T-pose shows where a joint is, against its neighbours: not
 along an arm, and of the spine, whose bend differs between people, only to the sides."""
 _UNSEEN = 1.0
@@ -117,7 +117,7 @@ _UNSEEN = 1.0
 
 _CORRELATION = np.eye(len(LEARNT))
 for _arm in _CHAINS:
-    _CORRELATION[np.ix_(_arm, _arm)] += _TOGETHER * (1.0 - np.eye(len(_arm)))
+    _CORRELATION[np.ix_(_arm, _arm)] += _ARM_CORRELATION * (1.0 - np.eye(len(_arm)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +155,7 @@ def _axes(top: _Vector, middle: _Vector, left: _Vector, right: _Vector) -> tuple
 
 def _unit(x: float, y: float, z: float) -> _Vector:
     length = math.sqrt(x * x + y * y + z * z)
-    if not length > _LEAST:
+    if not length > _MIN_LENGTH:
         return math.nan, math.nan, math.nan
     return x / length, y / length, z / length
 
@@ -165,7 +165,7 @@ def body_axes(positions: FloatArray) -> FloatArray:
     return np.array(_axes(*positions.take(_THORAX, axis=0).tolist())).T
 
 
-def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
+def in_current_pose(positions: FloatArray, local: FloatArray) -> FloatArray:
     """Vectors that stay with the body, in the axes of its positions.
 
     Number by number: for each frame of each camera, and three times as fast as the same by arrays of so few.
@@ -206,7 +206,7 @@ def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
     return np.array(result)
 
 
-def kept(positions: FloatArray) -> FloatArray:
+def retained(positions: FloatArray) -> FloatArray:
     """(11,) ``d`` of eq. (3) and (4): 1 of the trunk and of all that points as in a T-pose.
 
     Args:
@@ -255,7 +255,9 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
     covariance = np.diag(prior) - (rows * prior).T @ gain
     left = np.einsum("ij,jk,ik->i", angles, covariance, angles) / (angles**2 @ prior)
     # from the axes of the thorax into those of the segments
-    frames = turned(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
+    frames = in_current_pose(
+        positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy()
+    )  # rows: the frames' axes
     local = np.einsum("jab,jb->ja", frames, offsets)
     blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
     distance = float(residual @ np.linalg.solve(innovation, residual))
@@ -271,7 +273,7 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     angles: list[FloatArray] = []
     forward, left, up = range(3)
 
-    def say(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
+    def add_row(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
         row = np.zeros(points.shape)
         for joint, factor in terms:
             row[_PLACE[joint], axis] += factor
@@ -291,25 +293,25 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         # plane of elevation: the upper arm goes on along the line of the shoulders
         ratio = upper / width
         terms = (elbow, 1.0), (shoulder, -1.0 - ratio), (other[0], ratio)
-        angles.append(say(forward, 0.0, upper * POSE_STDDEV, *terms))
+        angles.append(add_row(forward, 0.0, upper * POSE_STDDEV, *terms))
         # elevation: at a right angle to the thorax, which leans by how its ends are off sideways
-        row = say(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
+        row = add_row(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
         row[_PLACE[top], left], row[_PLACE[middle], left] = sign * upper / thorax, -sign * upper / thorax
         angles.append(row)
-        for axis, bend, deviation in ((forward, _STRETCHED, _STRETCHED), (up, 0.0, POSE_STDDEV)):
+        for axis, bend, deviation in ((forward, _STRAIGHT_ELBOW, _STRAIGHT_ELBOW), (up, 0.0, POSE_STDDEV)):
             ratio = fore / upper
             terms = (wrist, 1.0), (elbow, -1.0 - ratio), (shoulder, ratio)
-            angles.append(say(axis, fore * bend, fore * deviation, *terms))
+            angles.append(add_row(axis, fore * bend, fore * deviation, *terms))
             ratio = palm / fore
-            say(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
+            add_row(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
     for start, end in zip(range(3), range(1, 4), strict=True):
         terms_of_both = ((arm[end], 1.0) for arm in (_LEFT, _RIGHT)), ((arm[start], -1.0) for arm in (_LEFT, _RIGHT))
-        say(left, 0.0, _ALIKE, *terms_of_both[0], *terms_of_both[1])
+        add_row(left, 0.0, _SYMMETRY_STDDEV, *terms_of_both[0], *terms_of_both[1])
     shoulders = _LEFT[0], _RIGHT[0]
     for axis in (forward, up):
-        say(axis, 0.0, _ALIKE, (shoulders[0], 1.0), (shoulders[1], -1.0))
+        add_row(axis, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 1.0), (shoulders[1], -1.0))
     for joint in (base, middle, top):
-        say(left, 0.0, _ALIKE, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
+        add_row(left, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
     return (
         np.array(rows).reshape(len(rows), -1),
         np.array(values),
@@ -322,7 +324,7 @@ _LONG_AGO_NS = -(2**62)
 
 
 @dataclass(slots=True, eq=False)
-class _Seen:
+class _Evidence:
     """What one sensor has seen of the person; arrays are never written into."""
 
     recent: deque[Skeleton] = field(default_factory=deque)
@@ -332,15 +334,15 @@ class _Seen:
     counts: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
     variance: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
 
-    def copied(self) -> _Seen:
+    def copied(self) -> _Evidence:
         return replace(self, recent=self.recent.copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Memory:
+class Snapshot:
     """All that is known of a person's joints at some time."""
 
-    sensors: Mapping[str, _Seen]
+    sensors: Mapping[str, _Evidence]
     offsets: Offsets | None
     before: FloatArray
     since_ns: int
@@ -348,7 +350,7 @@ class Memory:
     held_ns: int
     refused_ns: int
 
-    def from_the_beginning(self) -> Memory:
+    def as_long_known(self) -> Snapshot:
         """The same, as if it had been known long before."""
         return replace(self, since_ns=_LONG_AGO_NS, first_ns=_LONG_AGO_NS)
 
@@ -374,22 +376,22 @@ class JointCentres:
 
     def reset(self) -> None:
         """Forget the person."""
-        self.recall(Memory({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
+        self.restore(Snapshot({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
 
-    def memory(self) -> Memory:
+    def snapshot(self) -> Snapshot:
         """What is known now, to go back to."""
         sensors = {name: seen.copied() for name, seen in self._sensors.items()}
         times = self._since_ns, self._first_ns, self._held_ns, self._refused_ns
-        return Memory(sensors, self.offsets, self._before, *times)
+        return Snapshot(sensors, self.offsets, self._before, *times)
 
-    def recall(self, memory: Memory) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Know what was known then, and nothing else."""
-        self._sensors = {name: seen.copied() for name, seen in memory.sensors.items()}
-        self.offsets, self._before = memory.offsets, memory.before
-        self._since_ns, self._first_ns = memory.since_ns, memory.first_ns
-        self._held_ns, self._refused_ns = memory.held_ns, memory.refused_ns
+        self._sensors = {name: seen.copied() for name, seen in snapshot.sensors.items()}
+        self.offsets, self._before = snapshot.offsets, snapshot.before
+        self._since_ns, self._first_ns = snapshot.since_ns, snapshot.first_ns
+        self._held_ns, self._refused_ns = snapshot.held_ns, snapshot.refused_ns
 
-    def see(self, skeleton: Skeleton, sensor: str = "") -> bool:
+    def update(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """Look for a T-pose.
 
         Args:
@@ -401,7 +403,7 @@ class JointCentres:
         """
         if skeleton.covariances is None:
             return False
-        seen = self._sensors.setdefault(sensor, _Seen())
+        seen = self._sensors.setdefault(sensor, _Evidence())
         recent, stamp_ns = seen.recent, skeleton.stamp_ns
         after_ns = stamp_ns - recent[-1].stamp_ns if recent else 1
         if -_LATE_NS < after_ns <= 0:
@@ -423,7 +425,7 @@ class JointCentres:
 
     def _is_held(self, recent: deque[Skeleton]) -> bool:
         """Whether a T-pose is held still over these frames."""
-        if recent[-1].stamp_ns - recent[0].stamp_ns < HOLD * NANOSECONDS or len(recent) < _FEWEST:
+        if recent[-1].stamp_ns - recent[0].stamp_ns < HOLD * NANOSECONDS or len(recent) < _MIN_FRAMES:
             return False
         positions = _known(recent)
         if not is_t_pose(positions):
@@ -431,15 +433,15 @@ class JointCentres:
         arms = positions[:, _ARMS]
         moving = arms[:, :, 1:3] - arms[:, :, :1]
         moving = moving[np.isfinite(moving).all(axis=(1, 2, 3))]
-        return len(moving) >= _FEWEST and bool((moving.var(axis=0).sum(axis=-1) < _STRAY**2).all())
+        return len(moving) >= _MIN_FRAMES and bool((moving.var(axis=0).sum(axis=-1) < _MAX_MOTION**2).all())
 
-    def _learn(self, seen: _Seen, stamp_ns: int) -> bool:
+    def _learn(self, seen: _Evidence, stamp_ns: int) -> bool:
         """Take what is new, and what all sensors saw together."""
         new = [each for each in seen.recent if each.stamp_ns > seen.taken_ns]
         if not new:
             return False
         points, variance = _in_body_axes(new)
-        candidate = _Seen()
+        candidate = _Evidence()
         there = np.isfinite(points).all(axis=-1) & np.isfinite(variance)
         candidate.sum = np.where(there[..., None], points, 0.0).sum(axis=0)
         candidate.variance = np.where(there, variance, 0.0).sum(axis=0)
@@ -466,13 +468,13 @@ class JointCentres:
 
     def _gate(self, dimension: int) -> float:
         if dimension not in self._gates:
-            self._gates[dimension] = float(chdtri(dimension, 1.0 - _PROBABLE))
+            self._gates[dimension] = float(chdtri(dimension, 1.0 - _GATE_QUANTILE))
         return self._gates[dimension]
 
     @staticmethod
     def _progress(since_ns: int, stamp_ns: int) -> float:
         """From 0 when something was learnt to 1 when it is in force."""
-        return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_EASE * NANOSECONDS)))
+        return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_FADE_IN * NANOSECONDS)))
 
     def _in_force(self, stamp_ns: int) -> FloatArray:
         """(11, 3) metres, in the frames of the segments."""
@@ -494,13 +496,13 @@ class JointCentres:
         if self.offsets is None:
             return positions
         known = positions if measured.all() else np.where(measured[:, None], positions, np.nan)
-        offsets = turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
+        offsets = in_current_pose(known, self._in_force(stamp_ns)[:, None])[:, 0]
         if not math.isfinite(offsets.sum()):
             return positions
         # by the pose as it is without them: a stretched arm that is seen bent is stretched
         without = known.copy()
         without[LEARNT] -= offsets
-        offsets *= kept(without)[:, None]
+        offsets *= retained(without)[:, None]
         result = positions.copy()
         result[_MOVED] -= offsets[_MOVED_AS]
         return result
@@ -519,12 +521,17 @@ class JointCentres:
         known = self.offsets
         if known is None:
             return covariances
-        axes = turned(positions, known.axes)
+        axes = in_current_pose(positions, known.axes)
         if not np.isfinite(axes).all():
             return covariances
         mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
-        gone = (1.0 - _SLOW) * (1.0 - known.share) * self._progress(self._first_ns, stamp_ns) * kept(positions) ** 2
-        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _SHOWN)
+        gone = (
+            (1.0 - _TRANSIENT_SHARE)
+            * (1.0 - known.share)
+            * self._progress(self._first_ns, stamp_ns)
+            * retained(positions) ** 2
+        )
+        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _OBSERVED)
         scaling = axes.swapaxes(1, 2) @ (factors[:, :, None] * axes)
         result = covariances.copy()
         result[LEARNT] = scaling @ covariances[LEARNT] @ scaling
@@ -538,11 +545,11 @@ class JointCentres:
         if self.offsets is None:
             return result
         count = len(LEARNT)
-        frames = turned(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+        frames = in_current_pose(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
         if not np.isfinite(frames).all():
             return result
         blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)
-        share = kept(positions).repeat(3)
+        share = retained(positions).repeat(3)
         progress = self._progress(self._first_ns, stamp_ns) * share * share[:, None]
         places = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
         learnt = np.ix_(places, places)
@@ -566,7 +573,7 @@ def _in_body_axes(skeletons: list[Skeleton]) -> tuple[FloatArray, FloatArray]:
     return np.stack(points), np.stack(variances)
 
 
-def _offsets(sensors: list[_Seen]) -> Offsets | None:
+def _offsets(sensors: list[_Evidence]) -> Offsets | None:
     """By what sensors saw, each by how much it states; None where a joint is missing that says what the arms do."""
     precision, total = np.zeros(len(LEARNT)), np.zeros((len(LEARNT), 3))
     for each in sensors:
@@ -579,7 +586,7 @@ def _offsets(sensors: list[_Seen]) -> Offsets | None:
         return None
     seen = precision > 0.0
     points = total / np.where(seen, precision, 1.0)[:, None]
-    transient = np.where(seen, _SLOW / np.where(seen, precision, 1.0), _UNSEEN)
+    transient = np.where(seen, _TRANSIENT_SHARE / np.where(seen, precision, 1.0), _UNSEEN)
     positions = np.full((N_JOINTS, 3), np.nan)
     positions[LEARNT] = points
     return t_pose_offsets(positions, transient)

@@ -53,7 +53,7 @@ RECEIPT_GRID = 0.04
 so that they seldom part here; the least delays differ by 30 ms and more, because a frame that overtakes the ``/clock``
 of a bag seems to have come early."""
 
-REPAIR_CLOCK = 0.004
+PAIR_AGAIN_CLOCK = 0.004
 """Interpolate the frames anew when the clock has moved by more than this since they were paired, seconds."""
 
 CLOCK_WINDOW_NS = 5 * NANOSECONDS
@@ -70,10 +70,10 @@ WANDER_PPM = 50.0
 """Standard deviation by which the drift of a clock changes after it was saved, parts per million: quartz follows the
 temperature."""
 
-NO_POSE_AFTER = 8.0
+START_TIMEOUT = 8.0
 """Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
 
-HALF_TURN = 0.5 * np.pi
+JUMP_ANGLE = 0.5 * np.pi
 """A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
 
 FOREIGN_CLOCK = 5.0
@@ -295,7 +295,7 @@ class _Sensor:
         self.movement_since: int | None = None
 
 
-def _clock_from(sensor: _Sensor) -> str:
+def _clock_source(sensor: _Sensor) -> str:
     if sensor.clock_locked:
         return "motion"
     return "saved" if sensor.clock_saved else "receipt"
@@ -375,7 +375,7 @@ class OnlineCalibration:
         self._now = now
         horizon = now - round(self.parameters.settle_time * NANOSECONDS)
         for name, other in self._sensors.items():
-            self._follow(name, other, horizon)
+            self._process(name, other, horizon)
         self._track.forget_before(now - round(self.parameters.history * NANOSECONDS))
         if self._last_step is not None and now - self._last_step < PAIR_PERIOD * NANOSECONDS:
             return []
@@ -391,11 +391,11 @@ class OnlineCalibration:
 
     # --- one sensor
 
-    def _follow(self, name: str, other: _Sensor, horizon: int) -> None:
+    def _process(self, name: str, other: _Sensor, horizon: int) -> None:
         if not other.clock_guessed and not self._guess_clock(name, other):
             return
         if other.received is None:
-            self._receive_clock(name, other, horizon)
+            self._clock_from_receipt(name, other, horizon)
         own_horizon = other.clock.to_sensor(horizon)
         other.track.forget_before(own_horizon - round(self.parameters.history * NANOSECONDS))
         if not other.track.stamps or other.track.stamps[-1] < own_horizon - 2 * NANOSECONDS:
@@ -413,7 +413,7 @@ class OnlineCalibration:
             if other.received is not None and not other.clock_locked:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
-                self._follow_clock(name, other, horizon)
+                self._update_clock(name, other, horizon)
             self._estimate(name, other)
 
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
@@ -432,17 +432,17 @@ class OnlineCalibration:
         elif other.loaded is None:
             other.clock_saved = True  # of this session, whose motion is not to count twice
         else:
-            other.clock = other.clock_expected = self._carried(other.loaded)
+            other.clock = other.clock_expected = self._at_session_start(other.loaded)
             other.clock_saved = other.clock.stddev < RECEIPT_PRIOR
         other.clock_guessed = True
         return True
 
-    def _carried(self, loaded: ClockModel) -> ClockModel:
+    def _at_session_start(self, loaded: ClockModel) -> ClockModel:
         """What a clock of another session says of the beginning of this one."""
         assert self._anchor is not None
         return loaded.carried_to(self._anchor, WANDER_PPM)
 
-    def _receive_clock(self, name: str, other: _Sensor, horizon: int) -> None:
+    def _clock_from_receipt(self, name: str, other: _Sensor, horizon: int) -> None:
         """Better than the guess: the delays over some seconds, of the frames that both sensors took in them."""
         stamps = other.track.stamps
         start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
@@ -465,7 +465,7 @@ class OnlineCalibration:
                 )
             return  # a clock that was calibrated is better, where it has not drifted away since
         if other.clock_saved:
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
         other.loaded = other.clock_expected = None
         other.clock = other.received
         self._pair_anew(other, horizon)
@@ -516,8 +516,8 @@ class OnlineCalibration:
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
-                self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
-        elif self.parameters.method == "robust" and self._moved_enough(other, horizon):
+                self._set_target(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
+        elif self.parameters.method == "robust" and self._can_start_from_movement(other, horizon):
             # Nobody stands still: the movement itself is a start.
             start = registration(other.pairs.pairs())
             if start is not None:
@@ -525,9 +525,9 @@ class OnlineCalibration:
                 other.started = start
 
     @staticmethod
-    def _moved_enough(other: _Sensor, horizon: int) -> bool:
+    def _can_start_from_movement(other: _Sensor, horizon: int) -> bool:
         """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
-        waited = other.received is not None and horizon - other.received.anchor_ns > NO_POSE_AFTER * NANOSECONDS
+        waited = other.received is not None and horizon - other.received.anchor_ns > START_TIMEOUT * NANOSECONDS
         return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
@@ -543,7 +543,7 @@ class OnlineCalibration:
             return
         other.clock_base = replace(other.clock, offset_ns=other.clock.offset_ns + round(found.offset * NANOSECONDS))
         if other.clock_expected is not None and abs(found.offset) > FINE_RANGE:
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
         other.clock_locked = True
         other.movement_since = self._now
         self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
@@ -567,7 +567,7 @@ class OnlineCalibration:
         stamps = np.array(since) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
-    def _not_as_saved(self, name: str, other: _Sensor) -> None:
+    def _drop_saved_clock(self, name: str, other: _Sensor) -> None:
         self.events.append(f"{name}: its clock was set since it was calibrated")
         other.loaded = other.clock_expected = None
 
@@ -578,11 +578,11 @@ class OnlineCalibration:
             return found
         apart = (found.offset_ns - expected.offset_ns_at(found.anchor_ns)) / NANOSECONDS
         if abs(apart) > MOVED_SIGMAS * np.hypot(found.stddev, expected.stddev_at(found.anchor_ns)):
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
             return found
         return fit.solve(expected)
 
-    def _follow_clock(self, name: str, other: _Sensor, horizon: int) -> None:
+    def _update_clock(self, name: str, other: _Sensor, horizon: int) -> None:
         """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
         around = round(2 * FINE_RANGE * NANOSECONDS)
@@ -614,8 +614,8 @@ class OnlineCalibration:
             other.clock_expected, other.clock_base, other.clock_fit = other.clock, other.clock, None
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
-        if abs(moved) > REPAIR_CLOCK:
-            if self._remembers_all(other) and other.paired_until is not None:
+        if abs(moved) > PAIR_AGAIN_CLOCK:
+            if self._covers_all_pairs(other) and other.paired_until is not None:
                 self._pair_anew(other, other.paired_until)
             else:
                 other.pairs.shift_clock(
@@ -641,7 +641,7 @@ class OnlineCalibration:
             self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
         other.estimated = True
         other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, frames=len(pairs))
-        self._aim(other, best.rotation, best.translation, best.centre)
+        self._set_target(other, best.rotation, best.translation, best.centre)
 
     @staticmethod
     def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
@@ -655,7 +655,7 @@ class OnlineCalibration:
             or shift > 0.05 + MOVED_SIGMAS * np.hypot(found.translation_stddev, other.quality.translation_stddev)
         )
 
-    def _remembers_all(self, other: _Sensor) -> bool:
+    def _covers_all_pairs(self, other: _Sensor) -> bool:
         """Whether the raw frames still reach back to the oldest pair."""
         assert self._anchor is not None
         if not len(other.pairs):
@@ -675,9 +675,9 @@ class OnlineCalibration:
             starts.append(opposite)
         return best_estimate(pairs, starts)
 
-    def _aim(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
+    def _set_target(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
         other.target = rotation, translation, centre
-        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > HALF_TURN:
+        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > JUMP_ANGLE:
             other.rotation, other.translation = rotation, translation
             self._changed = True
 
@@ -750,10 +750,10 @@ class OnlineCalibration:
                     # The recording is still here as a whole: measure every window with what is known now.
                     other.clock_fit, other.clock_window_end = None, self._anchor
                     other.clock_base = other.clock
-                    other.clock_expected = None if other.loaded is None else self._carried(other.loaded)
+                    other.clock_expected = None if other.loaded is None else self._at_session_start(other.loaded)
                 if other.clock_locked:
-                    self._follow_clock(name, other, self._now)
-                    if self._remembers_all(other):
+                    self._update_clock(name, other, self._now)
+                    if self._covers_all_pairs(other):
                         self._pair_anew(other, self._now)
                 self._pair(other, self._now)
                 self._estimate(name, other)
@@ -815,7 +815,7 @@ class OnlineCalibration:
     def status(self) -> tuple[int, str, dict[str, object]]:
         """Diagnostic level (0 OK, 1 warning), one line, and values per sensor."""
         values: dict[str, object] = {"reference": self.reference, "method": self.parameters.method}
-        waiting, unsure = [], []
+        waiting, uncertain = [], []
         for name, other in self._sensors.items():
             if other.rotation is None:
                 waiting.append(name)
@@ -823,7 +823,7 @@ class OnlineCalibration:
             quality, clock = other.quality, other.clock
             at_ns = clock.anchor_ns if self._now is None else self._now
             if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
-                unsure.append(name)
+                uncertain.append(name)
             values |= {
                 f"{name} residual_mm": round(1e3 * quality.residual, 1),
                 f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
@@ -831,13 +831,13 @@ class OnlineCalibration:
                 f"{name} clock_offset_s": round(clock.offset_ns_at(at_ns) / NANOSECONDS, 4),
                 f"{name} clock_drift_ppm": round(clock.drift_ppm, 1),
                 f"{name} clock_stddev_ms": round(1e3 * clock.stddev_at(at_ns), 2),
-                f"{name} clock_from": _clock_from(other),
+                f"{name} clock_from": _clock_source(other),
                 f"{name} pairs": len(other.pairs),
                 f"{name} turned_share": round(other.turned, 3),
                 f"{name} late_frames": other.track.late,
             }
         if waiting:
             return 1, f"waiting for a still pose seen by {self.reference} and {', '.join(waiting)}", values
-        if unsure:
-            return 1, f"{', '.join(unsure)}: roughly calibrated, walk about to refine", values
+        if uncertain:
+            return 1, f"{', '.join(uncertain)}: roughly calibrated, walk about to refine", values
         return 0, "calibrated", values

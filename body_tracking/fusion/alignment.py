@@ -120,7 +120,7 @@ class SensorAlignment:
         Returns:
             The same body at its capture time in the reference's clock, with the covariances of
             ``core/measurement.py`` in all directions alike; joints that are not valid, and those of a body half that is
-            seen across what is believed, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
+            seen across what is accepted, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
         """
         source = self._sensors.get(sensor)
         if source is None:
@@ -143,7 +143,7 @@ class SensorAlignment:
         if source.newest is None or stamp > source.newest.stamp_ns:
             source.newest = seen
         self.counters["aligned"] += 1
-        return self._settled(sensor, seen)
+        return self._corrected(sensor, seen)
 
     def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
         """Start anew when a sensor's clock jumped back: the reference's takes the others with it."""
@@ -175,8 +175,8 @@ class SensorAlignment:
         source.ahead &= stamp > reference.stamp_ns + JUMP_BACK_NS
         return not source.ahead and not jumped_back(stamp, reference.stamp_ns)
 
-    def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
-        """The frame with left and right as they are believed from what all sensors see at that time."""
+    def _corrected(self, sensor: str, seen: _Seen) -> Skeleton:
+        """The frame with left and right as they are accepted from what all sensors see at that time."""
         fresh = {
             name: seen if name == sensor else source.newest
             for name, source in self._sensors.items()
@@ -186,9 +186,9 @@ class SensorAlignment:
         frames = [frame for frame in fresh.values() if frame is not None]
         angles, headings = [frame.angle for frame in frames], [frame.headings for frame in frames]
         weights = [frame.weights for frame in frames]
-        believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
+        accepted = self._sides.accepted_headings(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
         points, variance, states = seen.positions, seen.variance, seen.states
-        if halves := reversed_halves(seen.headings, believed):
+        if halves := reversed_halves(seen.headings, accepted):
             points, variance, states = points.copy(), variance.copy(), states.copy()
             swap_left_right(halves, points, variance, states)
         known = np.isfinite(variance)

@@ -30,28 +30,28 @@ TORSO_POINTS = len(_MIDLINE) + len(_LEFT)
 _CONFIRM = round(0.3 * NANOSECONDS)
 """A body that is nobody's becomes a person when it is seen for this long, nanoseconds: ghosts last a few frames."""
 
-_INSIST = round(1.0 * NANOSECONDS)
+_CHANGE_NS = round(1.0 * NANOSECONDS)
 """Who is whom is changed when another assignment has been better for this long, nanoseconds."""
 
 _MARGIN = 0.3
 """... by this many metres in total."""
 
-_SAME = 0.35
+_MERGE_DISTANCE = 0.35
 """Two people nearer than this, whom no sensor sees both, are one, metres: no two torsos are."""
 
-_OWN, _CROSS = 0.08, 0.2
+_OWN_STDDEV, _CROSS_STDDEV = 0.08, 0.2
 """Standard deviation of a torso against the same sensor's last frame, and against another sensor's, metres."""
 
-_GROWTH, _REACH, _FARTHEST = 0.6, 1.2, 2.5
+_GROWTH, _REACH, _MAX_GATE_GROWTH = 0.6, 1.2, 2.5
 """By which the deviation and the gate grow, metres per second, and the most by which the gate does, metres."""
 
-_FADE = 0.7
+_VELOCITY_DECAY = 0.7
 """Time constant with which a velocity fades while a person is not seen, seconds."""
 
-_FASTEST = 3.0
+_MAX_SPEED = 3.0
 """Nobody walks faster in a room, metres per second."""
 
-_NUMBER = 6.0
+_ID_BONUS = 6.0
 """What the sensor's own number is worth, in squared deviations."""
 
 _FRESH = round(0.2 * NANOSECONDS)
@@ -60,7 +60,7 @@ _FRESH = round(0.2 * NANOSECONDS)
 _KEPT, _RECENT = 6, round(0.3 * NANOSECONDS)
 """Sightings of a person by a sensor that are kept, and how old they may be, nanoseconds, for the velocity."""
 
-_LOOK = round(1.0 * NANOSECONDS)
+_CHECK_NS = round(1.0 * NANOSECONDS)
 """One who is alone is looked at this often, nanoseconds."""
 
 GATE = 0.6
@@ -135,7 +135,7 @@ class _Person:
     sightings: dict[str, deque[_Sighting]] = field(default_factory=dict)
     bodies: dict[str, int] = field(default_factory=dict)  # the sensors' own numbers
 
-    def note(self, sensor: str, sighting: _Sighting, body: int) -> None:
+    def record(self, sensor: str, sighting: _Sighting, body: int) -> None:
         """Seen."""
         track = self.sightings.setdefault(sensor, deque(maxlen=_KEPT))
         if track and sighting.stamp_ns <= track[-1].stamp_ns:
@@ -168,8 +168,8 @@ class _Person:
         if not known.any():
             return last.points
         velocity = np.median(moved[known], axis=0) / span
-        velocity *= min(1.0, _FASTEST / max(float(np.linalg.norm(velocity)), 1e-9))
-        carried = math.copysign(_FADE * -math.expm1(-abs(elapsed) / _FADE), elapsed)
+        velocity *= min(1.0, _MAX_SPEED / max(float(np.linalg.norm(velocity)), 1e-9))
+        carried = math.copysign(_VELOCITY_DECAY * -math.expm1(-abs(elapsed) / _VELOCITY_DECAY), elapsed)
         result: FloatArray = last.points + carried * velocity
         return result
 
@@ -190,7 +190,7 @@ class Association:
         # Takes half a second, which only who assigns need pay; at a second person's first frame it would be too late.
         from scipy.optimize import linear_sum_assignment
 
-        self._least_total = linear_sum_assignment
+        self._min_cost_assignment = linear_sum_assignment
         self.counters: Counter[str] = Counter()
         self._hold_ns = round(hold * NANOSECONDS)
         self._number = 0
@@ -201,7 +201,7 @@ class Association:
         self._people: list[_Person] = []
         self._contested: dict[str, int] = {}
         self._alike: dict[tuple[int, int], tuple[int, int]] = {}
-        self._looked: dict[str, int] = {}
+        self._checked: dict[str, int] = {}
 
     def forget_sensor(self, sensor: str) -> None:
         """Forget what one sensor saw, because its time jumped back."""
@@ -209,7 +209,7 @@ class Association:
             person.sightings.pop(sensor, None)
             person.bodies.pop(sensor, None)
         self._contested.pop(sensor, None)
-        self._looked.pop(sensor, None)
+        self._checked.pop(sensor, None)
 
     def move_sensor(self, sensor: str, rotation: FloatArray, translation: FloatArray) -> None:
         """A sensor turned out to stand elsewhere: what it saw is there too.
@@ -242,21 +242,21 @@ class Association:
     def alone(self, sensor: str, stamp_ns: int, body: int) -> int | None:
         """The number of the only person, where a sensor's only body can be nobody else and no look is due.
 
-        Whoever asks tells of the frame later, by :meth:`note`.
+        Whoever asks tells of the frame later, by :meth:`record`.
         """
-        if len(self._people) != 1 or stamp_ns - self._looked.get(sensor, -_LOOK) >= _LOOK:
+        if len(self._people) != 1 or stamp_ns - self._checked.get(sensor, -_CHECK_NS) >= _CHECK_NS:
             return None
         (person,) = self._people
         return person.number if person.confirmed and person.bodies.get(sensor) == body else None
 
-    def note(self, sensor: str, seen: Sequence[tuple[int, FloatArray]], body: int) -> None:
+    def record(self, sensor: str, seen: Sequence[tuple[int, FloatArray]], body: int) -> None:
         """What a sensor saw last of the only person, as (stamp, (25, 3) metres in world) in the order of the stamps."""
         (person,) = self._people
         person.sightings.pop(sensor, None)
         for (stamp_ns, _), points in zip(
             seen, torso_points(np.stack([positions for _, positions in seen])), strict=True
         ):
-            person.note(sensor, _Sighting(stamp_ns, points), body)
+            person.record(sensor, _Sighting(stamp_ns, points), body)
 
     def assign(self, sensor: str, bodies: Sequence[Skeleton]) -> tuple[int | None, ...]:
         """Who the bodies of one frame of one sensor are.
@@ -272,13 +272,13 @@ class Association:
         if not bodies:
             return ()
         stamp_ns = bodies[0].stamp_ns
-        self._forget_the_lost(stamp_ns)
+        self._drop_lost(stamp_ns)
         points = torso_points(np.stack([body.positions for body in bodies]))
         numbers = [body.body for body in bodies]
-        self._looked[sensor] = stamp_ns
+        self._checked[sensor] = stamp_ns
         whose = self._assignment(sensor, stamp_ns, points, numbers)
         if len(self._people) > 1:
-            whose = self._reconsidered(sensor, stamp_ns, points, whose)
+            whose = self._corrected(sensor, stamp_ns, points, whose)
         beginning = not any(person.confirmed for person in self._people)
         # in the order of the sensor's numbers, whatever order they come in
         for index in sorted(range(len(bodies)), key=lambda each: numbers[each]):
@@ -293,7 +293,7 @@ class Association:
             person = known
             before = person.bodies.get(sensor)
             self.counters["renumbered"] += before is not None and before != numbers[index]
-            person.note(sensor, _Sighting(stamp_ns, points[index]), numbers[index])
+            person.record(sensor, _Sighting(stamp_ns, points[index]), numbers[index])
             if not person.confirmed and (beginning or stamp_ns - person.since_ns >= _CONFIRM):
                 person.confirmed = True
                 self.counters["new"] += 1
@@ -301,7 +301,7 @@ class Association:
             self._merge(sensor, stamp_ns, whose)
         return tuple(person.number if person is not None and person.confirmed else None for person in whose)
 
-    def _forget_the_lost(self, stamp_ns: int) -> None:
+    def _drop_lost(self, stamp_ns: int) -> None:
         kept = []
         for person in self._people:
             if stamp_ns - person.seen_ns <= (self._hold_ns if person.confirmed else _CONFIRM):
@@ -321,27 +321,33 @@ class Association:
         expected, stddev, gate = [], [], []
         for person in people:
             other = person.by_others(sensor, stamp_ns)
-            own = _GROWTH * person.age_ns(sensor, stamp_ns) / NANOSECONDS + _OWN
-            cross = math.inf if other is None else _GROWTH * person.age_ns(other, stamp_ns) / NANOSECONDS + _CROSS
-            by, spread, least = (sensor, own, _OWN) if other is None or own <= cross else (other, cross, _CROSS)
+            own = _GROWTH * person.age_ns(sensor, stamp_ns) / NANOSECONDS + _OWN_STDDEV
+            cross = (
+                math.inf if other is None else _GROWTH * person.age_ns(other, stamp_ns) / NANOSECONDS + _CROSS_STDDEV
+            )
+            by, spread, least = (
+                (sensor, own, _OWN_STDDEV) if other is None or own <= cross else (other, cross, _CROSS_STDDEV)
+            )
             expected.append(person.expected(by, stamp_ns))
             stddev.append(spread)
-            gate.append(GATE + min(_REACH / _GROWTH * (spread - least), _FARTHEST))
+            gate.append(GATE + min(_REACH / _GROWTH * (spread - least), _MAX_GATE_GROWTH))
         distances = torso_distances(np.stack(expected), points)
         spread_of = np.array(stddev)[:, None]
         # people move in the plane: two dimensions of likelihood
-        costs = (distances / spread_of) ** 2 + 4.0 * np.log(spread_of / _OWN)
-        costs -= _NUMBER * np.array([[person.bodies.get(sensor) == number for number in numbers] for person in people])
+        costs = (distances / spread_of) ** 2 + 4.0 * np.log(spread_of / _OWN_STDDEV)
+        costs -= _ID_BONUS * np.array(
+            [[person.bodies.get(sensor) == number for number in numbers] for person in people]
+        )
         costs[~(distances <= np.array(gate)[:, None])] = _IMPOSSIBLE
         rows: IntArray
         columns: IntArray
-        rows, columns = self._least_total(costs)
+        rows, columns = self._min_cost_assignment(costs)
         for row, column in zip(rows, columns, strict=True):
             if costs[row, column] < _IMPOSSIBLE:
                 whose[column] = people[row]
         return whose
 
-    def _reconsidered(
+    def _corrected(
         self, sensor: str, stamp_ns: int, points: FloatArray, whose: list[_Person | None]
     ) -> list[_Person | None]:
         """The same, or, where other sensors have said for long that it is otherwise, what they say."""
@@ -359,11 +365,11 @@ class Association:
         expected = np.stack([person.expected(other, stamp_ns) for person, other in present])
         distances = np.minimum(torso_distances(expected, points[columns]), 2.0 * GATE)
         now = distances[list(mine.values()), range(len(columns))].sum()
-        rows, chosen = self._least_total(distances)
+        rows, chosen = self._min_cost_assignment(distances)
         if now - distances[rows, chosen].sum() <= _MARGIN:
             self._contested.pop(sensor, None)
             return whose
-        if stamp_ns - self._contested.setdefault(sensor, stamp_ns) < _INSIST:
+        if stamp_ns - self._contested.setdefault(sensor, stamp_ns) < _CHANGE_NS:
             return whose
         del self._contested[sensor]
         changed = list(whose)
@@ -385,14 +391,14 @@ class Association:
             older, newer = sorted((one, other), key=lambda person: person.number)
             pair = older.number, newer.number
             here = one.sightings[sensor][-1].points[None]
-            if torso_distances(here, other.expected(by, stamp_ns)[None])[0, 0] > _SAME:
+            if torso_distances(here, other.expected(by, stamp_ns)[None])[0, 0] > _MERGE_DISTANCE:
                 self._alike.pop(pair, None)
                 continue
             since, until = self._alike.get(pair, (stamp_ns, stamp_ns))
-            if stamp_ns - until > _INSIST:  # not looked at for long
+            if stamp_ns - until > _CHANGE_NS:  # not looked at for long
                 since = stamp_ns
             self._alike[pair] = since, stamp_ns
-            if stamp_ns - since < _INSIST:
+            if stamp_ns - since < _CHANGE_NS:
                 continue
             for name, track in newer.sightings.items():
                 if name not in older.sightings or track[-1].stamp_ns > older.sightings[name][-1].stamp_ns:
@@ -411,7 +417,7 @@ class Association:
         """Those in a frame, each with those of whom only another sensor tells, and that sensor."""
         for one in whose:
             for other in self._people:
-                if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _INSIST:
+                if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _CHANGE_NS:
                     continue
                 by = other.by_others(sensor, stamp_ns)
                 # a sensor that sees both sees that they are two

@@ -31,7 +31,7 @@ from body_tracking.fusion.weights import thesis_formula, thesis_text
 
 WORLD = "world"
 
-FASTEST = 8.0
+MAX_SPEED = 8.0
 """No joint moves faster than this along an axis, metres per second."""
 
 SMOOTHING = 0.1
@@ -308,7 +308,7 @@ class Fusion:
             share = 1.0 - math.exp(-step / SMOOTHING)
             change = (positions - last.positions) / step
             velocities = last.velocities + share * (change - last.velocities)
-            fast = ~(np.abs(change).max(axis=1) < FASTEST)  # and NaN; a label that jumps is faster than a limb
+            fast = ~(np.abs(change).max(axis=1) < MAX_SPEED)  # and NaN; a label that jumps is faster than a limb
             if fast.any():
                 velocities[fast] = 0.0
             since = last.since_ns
@@ -321,7 +321,7 @@ class Fusion:
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
         if step < self.parameters.silence:
-            source.rhythm.note(step)
+            source.rhythm.add(step)
 
     def poll(self, now_ns: int) -> list[Skeleton]:
         """The fused skeletons that need wait no longer.
@@ -333,21 +333,21 @@ class Fusion:
         while self._pending:
             stamp, other, deadline = self._pending[0]
             # The beat is the reference's; another's frame is answered only when that has been silent for a while.
-            if other and stamp - self._beat(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
+            if other and stamp - self._last_output(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
                 del self._pending[0]
                 continue
             due = self._due(stamp)
             if now_ns < deadline and any(rhythm.worth_waiting for rhythm in due):
                 break
             for source in self._sensors.values():
-                source.rhythm.answered(came=source.rhythm not in due)
+                source.rhythm.record(arrived=source.rhythm not in due)
             del self._pending[0]
             skeleton = self._fuse(stamp)
             if skeleton is not None:
                 fused.append(skeleton)
         return fused
 
-    def _beat(self, stamp: int) -> int:
+    def _last_output(self, stamp: int) -> int:
         """When the last output was, or, at the start, when somebody was first seen."""
         if self._last_ns is not None:
             return self._last_ns
@@ -417,17 +417,17 @@ class Fusion:
         # What moves between a sensor's capture and the output's is not known better than this.
         variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
         angles = [frame.angle for frame in frames]
-        as_believed = self._sides.settle(stamp, names, angles, points, variance, states, self.counters)
-        weights = self._gated(stamp, names, points, variance, as_believed)
+        heading_agrees = self._sides.correct(stamp, names, angles, points, variance, states, self.counters)
+        weights = self._gated(stamp, names, points, variance, heading_agrees)
         if min(shares) < 1.0:
             weights *= np.array(shares)[:, None]
         fused = self._combined(stamp, body, points, variance, weights, states)
-        fused = self._sides.turn_gently(stamp, fused, self.counters)
+        fused = self._sides.limit_turn_rate(stamp, fused, self.counters)
         self._follow(stamp, fused.positions)
         return fused
 
     def _gated(
-        self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray, as_believed: BoolArray
+        self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray, heading_agrees: BoolArray
     ) -> FloatArray:
         """(k, 25) weights: the inverse variances, less for joints away from their prediction, none beyond the gate."""
         # A joint that is nowhere has an infinite variance; one without a recent past has an infinite prediction error.
@@ -439,13 +439,13 @@ class Fusion:
         squared = np.einsum("kji,kji->kj", away, away) / (variance + spread)
         far = squared > self.parameters.gate**2  # False for NaN
         if far.any() or self._rejecting:
-            self._judge(stamp, names, far)
+            self._readmit(stamp, names, far)
         # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those with the
         # believed heading are not gated: a prediction does not know yet that the body turned.
         for half, (pair, (least, most)) in enumerate(zip(PAIRS, _WIDTHS, strict=True)):
             far[:, pair] |= far[:, pair[::-1]]
             width = np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1)
-            turned = np.flatnonzero(as_believed[:, half] & (least < width) & (width < most))
+            turned = np.flatnonzero(heading_agrees[:, half] & (least < width) & (width < most))
             far[turned[:, None], pair] = False
             squared[turned[:, None], pair] = 0.0
         weights /= 1.0 + squared / 4.0
@@ -453,7 +453,7 @@ class Fusion:
         self.counters["gated_joints"] += int(np.count_nonzero(far))
         return weights
 
-    def _judge(self, stamp: int, names: list[str], far: BoolArray) -> None:
+    def _readmit(self, stamp: int, names: list[str], far: BoolArray) -> None:
         """Believe, in place, a sensor again that has insisted on a rejected joint for long enough."""
         for index, name in enumerate(names):
             since = self._rejected_since[name]

@@ -93,7 +93,7 @@ class Ordering:
             source = self._sources[sensor]
         if source.newest_ns is None or stamp_ns > source.newest_ns:
             if source.newest_ns is not None and (step := stamp_ns - source.newest_ns) < JUMP_BACK_NS:
-                source.rhythm.note(step / NANOSECONDS)
+                source.rhythm.add(step / NANOSECONDS)
             source.newest_ns = stamp_ns
         self._arrived += 1
         insort(self._waiting, _Waiting(stamp_ns, self._arrived, now_ns + self._wait_ns, sensor, skeleton))
@@ -115,7 +115,7 @@ class Ordering:
             if self._left_ns is None or first.stamp_ns >= self._left_ns:
                 self._left_ns = first.stamp_ns
                 for source in self._sources.values():
-                    source.rhythm.answered(came=source.rhythm not in due)
+                    source.rhythm.record(arrived=source.rhythm not in due)
             self.counters["in vain"] += waited and bool(due) and self._wait_ns > 0
             del self._waiting[0]
             ready.append((first.sensor, first.skeleton))

@@ -184,7 +184,7 @@ class People:
             if alone is not None and self._number(alone) is not None:
                 source.pending.append((stamp_ns, pose, seen[0]))
                 return [(1 if one else self._slots.of[alone], seen[0])]
-        self._tell_pending()
+        self._record_pending()
         if source.used is not None and source.used is not pose:
             turned = pose.rotation @ source.used.rotation.T
             self._association.move_sensor(sensor, turned, pose.translation - turned @ source.used.translation)
@@ -239,13 +239,13 @@ class People:
         source.ahead &= stamp_ns > reference_ns + JUMP_BACK_NS
         return not source.ahead and not jumped_back(stamp_ns, reference_ns)
 
-    def _tell_pending(self) -> None:
+    def _record_pending(self) -> None:
         """Tell the association what sensors saw of one who was alone."""
         for sensor, source in self._sensors.items():
             if source.pending:
                 ends = (source.pending[0], source.pending[-1])[2 - min(2, len(source.pending)) :]
                 seen = [(stamp_ns, _points(body, pose)) for stamp_ns, pose, body in ends]
-                self._association.note(sensor, seen, ends[-1][2].body)
+                self._association.record(sensor, seen, ends[-1][2].body)
                 source.used = ends[-1][1]
                 source.pending.clear()
 

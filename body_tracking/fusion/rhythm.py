@@ -24,9 +24,9 @@ class Rhythm:
     def __init__(self) -> None:
         self._steps: deque[float] = deque(maxlen=7)
         self.period = _USUAL
-        self._in_vain = 0  # outputs in a row for which its frame was due and did not come in time
+        self._missed = 0  # outputs in a row for which its frame was due and did not come in time
 
-    def note(self, step: float) -> None:
+    def add(self, step: float) -> None:
         """A frame was captured so many seconds after the one before."""
         self._steps.append(step)
         self.period = sorted(self._steps)[len(self._steps) // 2]
@@ -40,11 +40,11 @@ class Rhythm:
         """
         return 0.0 < age < silence and age > self.period - DUE_MARGIN
 
-    def answered(self, *, came: bool) -> None:
+    def record(self, *, arrived: bool) -> None:
         """What waited goes on, with this sensor's frame or without it."""
-        self._in_vain = 0 if came else self._in_vain + 1
+        self._missed = 0 if arrived else self._missed + 1
 
     @property
     def worth_waiting(self) -> bool:
         """Whether a frame that is due can be hoped for."""
-        return self._in_vain < PATIENCE
+        return self._missed < PATIENCE

@@ -23,7 +23,7 @@ from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skel
 _CLOSE = math.sqrt(0.5)
 """Cosine between the headings that two sensors see above which they agree."""
 
-_SURE = math.cos(math.radians(30.0))
+_AGREES = math.cos(math.radians(30.0))
 """Cosine of the angle to the believed line from which on an axis is as it is believed to be."""
 
 HEADING_DRIFT = 1.6
@@ -47,7 +47,7 @@ VIEW_KEPT = round(0.5 * NANOSECONDS)
 HOLD = 10.0
 """A reversal that all sensors see at once is not believed for this long, seconds ..."""
 
-LEAST_HOLD = 1.0
+MIN_HOLD = 1.0
 """... or for this long where what it contradicts may be as wrong."""
 
 TURN_RATE = 8.0
@@ -127,7 +127,7 @@ class Sides:
 
     def __init__(self, hold: float = HOLD) -> None:
         self._hold_ns = round(hold * NANOSECONDS)
-        self._least_ns = min(round(LEAST_HOLD * NANOSECONDS), self._hold_ns)
+        self._least_ns = min(round(MIN_HOLD * NANOSECONDS), self._hold_ns)
         self.reset()
 
     def reset(self) -> None:
@@ -144,7 +144,7 @@ class Sides:
         self._seen: dict[tuple[str, int], tuple[float, float, int]] = {}
         self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
 
-    def settle(
+    def correct(
         self,
         stamp: int,
         names: Sequence[str],
@@ -178,14 +178,14 @@ class Sides:
                 weights[index][half] = 0.0
                 variance[index, HALVES[half]] = np.inf
                 counters["jumped"] += 1
-        believed = self.believed(stamp, names, angles, headings, weights, counters)
+        accepted = self.accepted_headings(stamp, names, angles, headings, weights, counters)
         for index, found in enumerate(headings):
-            halves = reversed_halves(found, believed)
+            halves = reversed_halves(found, accepted)
             swap_left_right(halves, points[index], variance[index], states[index])
             for _, opposite in halves:
                 counters["repaired" if opposite else "turned"] += 1
-        lines = [[abs(math.cos(a - b)) for a, b in zip(found, believed, strict=True)] for found in headings]
-        return np.array(lines) > _SURE
+        lines = [[abs(math.cos(a - b)) for a, b in zip(found, accepted, strict=True)] for found in headings]
+        return np.array(lines) > _AGREES
 
     def _jumped(self, stamp: int, name: str, headings: Sequence[float], points: FloatArray) -> list[int]:
         """The halves of a body of which one sensor sees one end elsewhere at once: another heading, another width."""
@@ -202,7 +202,7 @@ class Sides:
                 self._seen[name, half] = heading, width, stamp
         return jumped
 
-    def believed(
+    def accepted_headings(
         self,
         stamp: int,
         names: Sequence[str],
@@ -242,7 +242,7 @@ class Sides:
             for half in self._halves:
                 half.predict((stamp - self._headings_ns) / NANOSECONDS)
             senses = {index: self._sense(headings[index], weights[index]) for index in known}
-            if self._reversal_believed(stamp, leading, senses, angles[leading]):
+            if self._reversal_accepted(stamp, leading, senses, angles[leading]):
                 counters["reversals_accepted"] += 1
                 for half in self._halves:
                     half.angle += math.pi
@@ -270,7 +270,7 @@ class Sides:
         self._halves = [_Heading(heading) for heading in headings]
         if math.cos(headings[0] - headings[1]) < 0.0:
             self._halves[int(weights[0] > weights[1])].angle += math.pi
-        self._known_since, self._reversed_since = self._credited(stamp, angle), None
+        self._known_since, self._reversed_since = self._known_from(stamp, angle), None
 
     def _sense(self, headings: Sequence[float], weights: Sequence[float]) -> float:
         """1 where a sensor sees a body as it is taken to stand, -1 where reversed; the mean of both halves."""
@@ -314,7 +314,7 @@ class Sides:
             return better
         return leading
 
-    def _reversal_believed(self, stamp: int, leading: int, senses: Mapping[int, float], angle: float) -> bool:
+    def _reversal_accepted(self, stamp: int, leading: int, senses: Mapping[int, float], angle: float) -> bool:
         """Whether the body stands the other way round than it was taken to, since the trusted sensor sees it reversed.
 
         Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
@@ -334,14 +334,14 @@ class Sides:
             since = self._reversed_since = stamp
         if stamp - since <= min(max(since - self._known_since, self._least_ns), self._hold_ns):
             return False
-        self._known_since, self._reversed_since = self._credited(since, angle), None
+        self._known_since, self._reversed_since = self._known_from(since, angle), None
         return True
 
-    def _credited(self, stamp: int, angle: float) -> int:
+    def _known_from(self, stamp: int, angle: float) -> int:
         """Since when a body counts as known that a sensor sees from a time on, under an angle."""
         return stamp - self._hold_ns if angle < math.pi / 2 else stamp
 
-    def turn_gently(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
+    def limit_turn_rate(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
         """Turn shoulders and hips, with arms and legs, no faster than a person can.
 
         When the believed sensors change their mind at once about which way a body faces, the output follows them on

@@ -43,7 +43,7 @@ from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
 
-ANYWHERE = np.pi / np.sqrt(3.0)
+UNIFORM_STDDEV = np.pi / np.sqrt(3.0)
 """Radians: the standard deviation of an angle that may be anything, near a singular pose."""
 _ROUNDING = 1e-9
 _X, _Y, _Z = np.eye(3)
@@ -194,7 +194,7 @@ class Convention:
             names=self.names,
             position=values[self.rows],
             velocity=_times(rate_gradient, estimate.velocity[joint]),
-            position_stddev=np.where(lost_angle, np.inf, np.minimum(stddev, ANYWHERE)),
+            position_stddev=np.where(lost_angle, np.inf, np.minimum(stddev, UNIFORM_STDDEV)),
             # what says nothing of an angle says nothing of its rate
             velocity_stddev=np.where(lost_angle, np.inf, velocity_stddev),
         )

@@ -32,9 +32,9 @@ HELD, FREE = 2.5, 5.0
 The first is where the standard deviation of the outer angles stops to be infinite; noise alone exceeds it in one frame
 of twenty. Between the two the first angle turns by a share of what the rotation says.
 """
-LEAST_HOLD = np.radians(0.1)
+MIN_HOLD = np.radians(0.1)
 """Radians: a rotation is never taken for better known than that, so that rounding errors decide no angle."""
-GREATEST_HOLD = np.radians(4.0)
+MAX_HOLD = np.radians(4.0)
 """Radians: nor for worse: 20 deg away from a singular pose even a rotation that nothing observes has its own angles."""
 MARGIN = np.radians(60.0)
 """Radians by which an angle may leave its usual range for the sake of continuity, before it jumps back.
@@ -112,7 +112,7 @@ class EulerSequences:
         y, z = r[:, 1, 0], r[:, 2, 0]
         distance = np.sqrt(y * y + z * z)
         tilt = (self._tilt * variances).sum(axis=-1)
-        doubt = np.sqrt(np.minimum(np.maximum(tilt, LEAST_HOLD**2), GREATEST_HOLD**2))
+        doubt = np.sqrt(np.minimum(np.maximum(tilt, MIN_HOLD**2), MAX_HOLD**2))
         x = np.minimum(np.maximum((distance / doubt - HELD) / (FREE - HELD), 0.0), 1.0)
         hold = 1.0 - x * x * (3.0 - 2.0 * x)
 

@@ -91,9 +91,9 @@ class PosturePrior:
     def __init__(self, model: UpperBody, ranges: Ranges) -> None:
         names = [name.removesuffix("_left").removesuffix("_right") for name in model.coordinate_names[6:]]
         self.postural: BoolArray = np.array([name in STDDEV for name in names])
-        told = np.radians([STDDEV.get(name, 0.0) for name in names])
+        postural = np.radians([STDDEV.get(name, 0.0) for name in names])
         self.mean: FloatArray = np.where(self.postural, 0.0, ranges.centre)
-        self.stddev: FloatArray = np.where(self.postural, told, ranges.stddev)
+        self.stddev: FloatArray = np.where(self.postural, postural, ranges.stddev)
         self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
         self._ranges = ranges
 
@@ -115,8 +115,8 @@ class PosturePrior:
     @staticmethod
     def tilt_of(rotation: FloatArray) -> FloatArray:
         """(..., 2) sines of the lean of a pelvis forward and to the left, of its rotations (..., 3, 3)."""
-        ways = _ways(rotation)
-        values: FloatArray = (ways @ rotation[..., :, 2:])[..., 0]
+        axes = _horizontal_axes(rotation)
+        values: FloatArray = (axes @ rotation[..., :, 2:])[..., 0]
         return values
 
     @staticmethod
@@ -127,17 +127,17 @@ class PosturePrior:
             lines: of the model there.
         """
         rotation, turning = lines.posture.rotations[0], lines.rotation_jacobian[0]
-        ways = _ways(rotation)
-        forward, left = ways @ rotation[:, 2]
-        gradients: FloatArray = ways @ so3.skew(-rotation[:, 2]) @ turning
-        # both ways turn with the heading
+        axes = _horizontal_axes(rotation)
+        forward, left = axes @ rotation[:, 2]
+        gradients: FloatArray = axes @ so3.skew(-rotation[:, 2]) @ turning
+        # both axes turn with the heading
         size = max(float(np.hypot(rotation[0, 1], rotation[1, 1])), _VERTICAL)
-        heading = (-ways[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
+        heading = (-axes[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
         gradients += np.outer([left, -forward], heading)
         return Tilt(np.array([forward, left]), gradients)
 
 
-def _ways(rotation: FloatArray) -> FloatArray:
+def _horizontal_axes(rotation: FloatArray) -> FloatArray:
     """(..., 2, 3) horizontal unit vectors: where a pelvis of rotation (..., 3, 3) faces, and to its left."""
     x, y = rotation[..., 0, 1], rotation[..., 1, 1]
     size = np.maximum(np.hypot(x, y), _VERTICAL)

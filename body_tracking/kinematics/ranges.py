@@ -164,7 +164,7 @@ class Ranges:
         """
         return self.excess_of(self.values(q))
 
-    def surely_within(self, q: FloatArray, margin: float) -> bool:
+    def certainly_within(self, q: FloatArray, margin: float) -> bool:
         """Whether a configuration (nq,) is quickly seen to leave no range by more than a margin, radians."""
         angles = q[self._model.scalar_q]
         outside = np.abs(angles - self._scalar_middle) > self._scalar_reach + margin

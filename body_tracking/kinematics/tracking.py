@@ -40,11 +40,11 @@ def angle_names(name: str) -> tuple[str, ...]:
 
 _GAP_NS = NANOSECONDS // 2
 """After longer than this the last pose is no better a start than none."""
-_POOR = 4.0
+_POOR_FIT = 4.0
 """Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
 _STEPS, _TOLERANCE = 4, 2e-3
 """Of a fit that starts from the frame before: at most so many steps, until one is smaller than this, rad and m."""
-_GREATEST_RATE = 10.0
+_MAX_RATE = 10.0
 """rad/s and m/s: standard deviation of a rate of which nothing is known."""
 _TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
 
@@ -131,7 +131,7 @@ class SkeletonFit:
             moved = np.where(np.isfinite(self._last.velocity), elapsed * self._last.velocity, 0.0)
             start = self.model.integrate(self._last.q, moved)
             fit = self._inverse.solve(positions, stddev, lengths, start, max_iterations=_STEPS, tolerance=_TOLERANCE)
-            if fit.cost > _POOR * 3.0 * np.count_nonzero(measured):
+            if fit.cost > _POOR_FIT * 3.0 * np.count_nonzero(measured):
                 self.counters["poor fits"] += 1
                 anew = self._inverse.solve(positions, stddev, lengths)
                 fit = anew if anew.cost < fit.cost else fit
@@ -153,7 +153,7 @@ class SkeletonFit:
         jacobian = self.model.linearise(q, self.lengths.lengths).jacobian.reshape(-1, nv)
         weighted = jacobian * weights[:, None]
         information = weighted.T @ jacobian
-        information[np.arange(nv), np.arange(nv)] += _GREATEST_RATE**-2
+        information[np.arange(nv), np.arange(nv)] += _MAX_RATE**-2
         covariance = np.linalg.inv(information).astype(np.float64)
         velocity = covariance @ (weighted.T @ np.where(known[:, None], velocities, 0.0).reshape(-1))
         return velocity, covariance
@@ -192,7 +192,7 @@ class AngleStream:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
         if self.convention == POSITIONAL:
             return positional_angles(skeleton)
-        self._forget_who_is_gone(skeleton.stamp_ns)
+        self._reset_after_gap(skeleton.stamp_ns)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)
 
@@ -202,12 +202,12 @@ class AngleStream:
         Raises:
             ConventionError: the convention is made of positions.
         """
-        self._forget_who_is_gone(estimate.stamp_ns)
+        self._reset_after_gap(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)
         self._previous = angles
         return angles
 
-    def _forget_who_is_gone(self, stamp_ns: int) -> None:
+    def _reset_after_gap(self, stamp_ns: int) -> None:
         if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:
             self.reset()
 
@@ -227,21 +227,21 @@ class LengthChanges:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._told: FloatArray | None = None
-        self._told_ns = 0
+        self._published: FloatArray | None = None
+        self._published_ns = 0
         self._before: FloatArray | None = None
 
-    def news(self, stamp_ns: int, lengths: FloatArray) -> bool:
+    def due(self, stamp_ns: int, lengths: FloatArray) -> bool:
         """Whether to tell these (n,) lengths, metres, of this capture time; if so, they count as told."""
         settled = self._before is not None and np.array_equal(self._before, lengths)
         self._before = lengths
-        if self._told is not None:
-            if 0 <= stamp_ns - self._told_ns < self._period_ns:
+        if self._published is not None:
+            if 0 <= stamp_ns - self._published_ns < self._period_ns:
                 return False
-            change = float(np.abs(lengths - self._told).max())
+            change = float(np.abs(lengths - self._published).max())
             if change <= self._tolerance and not (settled and change > 0.0):
                 return False
-        self._told, self._told_ns = lengths, stamp_ns
+        self._published, self._published_ns = lengths, stamp_ns
         return True
 
 

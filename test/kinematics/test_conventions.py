@@ -14,8 +14,8 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.conventions import (
-    ANYWHERE,
     CONVENTIONS,
+    UNIFORM_STDDEV,
     ConventionError,
     angles_of,
     segment_quaternions,
@@ -303,7 +303,7 @@ def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> N
         first, middle, last = (angles.names.index(key) for key in OUTER[name])
         deviations = angles.position_stddev
         assert deviations[middle] < 5.0 * stddev
-        assert max(deviations[first], deviations[last]) <= ANYWHERE and np.isfinite(angles.velocity_stddev[first])
+        assert max(deviations[first], deviations[last]) <= UNIFORM_STDDEV and np.isfinite(angles.velocity_stddev[first])
         assert deviations[first] > before or away == 0.0
         assert (deviations[first] > 30.0 * stddev) == (away < 2.0)
         before = deviations[first]

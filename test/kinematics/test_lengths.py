@@ -28,14 +28,14 @@ BASE = BASE_STDDEV[POINTS] ** 2
 ARM = [LENGTHS.index(name) for name in ("upper_arm_left", "forearm_left", "hand_left")]
 
 
-def somebody(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def moving_person(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (n,), points (n, 19, 3) and lengths (21,)."""
     rng = np.random.default_rng(seed)
     truth = truth_of(RandomPerson.draw(rng), RandomMotion(rng, seconds), capture_times(seconds, rng, rate))
     return truth.times, truth.positions, truth.lengths
 
 
-def learnt(
+def gathered(
     times: FloatArray,
     points: FloatArray,
     white: float = 0.0,
@@ -48,19 +48,21 @@ def learnt(
     seen = SegmentLengths()
     for k, (time, frame) in enumerate(zip(times, points, strict=True)):
         variance = BASE if model is None else model[k]
-        seen = seen.seen("", round(time * NANOSECONDS), frame, tracked, np.full(len(POINTS), white**2), variance, slow)
+        seen = seen.with_frame(
+            "", round(time * NANOSECONDS), frame, tracked, np.full(len(POINTS), white**2), variance, slow
+        )
     return seen
 
 
 def estimated(*args: FloatArray, **kwargs: float) -> LengthEstimate:
-    return learnt(*args, **kwargs).estimate()  # type: ignore[arg-type]
+    return gathered(*args, **kwargs).estimate()  # type: ignore[arg-type]
 
 
 def stddev(estimate: LengthEstimate) -> FloatArray:
     return np.sqrt(estimate.covariance.diagonal())
 
 
-def lasting(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
+def correlated_noise(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
     """(n, size) deviates of unit variance that last (Ornstein-Uhlenbeck)."""
     kept = np.exp(-np.diff(times) / persistence)
     found = np.empty((len(times), size))
@@ -72,7 +74,7 @@ def lasting(times: FloatArray, rng: np.random.Generator, persistence: float, siz
 
 def test_of_perfect_points_the_lengths_are_exact() -> None:
     for seed in range(5):
-        times, points, lengths = somebody(seed, 4.0)
+        times, points, lengths = moving_person(seed, 4.0)
         assert_allclose(estimated(times, points).lengths, lengths, rtol=0.0, atol=1e-6)
 
 
@@ -80,7 +82,7 @@ def test_of_perfect_points_the_lengths_are_exact() -> None:
 @given(seed=st.integers(0, 10_000))
 def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    times, points, _ = somebody(3, 4.0, rate=10.0)
+    times, points, _ = moving_person(3, 4.0, rate=10.0)
     points = points + rng.normal(scale=0.01, size=points.shape)
     turned = Rotation.random(random_state=rng).apply(points.reshape(-1, 3)).reshape(points.shape) + rng.normal(size=3)
     one, two = estimated(times, points, 0.01), estimated(times, turned, 0.01)
@@ -89,7 +91,7 @@ def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
 
 
 def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
-    for seen in (SegmentLengths(), learnt(*somebody(0, 4.0)[:2], tracked=~EVERY)):
+    for seen in (SegmentLengths(), gathered(*moving_person(0, 4.0)[:2], tracked=~EVERY)):
         estimate = seen.estimate()
         assert_allclose(estimate.lengths, MODEL.default_lengths())
         assert_allclose(estimate.covariance, proportions())
@@ -99,7 +101,7 @@ def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
 
 
 def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
-    times, points, lengths = somebody(4, 10.0)
+    times, points, lengths = moving_person(4, 10.0)
     hidden = np.isin(POINTS, [Joint[f"{name}_LEFT"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")])
     estimate = estimated(times, points, tracked=~hidden)
     assert (np.abs(estimate.lengths - lengths)[ARM] < 3.0 * stddev(estimate)[ARM]).all()
@@ -113,7 +115,7 @@ def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
 def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
     off, normalised = [], []
     for seed in range(12):
-        times, points, lengths = somebody(seed, 12.0)
+        times, points, lengths = moving_person(seed, 12.0)
         rng = np.random.default_rng(seed)
         estimate = estimated(times, points + rng.normal(scale=noise, size=points.shape), noise)
         off.append(estimate.lengths - lengths)
@@ -123,7 +125,7 @@ def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
 
 
 def test_the_more_frames_the_surer_as_long_as_the_noise_is_white() -> None:
-    times, points, _ = somebody(5, 32.0)
+    times, points, _ = moving_person(5, 32.0)
     points = points + np.random.default_rng(5).normal(scale=0.02, size=points.shape)
     short, long = (stddev(estimated(times[times < end], points[times < end], 0.02)) for end in (8.0, 32.0))
     assert np.median(long / short) < 0.7  # half, as variances fall with the time
@@ -134,8 +136,8 @@ def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out(
     normalised, as_if_new = [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        times, points, _ = somebody(seed, 60.0, rate=15.0)
-        wrong = 0.02 * lasting(times, rng, 3.0, points[0].size).reshape(points.shape)
+        times, points, _ = moving_person(seed, 60.0, rate=15.0)
+        wrong = 0.02 * correlated_noise(times, rng, 3.0, points[0].size).reshape(points.shape)
         points = points + wrong + rng.normal(scale=0.003, size=points.shape)
         first = times < 30.0
         halves = [estimated(times[part], points[part], 0.003) for part in (first, ~first)]
@@ -147,7 +149,7 @@ def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out(
 
 
 def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
-    times, points, lengths = somebody(6, 20.0)
+    times, points, lengths = moving_person(6, 20.0)
     rng = np.random.default_rng(6)
     points = points + rng.normal(scale=0.01, size=points.shape)
     good = estimated(times, points, 0.01)
@@ -162,7 +164,7 @@ def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
 
 
 def test_seconds_seen_badly_count_less() -> None:
-    times, points, lengths = somebody(7, 20.0)
+    times, points, lengths = moving_person(7, 20.0)
     late = times >= 10.0
     points = points + np.random.default_rng(7).normal(scale=0.003, size=points.shape)
     points[late] *= 1.1
@@ -175,46 +177,46 @@ def test_seconds_seen_badly_count_less() -> None:
 
 
 def test_stated_slow_errors_keep_a_few_seconds_from_being_sure() -> None:
-    times, points, _ = somebody(8, 6.0)
+    times, points, _ = moving_person(8, 6.0)
     sure, unsure = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
     assert (unsure > 2.0 * sure).all()
 
 
 def test_two_sensors_are_gathered_apart() -> None:
-    times, points, lengths = somebody(9, 6.0)
+    times, points, lengths = moving_person(9, 6.0)
     seen = SegmentLengths()
     zero = np.zeros(len(POINTS))
     for time, frame in zip(times, points, strict=True):
         for number, sensor in enumerate(("one", "other")):
-            seen = seen.seen(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
+            seen = seen.with_frame(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
     assert len(seen.blocks) >= 8
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
 def test_a_sensor_of_few_frames_is_learnt_from_too() -> None:
-    times, points, lengths = somebody(10, 12.0, rate=2.0)
-    seen = learnt(times, points)
+    times, points, lengths = moving_person(10, 12.0, rate=2.0)
+    seen = gathered(times, points)
     assert len(seen.blocks) >= 4
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
 def test_only_as_many_blocks_are_kept_as_the_memory_has() -> None:
-    times, points, lengths = somebody(11, 12.0)
+    times, points, lengths = moving_person(11, 12.0)
     seen = SegmentLengths(memory=3)
     taller = np.where((times < 6.0)[:, None, None], points, 1.1 * points)
     for time, frame in zip(times, taller, strict=True):
-        seen = seen.seen("", round(time * NANOSECONDS), frame, EVERY, np.zeros(len(POINTS)), BASE)
+        seen = seen.with_frame("", round(time * NANOSECONDS), frame, EVERY, np.zeros(len(POINTS)), BASE)
     assert len(seen.blocks) == 3
     assert_allclose(seen.estimate().lengths, 1.1 * lengths, rtol=0.0, atol=1e-6)
 
 
 def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> None:
-    times, points, lengths = somebody(12, 0.9)
+    times, points, lengths = moving_person(12, 0.9)
     for count in (1, 2, 3, 4, len(times)):
-        seen = learnt(times[:count], points[:count])
+        seen = gathered(times[:count], points[:count])
         assert not seen.blocks
         assert not seen.estimate().seen.any()
-        estimate = seen.begun("", np.zeros(len(POINTS))).estimate()
+        estimate = seen.with_unfinished_block("", np.zeros(len(POINTS))).estimate()
         assert estimate.seen.all()
         assert_allclose(estimate.lengths, lengths, rtol=0.0, atol=1e-6)
 
@@ -223,26 +225,26 @@ def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> Non
 
 
 def test_lengths_of_skeletons_are_there_at_once_and_never_jump() -> None:
-    times, points, lengths = somebody(13, 12.0)
-    told = SkeletonLengths()
+    times, points, lengths = moving_person(13, 12.0)
+    tracker = SkeletonLengths()
     course = []
     for time, frame in zip(times, np.where((times < 3.5)[:, None, None], 0.9 * points, points), strict=True):
-        told.update(round(time * NANOSECONDS), frame, BASE)
-        course.append(told.lengths)
+        tracker.update(round(time * NANOSECONDS), frame, BASE)
+        course.append(tracker.lengths)
     assert_allclose(course[0], 0.9 * lengths, rtol=0.0, atol=1e-6)
     assert_allclose(course[-1], lengths, rtol=0.02)  # the blocks of the later pose are the more
     assert (np.abs(np.diff(course, axis=0)) < 0.01 * lengths).all()  # of the tenth that was to be gone
-    told.reset()
-    assert np.isinf(told.stddev).all()
-    assert_allclose(told.lengths, MODEL.default_lengths())
+    tracker.reset()
+    assert np.isinf(tracker.stddev).all()
+    assert_allclose(tracker.lengths, MODEL.default_lengths())
 
 
 def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> None:
-    times, points, lengths = somebody(14, 140.0, rate=10.0)
-    told = SkeletonLengths()
+    times, points, lengths = moving_person(14, 140.0, rate=10.0)
+    tracker = SkeletonLengths()
     for time, frame in zip(times, np.where((times < 80.0)[:, None, None], 0.85 * points, points), strict=True):
-        told.update(round(time * NANOSECONDS), frame, BASE)
-    assert_allclose(told.lengths, lengths, rtol=0.005)
+        tracker.update(round(time * NANOSECONDS), frame, BASE)
+    assert_allclose(tracker.lengths, lengths, rtol=0.005)
 
 
 @pytest.mark.slow
@@ -260,7 +262,7 @@ def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path
                 assert frame.covariances is not None
                 variance = frame.covariances[POINTS].diagonal(axis1=1, axis2=2).mean(axis=1)
                 model = np.where(frame.valid[POINTS], variance, BASE)
-                seen = seen.seen(
+                seen = seen.with_frame(
                     "", frame.stamp_ns, frame.positions[POINTS], frame.valid[POINTS], np.full(19, 9e-6), model, 0.1
                 )
         halves.append(seen.estimate())

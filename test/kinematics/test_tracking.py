@@ -173,7 +173,7 @@ def test_lengths_are_told_at_first_when_they_change_and_when_they_settle_but_not
         time = number * FRAME
         if 1.0 < time <= 4.0:
             lengths = lengths + np.array([0.0002, 0.0])  # 6 mm/s
-        if changes.news(round(time * NANOSECONDS), lengths.copy()):
+        if changes.due(round(time * NANOSECONDS), lengths.copy()):
             told.append((time, float(lengths[0])))
     assert told[0][0] == 0.0
     assert np.diff([time for time, _ in told]).min() >= 1.0 - 1e-6
@@ -183,6 +183,6 @@ def test_lengths_are_told_at_first_when_they_change_and_when_they_settle_but_not
 
 def test_lengths_that_stay_are_told_once() -> None:
     changes = LengthChanges()
-    assert [changes.news(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
+    assert [changes.due(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
     changes.reset()
-    assert changes.news(0, np.array([0.3]))
+    assert changes.due(0, np.array([0.3]))
