@@ -1,13 +1,13 @@
-"""Whom the bodies that several sensors see belong to, over time: assignment of torsos to people who keep their ids.
+"""Association of the bodies that several sensors see with people, over time.
 
-A frame of one sensor is taken at its own time, for sensors are not paired. Each person is expected where the same
-sensor saw them last, or another one, whichever is the better known, moved on at a constant velocity that fades; how far
-off that may be grows with the time since. The bodies of the frame go to the people by the assignment of the least total
-cost (Kuhn 1955; ``scipy.optimize.linear_sum_assignment``) among those that are near enough: the negative logarithm of
-the likelihood of the distance between torsos. The sensor's own number of a body counts as evidence, not as truth.
+Each frame of one sensor is assigned at its own time. A person is predicted from the last sighting by the same sensor or
+by another one, whichever has the smaller variance, with a decaying velocity; the variance grows with the time since.
+The assignment of bodies to people within the gate minimises the total cost (Kuhn 1955;
+``scipy.optimize.linear_sum_assignment``), the negative log-likelihood of the distance between torsos. The sensor's own
+number of a body is evidence only.
 
-Torsos are compared by points that do not change when a sensor exchanges left and right, and by the median of their
-distances, so that a joint that jumps does not matter.
+Torsos are compared by points that do not change when a sensor swaps left and right, and by the median of their
+distances, which one outlier does not move.
 """
 
 from __future__ import annotations
@@ -28,44 +28,43 @@ _RIGHT = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
 TORSO_POINTS = len(_MIDLINE) + len(_LEFT)
 
 _CONFIRM = round(0.3 * NANOSECONDS)
-"""A body that is nobody's becomes a person when it is seen for this long, nanoseconds: ghosts last a few frames."""
+"""An unassigned body becomes a person when seen for this long, nanoseconds: ghosts last a few frames."""
 
 _CHANGE_NS = round(1.0 * NANOSECONDS)
-"""Who is whom is changed when another assignment has been better for this long, nanoseconds."""
+"""The assignment changes when another one has been better for this long, nanoseconds."""
 
 _MARGIN = 0.3
 """... by this many metres in total."""
 
 _MERGE_DISTANCE = 0.35
-"""Two people nearer than this, whom no sensor sees both, are one, metres: no two torsos are."""
+"""Two people nearer than this, whom no sensor sees both, are merged, metres: torsos do not come as close."""
 
 _OWN_STDDEV, _CROSS_STDDEV = 0.08, 0.2
 """Standard deviation of a torso against the same sensor's last frame, and against another sensor's, metres."""
 
 _GROWTH, _REACH, _MAX_GATE_GROWTH = 0.6, 1.2, 2.5
-"""By which the deviation and the gate grow, metres per second, and the most by which the gate does, metres."""
+"""Growth of the standard deviation and of the gate, metres per second, and the gate's largest growth, metres."""
 
 _VELOCITY_DECAY = 0.7
-"""Time constant with which a velocity fades while a person is not seen, seconds."""
+"""Time constant of the velocity of a person who is not seen, seconds."""
 
 _MAX_SPEED = 3.0
-"""Nobody walks faster in a room, metres per second."""
+"""Fastest walk in a room, metres per second."""
 
 _ID_BONUS = 6.0
-"""What the sensor's own number is worth, in squared deviations."""
+"""Cost by which the sensor's own number favours the same person, in squared standard deviations."""
 
 _FRESH = round(0.2 * NANOSECONDS)
-"""What another sensor saw is of now for this long, nanoseconds."""
+"""Age up to which another sensor's sighting counts as current, nanoseconds."""
 
 _KEPT, _RECENT = 6, round(0.3 * NANOSECONDS)
-"""Sightings of a person by a sensor that are kept, and how old they may be, nanoseconds, for the velocity."""
+"""Number of a sensor's sightings that are kept, and their largest age for the velocity, nanoseconds."""
 
 _CHECK_NS = round(1.0 * NANOSECONDS)
-"""One who is alone is looked at this often, nanoseconds."""
+"""A lone person is assigned this often, nanoseconds."""
 
 GATE = 0.6
-"""Metres between a torso and where a person is expected, from which it is somebody else's; more for one long unseen."""
-
+"""Largest distance between a torso and a person's prediction, metres; it grows while the person is not seen."""
 
 _IMPOSSIBLE = 1e9
 
@@ -90,7 +89,7 @@ def torso_points(positions: FloatArray) -> FloatArray:
 
 
 def torso_distances(ones: FloatArray, others: FloatArray) -> FloatArray:
-    """The distances between torsos: the (lower) median over the points that both have, else that of their middles.
+    """Distances between torsos: the (lower) median over the points that both have, else that of their centres.
 
     Args:
         ones: (n, 6, 3) metres, as of :func:`torso_points`.
@@ -126,7 +125,7 @@ class _Sighting:
 
 @dataclass(slots=True, eq=False)
 class _Person:
-    """Somebody, and what each sensor saw of them last."""
+    """A person with each sensor's last sightings."""
 
     number: int
     since_ns: int
@@ -136,7 +135,6 @@ class _Person:
     bodies: dict[str, int] = field(default_factory=dict)  # the sensors' own numbers
 
     def record(self, sensor: str, sighting: _Sighting, body: int) -> None:
-        """Seen."""
         track = self.sightings.setdefault(sensor, deque(maxlen=_KEPT))
         if track and sighting.stamp_ns <= track[-1].stamp_ns:
             return
@@ -145,17 +143,17 @@ class _Person:
         self.seen_ns = max(self.seen_ns, sighting.stamp_ns)
 
     def age_ns(self, sensor: str, stamp_ns: int) -> float:
-        """Since a sensor saw them; infinity where it did not."""
+        """Time since a sensor saw the person; infinity where it did not."""
         track = self.sightings.get(sensor)
         return abs(stamp_ns - track[-1].stamp_ns) if track else math.inf
 
     def by_others(self, sensor: str, stamp_ns: int) -> str | None:
-        """The other sensor that saw them last."""
+        """The other sensor with the newest sighting."""
         others = (name for name in self.sightings if name != sensor)
         return min(others, key=lambda name: self.age_ns(name, stamp_ns), default=None)
 
     def expected(self, sensor: str, stamp_ns: int) -> FloatArray:
-        """(6, 3) metres: where the torso is by what one sensor saw."""
+        """(6, 3) metres: prediction of the torso from one sensor's sightings."""
         track = self.sightings[sensor]
         last = track[-1]
         first = next(each for each in track if last.stamp_ns - each.stamp_ns <= _RECENT)
@@ -181,13 +179,12 @@ class Association:
         hold: seconds for which a person whom no sensor sees keeps the id.
 
     Attributes:
-        counters: what happened since the construction: ``new`` people, ``lost`` ones, ``merged`` ones who were one,
-            ``exchanged`` assignments that were changed because others had been better for long, and bodies that a
-            sensor ``renumbered``.
+        counters: since the construction: ``new``, ``lost`` and ``merged`` people, ``exchanged`` assignments, and bodies
+            that a sensor ``renumbered``.
     """
 
     def __init__(self, hold: float = HOLD) -> None:
-        # Takes half a second, which only who assigns need pay; at a second person's first frame it would be too late.
+        # The import takes half a second: too long for a second person's first frame.
         from scipy.optimize import linear_sum_assignment
 
         self._min_cost_assignment = linear_sum_assignment
@@ -197,14 +194,14 @@ class Association:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everybody; numbers go on."""
+        """Forget all people; numbers are not used again."""
         self._people: list[_Person] = []
         self._contested: dict[str, int] = {}
         self._alike: dict[tuple[int, int], tuple[int, int]] = {}
         self._checked: dict[str, int] = {}
 
     def forget_sensor(self, sensor: str) -> None:
-        """Forget what one sensor saw, because its time jumped back."""
+        """Forget one sensor's sightings, because its time jumped back."""
         for person in self._people:
             person.sightings.pop(sensor, None)
             person.bodies.pop(sensor, None)
@@ -212,11 +209,11 @@ class Association:
         self._checked.pop(sensor, None)
 
     def move_sensor(self, sensor: str, rotation: FloatArray, translation: FloatArray) -> None:
-        """A sensor turned out to stand elsewhere: what it saw is there too.
+        """Move a sensor's sightings after a change of its pose.
 
         Args:
             sensor: its name.
-            rotation: (3, 3) from where it was taken to be, in world.
+            rotation: (3, 3) from the old pose, in world.
             translation: (3,) metres, likewise.
         """
         for person in self._people:
@@ -227,22 +224,22 @@ class Association:
 
     @property
     def people(self) -> tuple[int, ...]:
-        """Everybody who is there, by number: the longest known first."""
+        """The numbers of the confirmed people, the longest known first."""
         return tuple(person.number for person in self._people if person.confirmed)
 
     def seen_ns(self, number: int) -> int | None:
-        """When somebody was seen last, by the reference's clock; None where nobody has this number."""
+        """Reference time of a person's last sighting; None for an unknown number."""
         return next((person.seen_ns for person in self._people if person.number == number), None)
 
     def place(self, number: int) -> FloatArray:
-        """(3,) metres in world: the middle of somebody's torso as last seen."""
+        """(3,) metres in world: the centre of a person's torso in the last sighting."""
         (person,) = (person for person in self._people if person.number == number)
         return _middle(max((track[-1] for track in person.sightings.values()), key=lambda each: each.stamp_ns).points)
 
     def alone(self, sensor: str, stamp_ns: int, body: int) -> int | None:
-        """The number of the only person, where a sensor's only body can be nobody else and no look is due.
+        """The number of the only person, where a sensor's only body must be that person and no assignment is due.
 
-        Whoever asks tells of the frame later, by :meth:`record`.
+        The caller passes the frame later, by :meth:`record`.
         """
         if len(self._people) != 1 or stamp_ns - self._checked.get(sensor, -_CHECK_NS) >= _CHECK_NS:
             return None
@@ -250,7 +247,7 @@ class Association:
         return person.number if person.confirmed and person.bodies.get(sensor) == body else None
 
     def record(self, sensor: str, seen: Sequence[tuple[int, FloatArray]], body: int) -> None:
-        """What a sensor saw last of the only person, as (stamp, (25, 3) metres in world) in the order of the stamps."""
+        """Record a sensor's last frames of the only person, (stamp, (25, 3) metres in world) in the order of stamps."""
         (person,) = self._people
         person.sightings.pop(sensor, None)
         for (stamp_ns, _), points in zip(
@@ -259,15 +256,14 @@ class Association:
             person.record(sensor, _Sighting(stamp_ns, points), body)
 
     def assign(self, sensor: str, bodies: Sequence[Skeleton]) -> tuple[int | None, ...]:
-        """Who the bodies of one frame of one sensor are.
+        """Assign the bodies of one frame of one sensor to people.
 
         Args:
             sensor: its name.
             bodies: in world and in the reference's clock, all of one stamp; NaN for joints that are not known.
 
         Returns:
-            For each body the number of a person, the same for as long as the person is there; None for one of whom it
-            is not certain yet that it is a person.
+            For each body the number of its person, constant while the person is present; None for an unconfirmed one.
         """
         if not bodies:
             return ()
@@ -280,17 +276,15 @@ class Association:
         if len(self._people) > 1:
             whose = self._corrected(sensor, stamp_ns, points, whose)
         beginning = not any(person.confirmed for person in self._people)
-        # in the order of the sensor's numbers, whatever order they come in
+        # in the order of the sensor's numbers, so that the order of the bodies does not matter
         for index in sorted(range(len(bodies)), key=lambda each: numbers[each]):
             if whose[index] is None and np.isfinite(points[index]).any():
                 self._number += 1
-                person = _Person(self._number, stamp_ns, stamp_ns, confirmed=False)
-                whose[index] = person
-                self._people.append(person)
-        for index, known in enumerate(whose):
-            if known is None:
+                whose[index] = added = _Person(self._number, stamp_ns, stamp_ns, confirmed=False)
+                self._people.append(added)
+        for index, person in enumerate(whose):
+            if person is None:
                 continue
-            person = known
             before = person.bodies.get(sensor)
             self.counters["renumbered"] += before is not None and before != numbers[index]
             person.record(sensor, _Sighting(stamp_ns, points[index]), numbers[index])
@@ -313,7 +307,7 @@ class Association:
     def _assignment(
         self, sensor: str, stamp_ns: int, points: FloatArray, numbers: Sequence[int]
     ) -> list[_Person | None]:
-        """Of each body the person that it is most likely, if any."""
+        """The most likely person of each body, if any."""
         people = [person for person in self._people if person.sightings]
         whose: list[_Person | None] = [None] * len(points)
         if not people:
@@ -350,7 +344,7 @@ class Association:
     def _corrected(
         self, sensor: str, stamp_ns: int, points: FloatArray, whose: list[_Person | None]
     ) -> list[_Person | None]:
-        """The same, or, where other sensors have said for long that it is otherwise, what they say."""
+        """The assignment, or the one by the other sensors' sightings where that has been better for long."""
         present = [
             (person, other)
             for person in self._people
@@ -379,14 +373,14 @@ class Association:
             before, after = whose[index], changed[index]
             if before is not after:
                 self.counters["exchanged"] += 1
-                for person in (before, after):  # what was seen of them was of others
+                for person in (before, after):  # their sightings were of others
                     if person is not None:
                         person.sightings.pop(sensor, None)
                         person.bodies.pop(sensor, None)
         return changed
 
     def _merge(self, sensor: str, stamp_ns: int, whose: Sequence[_Person | None]) -> None:
-        """Make one of two whom no sensor sees both and who have been in one place for long."""
+        """Merge two people whom no sensor sees both and who have been in one place for long."""
         for one, other, by in self._pairs(sensor, stamp_ns, whose):
             older, newer = sorted((one, other), key=lambda person: person.number)
             pair = older.number, newer.number
@@ -395,7 +389,7 @@ class Association:
                 self._alike.pop(pair, None)
                 continue
             since, until = self._alike.get(pair, (stamp_ns, stamp_ns))
-            if stamp_ns - until > _CHANGE_NS:  # not looked at for long
+            if stamp_ns - until > _CHANGE_NS:  # not compared for long
                 since = stamp_ns
             self._alike[pair] = since, stamp_ns
             if stamp_ns - since < _CHANGE_NS:
@@ -414,7 +408,7 @@ class Association:
     def _pairs(
         self, sensor: str, stamp_ns: int, whose: Sequence[_Person | None]
     ) -> Iterator[tuple[_Person, _Person, str]]:
-        """Those in a frame, each with those of whom only another sensor tells, and that sensor."""
+        """The people in a frame, each with those whom only another sensor sees, and that sensor."""
         for one in whose:
             for other in self._people:
                 if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _CHANGE_NS:

@@ -306,9 +306,9 @@ def test_sensors_are_told_apart_and_what_they_saw_is_put_together() -> None:
     both, one = JointCentres({}), JointCentres({})
     for number in range(60):
         frame = skeleton(seen(T_POSE, local), number * FRAME_NS)
-        one.see(frame, "kinect1")
-        both.see(frame, "kinect1")
-        both.see(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
+        one.update(frame, "kinect1")
+        both.update(frame, "kinect1")
+        both.update(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
     assert both.offsets is not None
     assert one.offsets is not None
     # two that saw the same know it better
