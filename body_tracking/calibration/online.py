@@ -1,10 +1,9 @@
 """Calibration while people move: skeletons in, poses and clocks of the sensors out.
 
-Everything is a function of the stamps: an estimate at reference time T uses what was captured up to T minus
-``settle_time`` and holds from T plus ``activation_delay``, so that a live run and an offline one, in which messages
-arrive a little earlier or later, give the same numbers.
+Everything is a function of the stamps: an estimate at reference time T uses frames captured up to T minus
+``settle_time`` and holds from T plus ``activation_delay``, so that times of arrival do not change the numbers.
 
-Over 500 lines: one state machine from first frame to published pose; the estimators that it uses are beside it.
+Over 500 lines: one state machine from first frame to published pose, over estimators in their own modules.
 """
 
 from __future__ import annotations
@@ -34,53 +33,50 @@ from body_tracking.core.sensor_poses import (
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
-"""Seconds of reference time between remembered pairs: frames closer together err alike."""
+"""Seconds of reference time between stored pairs: errors of frames closer together are correlated."""
 
 MAX_BRACKET = 0.09
-"""Interpolate between two frames of a sensor only where they are at most this far apart, seconds."""
+"""Longest interval between two frames of a sensor for interpolation, seconds."""
 
 GUESS_FRAMES = 30
 """Frames of a sensor whose delay of receipt gives the first guess of its clock."""
 
 GUESS_GRID = 0.1
-"""The guess is rounded to this, seconds: a few milliseconds of network then make no difference."""
+"""The guess is rounded to this, seconds, so that network delays do not change it."""
 
 RECEIPT_FRAMES = 90
-"""Frames of a sensor whose median delay of receipt gives its clock until motion tells it better: three seconds ..."""
+"""Frames of a sensor whose median delay of receipt gives its clock until the motion does: three seconds ..."""
 
 RECEIPT_GRID = 0.04
-"""... rounded to this, seconds. The medians of a live run and of its recording differ by some tenths of a millisecond,
-so that they seldom part here; the least delays differ by 30 ms and more, because a frame that overtakes the ``/clock``
-of a bag seems to have come early."""
+"""... rounded to this, seconds. The medians of a live run and of its recording differ by some tenths of a millisecond
+and seldom round differently; the minima differ by 30 ms and more, because a frame can overtake a bag's ``/clock``."""
 
 PAIR_AGAIN_CLOCK = 0.004
 """Interpolate the frames anew when the clock has moved by more than this since they were paired, seconds."""
 
 CLOCK_WINDOW_NS = 5 * NANOSECONDS
-"""Length of the windows of motion that each tell the offset of the clock."""
+"""Length of the windows of motion that each measure the offset of the clock."""
 
 REBASE_CLOCK = 0.05
-"""The offset is looked for around another line when the clock has gone this far from the one so far, seconds."""
+"""The fit gets a new base when the clock differs from its base by this, seconds."""
 
 MOVED_SIGMAS = 5.0
-"""A sensor has been moved, or its clock set, when its pose or clock is this many standard deviations from the saved
-one."""
+"""Standard deviations between estimate and saved pose or clock from which the saved one is dropped."""
 
 WANDER_PPM = 50.0
-"""Standard deviation by which the drift of a clock changes after it was saved, parts per million: quartz follows the
-temperature."""
+"""Standard deviation of a saved clock's change of drift, parts per million: quartz depends on the temperature."""
 
 START_TIMEOUT = 8.0
-"""Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
+"""Longest wait for a still pose, or for motion that determines the clock, seconds."""
 
 JUMP_ANGLE = 0.5 * np.pi
-"""A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
+"""A published pose farther than this from a better one is replaced at once, radians."""
 
 FOREIGN_CLOCK = 5.0
-"""Seconds; a saved clock that is further off is not of stamps in ROS time, whose offsets are small."""
+"""Largest saved offset, seconds: clocks in ROS time have small ones."""
 
 CLOCK_STEP = 1.0
-"""A saved offset that is farther from the guess by the times of receipt is of another clock, seconds."""
+"""Largest difference of a saved offset from the one by times of receipt, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +185,7 @@ class CalibrationParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationUpdate:
-    """A result to be published.
+    """A result to publish.
 
     Attributes:
         valid_from_ns: reference time from which it holds; 0 for always.
@@ -230,7 +226,7 @@ class _Track:
                 del values[:old]
 
     def delay(self, first_ns: int, last_ns: int) -> float | None:
-        """Median delay of receipt of the frames of a time, nanoseconds; None where there are few."""
+        """Median delay of receipt of the frames in an interval, nanoseconds; None for fewer than GUESS_FRAMES."""
         found = self.delays[bisect_left(self.stamps, first_ns) : bisect_right(self.stamps, last_ns)]
         return float(np.median(found)) if len(found) >= GUESS_FRAMES else None
 
@@ -261,7 +257,7 @@ class _Track:
 
 
 class _Sensor:
-    """What is known of one sensor beside the reference; rotations and translations are sensor to reference, optical."""
+    """State of one sensor other than the reference; rotations and translations are sensor to reference, optical."""
 
     def __init__(self, parameters: CalibrationParameters) -> None:
         self.parameters = parameters
@@ -271,12 +267,12 @@ class _Sensor:
         self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
         self.clock = ClockModel()  # in use
         self.loaded: ClockModel | None = None  # from another session
-        self.quality = SensorQuality()  # but for the clock
+        self.quality = SensorQuality()  # of the pose
         self.turned = 0.0
         self.forget()
 
     def forget(self) -> None:
-        """Start estimating anew; what is published stays."""
+        """Start estimating anew; the published pose stays."""
         self.clock = replace(self.clock, stddev=np.inf, drift_stddev_ppm=np.inf)
         self.clock_guessed = False
         self.clock_saved = False
@@ -342,7 +338,7 @@ class OnlineCalibration:
             received_ns: when it arrived, in a clock common to all sensors.
 
         Returns:
-            What is to be published now, mostly nothing.
+            The results to publish, usually none.
         """
         if sensor == self.reference:
             if not self._track.push(skeleton, received_ns):
@@ -382,7 +378,7 @@ class OnlineCalibration:
         elapsed = 0.0 if self._last_step is None else (now - self._last_step) / NANOSECONDS
         self._last_step = now
         for other in self._sensors.values():
-            # While nobody was seen, nothing can jump.
+            # The pose may jump after a gap: no person was seen.
             self._changed |= self._slew(other, np.inf if gap else elapsed)
         if not self._changed:
             return []
@@ -438,16 +434,16 @@ class OnlineCalibration:
         return True
 
     def _at_session_start(self, loaded: ClockModel) -> ClockModel:
-        """What a clock of another session says of the beginning of this one."""
+        """A clock of another session, predicted to the beginning of this one."""
         assert self._anchor is not None
         return loaded.carried_to(self._anchor, WANDER_PPM)
 
     def _clock_from_receipt(self, name: str, other: _Sensor, horizon: int) -> None:
-        """Better than the guess: the delays over some seconds, of the frames that both sensors took in them."""
+        """Replace the guess by the median delays over some seconds, of the frames that both sensors took in them."""
         stamps = other.track.stamps
         start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
         stop = start + RECEIPT_FRAMES - 1
-        # Only what was captured long enough ago, or another order of arrival would make this happen a frame later.
+        # Only frames captured long enough ago, so that the order of arrival does not matter.
         if stop >= len(stamps) or other.clock.to_sensor(horizon) < stamps[stop]:
             return
         first, last = stamps[start], stamps[stop]
@@ -463,7 +459,7 @@ class OnlineCalibration:
                 other.clock = replace(
                     other.received, offset_ns=other.clock.offset_ns_at(middle), drift_ppm=other.clock.drift_ppm
                 )
-            return  # a clock that was calibrated is better, where it has not drifted away since
+            return  # a calibrated clock that has not drifted away is better
         if other.clock_saved:
             self._drop_saved_clock(name, other)
         other.loaded = other.clock_expected = None
@@ -472,7 +468,7 @@ class OnlineCalibration:
         self._changed = True
 
     def _pair(self, other: _Sensor, horizon: int) -> None:
-        """Remember pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
+        """Store pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
         assert self._anchor is not None
         track, period = self._track, round(PAIR_PERIOD * NANOSECONDS)
         start = 0 if other.paired_until is None else bisect_right(track.stamps, other.paired_until)
@@ -505,7 +501,7 @@ class OnlineCalibration:
             try:
                 found = [still_pose_registration(own[1:], theirs[1:])]
                 if self.parameters.method == "robust":
-                    # One of them may see the body turned around.
+                    # One of them may see the body reversed.
                     exchanged = theirs[1][:, MIRROR], theirs[2][:, MIRROR]
                     found.append(still_pose_registration(own[1:], exchanged))
             except CalibrationError:
@@ -518,7 +514,7 @@ class OnlineCalibration:
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
                 self._set_target(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
         elif self.parameters.method == "robust" and self._can_start_from_movement(other, horizon):
-            # Nobody stands still: the movement itself is a start.
+            # Without a still pose the movement itself is a start.
             start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from movement, no still pose was seen")
@@ -526,7 +522,7 @@ class OnlineCalibration:
 
     @staticmethod
     def _can_start_from_movement(other: _Sensor, horizon: int) -> bool:
-        """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
+        """Whether the clock is known from motion, or has been known from receipt for a while."""
         waited = other.received is not None and horizon - other.received.anchor_ns > START_TIMEOUT * NANOSECONDS
         return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
@@ -559,7 +555,7 @@ class OnlineCalibration:
         self, track: _Track, clock: ClockModel, start: int | None, stop: int
     ) -> tuple[FloatArray, FloatArray]:
         """Of the frames in (start, stop] of a clock: reference seconds (n,) since the anchor, and positions."""
-        # Stamps since an epoch have no room for microseconds in a float.
+        # Differences first: a float has too few digits for microseconds since the epoch.
         first = 0 if start is None else bisect_right(track.stamps, start)
         last = bisect_right(track.stamps, stop)
         assert self._anchor is not None
@@ -572,7 +568,7 @@ class OnlineCalibration:
         other.loaded = other.clock_expected = None
 
     def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockModel | None:
-        """The clock by all the motion so far and by what was known before it, unless these contradict each other."""
+        """The clock by all the motion so far and the expected clock, unless these contradict each other."""
         found, expected = fit.solve(other.received), other.clock_expected
         if found is None or expected is None:
             return found
@@ -583,7 +579,7 @@ class OnlineCalibration:
         return fit.solve(expected)
 
     def _update_clock(self, name: str, other: _Sensor, horizon: int) -> None:
-        """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
+        """Measure the offset over every complete window of motion, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
         around = round(2 * FINE_RANGE * NANOSECONDS)
         measured = False
@@ -610,7 +606,7 @@ class OnlineCalibration:
         other.clock = found
         gone = other.clock.to_sensor(other.clock_window_end) - other.clock_base.to_sensor(other.clock_window_end)
         if abs(gone) > REBASE_CLOCK * NANOSECONDS:
-            # What is known by now is what the next fit expects.
+            # The estimate so far is the next fit's prior.
             other.clock_expected, other.clock_base, other.clock_fit = other.clock, other.clock, None
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
@@ -635,7 +631,7 @@ class OnlineCalibration:
         other.started = best.rotation, best.translation
         other.turned = best.turned
         if not other.estimated and best.rotation_stddev > other.quality.rotation_stddev:
-            # A calibration that was loaded is better than what this session knows so far, unless they contradict.
+            # A loaded calibration of smaller stated uncertainty stays, unless the estimate contradicts it.
             if not other.clock_locked or not self._contradicts(best, other):
                 return
             self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
@@ -645,7 +641,7 @@ class OnlineCalibration:
 
     @staticmethod
     def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
-        """Whether the published pose is farther from an estimate than both are uncertain."""
+        """Whether published pose and estimate differ by more than their uncertainties explain."""
         assert other.rotation is not None
         apart = Rotation.from_matrix(found.rotation @ other.rotation.T).magnitude()
         place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
@@ -664,7 +660,7 @@ class OnlineCalibration:
         return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
 
     def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
-        """The best from three starts: the last estimate, half a turn from it, the spines, which know no sides."""
+        """The best from three starts: the last estimate, half a turn from it, and the spines, which have no sides."""
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)
@@ -684,7 +680,7 @@ class OnlineCalibration:
     def _slew(self, other: _Sensor, elapsed: float) -> bool:
         """Move the published pose toward the target; True when it moved.
 
-        The turn is about the person, so that what the person does is disturbed least.
+        The rotation is about the person's place, to disturb the person's motion least.
         """
         if other.target is None or other.rotation is None:
             return False
@@ -733,7 +729,7 @@ class OnlineCalibration:
         return CalibrationResult(self.reference, stamped, clocks, quality)
 
     def current_update(self) -> CalibrationUpdate:
-        """What holds now, to be published at the start; valid always."""
+        """The present result, valid for all times, to publish at the start."""
         return self._update(0)
 
     def result(self) -> CalibrationResult:
@@ -741,13 +737,13 @@ class OnlineCalibration:
         return self._result(0, published=False)
 
     def finish(self) -> CalibrationResult:
-        """The best estimate from everything that was pushed, up to the last frame; for recordings."""
+        """The best estimate from all frames up to the last one; for recordings."""
         if self._now is not None and self._anchor is not None and self.parameters.method == "robust":
             for name, other in self._sensors.items():
                 if not other.clock_guessed:
                     continue
                 if other.clock_locked and self._track.stamps[0] <= self._anchor:
-                    # The recording is still here as a whole: measure every window with what is known now.
+                    # All frames are still stored: measure every window again with the final clock.
                     other.clock_fit, other.clock_window_end = None, self._anchor
                     other.clock_base = other.clock
                     other.clock_expected = None if other.loaded is None else self._at_session_start(other.loaded)
@@ -760,10 +756,10 @@ class OnlineCalibration:
         return self.result()
 
     def load(self, result: CalibrationResult) -> None:
-        """Take an earlier calibration; it holds until movement shows a better one.
+        """Load an earlier calibration; it holds until there is a better estimate.
 
-        Its clocks count as known from other motion than this session's: given what the same recording told before,
-        clocks are stated to be known better by up to the square root of two.
+        Its clocks count as independent of this session's motion: a calibration from the same recording makes the stated
+        standard deviations of clocks too small, by up to the square root of two.
 
         Raises:
             CalibrationError: it belongs to another reference sensor.
@@ -804,7 +800,7 @@ class OnlineCalibration:
         return "calibrating: stand still (a T-pose is best) for two seconds, then walk about"
 
     def reset(self) -> str:
-        """Forget every calibration and start again."""
+        """Delete every calibration and start again."""
         for name, other in list(self._sensors.items()):
             fresh = _Sensor(self.parameters)
             fresh.track = other.track

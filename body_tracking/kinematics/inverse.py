@@ -108,7 +108,7 @@ class InverseKinematics:
             (35,) configuration.
 
         Raises:
-            ModelError: SpineBase, SpineMid and SpineShoulder show no trunk at all.
+            ModelError: SpineBase, SpineMid and SpineShoulder determine no trunk.
         """
         point = {joint: positions[number] for joint, number in self._point.items()}
         base, mid, top = (point[joint] for joint in (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER))

@@ -1,18 +1,18 @@
-"""How long a person's segments are, from the distances between the points of many frames.
+"""Estimation of a person's segment lengths from the distances between the points of many frames.
 
-Independent of the pose that a filter or a fit believes in: a wrong pose spoils no length here. :class:`SegmentLengths`
-gathers what sensors show; :class:`SkeletonLengths` is for who has filtered skeletons and asks after every frame.
+Independent of the estimated pose. :class:`SegmentLengths` estimates from sensors' frames, :class:`SkeletonLengths` from
+filtered skeletons, after every frame.
 
-What a sensor shows of one bone differs from pose to pose by a tenth and more, for seconds, and these errors are by far
-the greatest; averaging frames as if each were new would soon be sure of a wrong length. Therefore
+A sensor's error of a length depends on the pose, is a tenth of the length and more, and lasts for seconds. Frames are
+therefore not independent:
 
-- frames are gathered into blocks of a second (longer where there are few); the mean squared distances in a block, less
-  what white noise adds to them, tell its lengths. Frames far from the block's median do not count;
-- over the blocks a mean is taken that single strange poses do not move (Huber 1964), each weighed by how much the
-  sensors' points are weights by the measurement model: a body seen from the side is not seen well;
-- its variance is that of the blocks: the part that two interleaved halves of a block do not share is white and
-  averages out from block to block, the rest persists from pose to pose and averages out that much more slowly;
-- and all is weighed against how people differ in their proportions, left hardly from right.
+- Frames are gathered into blocks of a second (longer where there are few). A block's lengths follow from its mean
+  squared distances less the variance of the white noise. Frames far from the block's median are outliers.
+- Huber's estimate of location (Huber 1964) combines the blocks, weighted by the inverse variance of their points by the
+  measurement model.
+- Its variance has two parts. The difference between two interleaved halves of a block is white and averages out from
+  block to block; the rest of the blocks' spread is correlated over time and averages out more slowly.
+- The prior is the distribution of people's proportions, with a high correlation between left and right.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ from body_tracking.kinematics.upper_body import LENGTHS, UpperBody
 
 _BLOCK_NS = NANOSECONDS
 _MIN_FRAMES = 4
-"""Frames from which on a block counts: two for each of its halves."""
+"""Least frames of a block: two for each of its halves."""
 _MAX_BLOCK_NS = 4 * _BLOCK_NS
-"""What a block waits for these."""
+"""Longest block, where frames are few."""
 _OUTLIER = 4.0
-"""Standard deviations from the median of a block from which a frame does not count in it."""
+"""Standard deviations from the block's median beyond which a frame is an outlier."""
 _HUBER = 1.345
 """Huber's constant of 95 % efficiency."""
 _EFFICIENCY = 0.95
 _ITERATIONS = 8
 _MAD_TO_STDDEV = 1.4826
-"""Standard deviation of normal deviates over the median of their sizes."""
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 _PRIOR_BLOCKS = 3.0
-"""Blocks that what is stated of the slow errors is weights against their observed spread."""
+"""Weight of the stated variance of slow errors against the observed spread, in blocks."""
 _MIN_STDDEV = 1e-5
-"""Metres: standard deviation that no length falls below, so that covariances stay invertible."""
+"""Metres: least standard deviation of a length, so that covariances stay invertible."""
 _MIN_LENGTH = 0.005
-"""Metres: nothing is shorter."""
+"""Metres."""
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
-"""Standard deviations by which lengths differ from the average: all alike, each kind, left from right."""
+"""Relative standard deviations of lengths between people: common to all, per kind, per side."""
 _MIN_SCALE = 0.08
-"""Metres: shorter lengths differ as if they were as long as this, because sensors place these points so."""
+"""Metres: shorter lengths have the standard deviation of this one, because of how sensors place their points."""
 _MIN_SIZE, _MAX_SIZE = 0.5, 1.4
-"""Of a person against one of average stature."""
+"""Bounds of a person's size relative to the average."""
 
 _MODEL: Final = UpperBody()
 _DEFAULT: Final = _MODEL.default_lengths()
 
 
 def proportions() -> FloatArray:
-    """(21, 21) square metres: how people differ in their lengths; left and right of one person hardly do."""
+    """(21, 21) square metres: covariance of lengths between people, with left and right of one person correlated."""
     kinds = [name.removesuffix("_left").removesuffix("_right") for name in LENGTHS]
     same = np.array([[a == b for b in kinds] for a in kinds])
     relative = _STATURE_SHARE**2 + _PROPORTION_SHARE**2 * same + _SIDE_SHARE**2 * np.eye(len(LENGTHS))
@@ -67,7 +67,7 @@ def proportions() -> FloatArray:
 
 
 def _ends() -> dict[str, tuple[Joint, Joint]]:
-    """The two points between which each length shows; the model's hand tip and thumb hang on the wrist."""
+    """The two points whose distance measures each length; the model's hand tip and thumb are attached to the wrist."""
     found = {
         "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
         "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
@@ -97,7 +97,7 @@ _SIDES: Final = ("left", "right")
 
 
 def _scalar_products() -> tuple[tuple[str, ...], IntArray]:
-    """Names (k,) and points (4, k) a, b, c, d of the scalar products (b - a) . (d - c) that tell all lengths."""
+    """Names (k,) and points (4, k) a, b, c, d of the scalar products (b - a) . (d - c) that determine lengths."""
     rows: dict[str, tuple[Joint, Joint, Joint, Joint]] = {}
     for name, (a, b) in _ENDS.items():
         if not name.startswith(("thumb_out", "hip_drop")):
@@ -119,7 +119,7 @@ _COLUMN: Final = {name: number for number, name in enumerate(_PRODUCTS)}
 
 
 def _noise() -> FloatArray:
-    """(k, 19) by how much white noise of unit variance of each point raises each product."""
+    """(k, 19) bias of each product by white noise of unit variance of each point."""
     first, second = np.zeros((2, len(_PRODUCTS), len(_POINT)))
     rows = np.arange(len(_PRODUCTS))
     a, b, c, d = _FACTORS
@@ -145,11 +145,11 @@ _OTHER_SIDE: Final = np.array(
 )
 _NO_NOISE: Final = np.zeros(len(_POINT))
 _UNSEEN: Final = (INFERRED_FACTOR * BASE_STDDEV[_MODEL.joints]) ** 2
-"""(19,) square metres: what a point that was not seen in a frame counts for in the weights of its block."""
+"""(19,) square metres: variance of an unseen point in the weight of its block."""
 _FOLLOW_TIME = 1.0
-"""Seconds in which lengths that are told after every frame follow what the blocks say."""
+"""Seconds: time constant with which the published lengths follow the estimate."""
 _SKELETONS_MEMORY = 60
-"""Blocks: who takes the place of another person, unnoticed, has their own lengths after half of it."""
+"""Blocks: after an unnoticed change of person the lengths are the new person's after half of it."""
 
 
 def _lengths_of(products: FloatArray) -> FloatArray:
@@ -179,7 +179,7 @@ def _lengths_of(products: FloatArray) -> FloatArray:
 
 
 _Frame = tuple[int, FloatArray, BoolArray, FloatArray]
-"""Stamp, points (19, 3), which of them count (19,), their variance by the measurement model (19,)."""
+"""Stamp, points (19, 3), mask of the used ones (19,), their variance by the measurement model (19,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,10 +188,10 @@ class _Block:
 
     Attributes:
         stamp_ns: of its first frame.
-        products: (k,) square metres, less what white noise adds; NaN where not seen.
+        products: (k,) square metres, without the bias by white noise; NaN where not seen.
         lengths: (21,) metres.
-        white: (21,) square metres: variance of the lengths by what its two interleaved halves do not share.
-        slow: (21,) square metres: variance of the lengths by slow errors, as it was stated.
+        white: (21,) square metres: variance of the lengths by the difference of two interleaved halves.
+        slow: (21,) square metres: stated variance of the lengths by slow errors.
         model: (19,) square metres: variance of the points by the measurement model.
     """
 
@@ -205,12 +205,12 @@ class _Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LengthEstimate:
-    """Lengths and what is known of them.
+    """Estimated lengths.
 
     Attributes:
         lengths: (21,) metres.
         covariance: (21, 21) square metres.
-        seen: (21,) which of them the points showed; the others are what these and the average person make likely.
+        seen: (21,) which of them were measured; the others follow from these and the prior.
     """
 
     lengths: FloatArray
@@ -220,11 +220,11 @@ class LengthEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentLengths:
-    """What was seen of a person's lengths so far; never written into.
+    """Measurements of a person's lengths; immutable.
 
     Attributes:
         persistence: seconds, the time constant of the autocorrelation of errors in a length.
-        memory: blocks that are kept; older ones are forgotten.
+        memory: number of the newest blocks that are kept.
         blocks: the finished blocks.
     """
 
@@ -244,17 +244,17 @@ class SegmentLengths:
         slow: float = 0.0,
         stretch: float = 0.0,
     ) -> SegmentLengths:
-        """With one more frame; ``blocks`` is another one whenever a block is complete. Arrays are kept, not copied.
+        """With one more frame; ``blocks`` is a new object whenever a block is complete. Arrays are kept, not copied.
 
         Args:
-            sensor: whose frame it is.
-            stamp_ns: when it was captured.
+            sensor: name of the sensor.
+            stamp_ns: capture time.
             points: (19, 3) metres, the points of the model, in any frame.
-            tracked: (19,) which of them count.
+            tracked: (19,) which of them to use.
             white: (19,) square metres per axis, variance of their white noise.
-            model: (19,) square metres per axis, their variance by the measurement model, which blocks are weighed by.
-            slow: share of that which is known to be errors that last for seconds.
-            stretch: share of their length that upper arms and forearms are wrong by, beside that (standard deviation).
+            model: (19,) square metres per axis, their variance by the measurement model, for the weights of blocks.
+            slow: share of ``model`` that is due to errors that last for seconds.
+            stretch: additional relative standard deviation of the lengths of upper arms and forearms.
         """
         frames = self._gathered.get(sensor, ())
         blocks = self.blocks
@@ -269,24 +269,17 @@ class SegmentLengths:
     def with_unfinished_block(
         self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0
     ) -> SegmentLengths:
-        """With the frames of a sensor's unfinished block as one more block, for who cannot wait for it.
-
-        Args:
-            sensor: whose block it is.
-            white: see :meth:`with_frame`.
-            slow: see :meth:`with_frame`.
-            stretch: see :meth:`with_frame`.
-        """
+        """With the frames of a sensor's unfinished block as one more block; arguments as of :meth:`with_frame`."""
         frames = self._gathered.get(sensor, ())
         if not frames:
             return self
-        # the first few, again and again: what they differ by among themselves is all that is known of their noise
+        # too few frames are repeated: both halves of a block need two
         frames *= -(-_MIN_FRAMES // len(frames))
         blocks = (*self.blocks, _block(frames, white, slow, stretch))[-self.memory :]
         return SegmentLengths(self.persistence, self.memory, blocks, self._gathered)
 
     def estimate(self) -> LengthEstimate:
-        """All that is known; an average person where nothing was seen."""
+        """The lengths by all blocks and the prior."""
         prior = proportions()
         if not self.blocks:
             return LengthEstimate(_DEFAULT, prior, np.zeros(len(LENGTHS), dtype=np.bool_))
@@ -305,11 +298,11 @@ class SegmentLengths:
         known = np.isfinite(centre) & np.isfinite(middle)
         if not known.any():
             return LengthEstimate(_DEFAULT, prior, known)
-        # variance of a block that is weights as much as one on average
+        # variance of a block of average weight
         spread = (weights * off**2).sum(axis=0) / np.maximum(count - 1, 1)
         excess = np.maximum(spread - whiteness, 0.0)
         slow = (_PRIOR_BLOCKS * stated + (count - 1.0) * excess) / (_PRIOR_BLOCKS + count - 1.0)
-        # the variance of a mean of blocks whose errors are as alike as they are close in time
+        # the variance of a mean of blocks whose errors are correlated over time
         stamps = np.array([block.stamp_ns for block in self.blocks]) / NANOSECONDS
         alike = np.exp(-np.abs(stamps[:, None] - stamps) / self.persistence)
         roots = np.sqrt(weights)
@@ -325,14 +318,14 @@ class SegmentLengths:
 
 
 class SkeletonLengths:
-    """The lengths that the filtered skeletons of one person show, from the first frame on and after every one.
+    """The lengths of one person by filtered skeletons, from the first frame on.
 
-    Before a first block is complete, the frames so far are one. Every block can move a length by centimetres, and a
-    pose that is fitted with it by degrees: the lengths go there gradually. The points count as free of white noise,
-    which a filter has taken away, and no slow errors are stated: what was seen outweighs the average person.
+    Until the first block is complete, the frames so far are one. The lengths follow the estimate gradually, because a
+    block can change one by centimetres, and a pose that is fitted with it by degrees. Points count as free of white
+    noise, which the filter has removed, and of slow errors, so that measurements outweigh the prior.
 
     Attributes:
-        lengths: (21,) metres; those that were never seen are the other side's, or in proportion to the others.
+        lengths: (21,) metres; unseen ones are the other side's, or in proportion to the others.
         stddev: (21,) metres; infinity where never seen.
     """
 
@@ -348,10 +341,10 @@ class SkeletonLengths:
         self.stddev: FloatArray = np.full(len(LENGTHS), np.inf)
 
     def update(self, stamp_ns: int, points: FloatArray, variance: FloatArray) -> None:
-        """Take one frame.
+        """Update with one frame.
 
         Args:
-            stamp_ns: when it was captured.
+            stamp_ns: capture time.
             points: (19, 3) metres, the points of the model, in any frame; NaN where not known.
             variance: (19,) square metres per axis, of the points; infinity where not known.
         """
@@ -376,7 +369,7 @@ class SkeletonLengths:
 
 
 def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: float) -> _Block:
-    """What some frames say; see :meth:`SegmentLengths.with_frame` for the rest."""
+    """The block of some frames; see :meth:`SegmentLengths.with_frame` for the other arguments."""
     stamps, positions, counted, variances = zip(*frames, strict=True)
     points = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
     model = np.mean(variances, axis=0)
@@ -402,7 +395,7 @@ def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: 
 
 
 def _nanmean(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, where at most one value is there."""
+    """Over the first dimension; NaN, without a warning, for fewer than two values."""
     there = np.isfinite(values)
     count = there.sum(axis=0)
     total = np.where(there, values, 0.0).sum(axis=0)
@@ -410,7 +403,7 @@ def _nanmean(values: FloatArray) -> FloatArray:
 
 
 def _nanmedian(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, where no value is there."""
+    """Over the first dimension; NaN, without a warning, where there is no value."""
     ordered = np.sort(values, axis=0)  # NaN comes last
     count = np.isfinite(values).sum(axis=0)
     columns = np.arange(values.shape[1])
@@ -428,14 +421,14 @@ def _weights(weights: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArr
 
 
 def _location(values: FloatArray, weights: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Huber's estimate of location (m,) of values (n, m), NaN where missing, and how far (n, m) these are from it.
+    """Huber's estimate of location (m,) of values (n, m), NaN where missing, and the residuals (n, m).
 
-    What is missing is not far, and nothing farther than some times the scale.
+    Residuals of missing values are 0, and the others are clipped at :data:`_OUTLIER` times the scale.
 
     Args:
         values: one row per block.
         weights: (n, m) inverse variances, 1 on average.
-        least: (m,) scale that a value of average weights has at least.
+        least: (m,) lower bound of the scale of a value of average weight.
     """
     there = np.isfinite(values)
     filled = np.where(there, values, 0.0)

@@ -251,7 +251,7 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
         velocities every velocity is NaN.
     """
     n = _N_ANGLES
-    with np.errstate(all="ignore"):  # NaN and infinity are values here: they say that something is not known
+    with np.errstate(all="ignore"):  # NaN and infinity mark unknown values
         positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
         angles, jacobian, sine, singular = _angles_and_jacobian(positions)
         unknown = np.isnan(angles)

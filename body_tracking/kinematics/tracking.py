@@ -1,7 +1,7 @@
-"""A body model that follows a person frame by frame, where no filter of its own estimates it.
+"""The body model frame by frame, for filters that do not estimate it.
 
-:class:`SkeletonFit` fits ``upper_body`` to filtered joint positions; :class:`AngleStream` makes joint angles of what a
-node receives, in any convention; :class:`LengthChanges` tells when a person's lengths are news.
+:class:`SkeletonFit` fits ``upper_body`` to filtered joint positions; :class:`AngleStream` computes joint angles in any
+convention; :class:`LengthChanges` decides when to publish segment lengths.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ def angle_names(name: str) -> tuple[str, ...]:
     """The angles of one of ``ALL_CONVENTIONS``, in order.
 
     Raises:
-        ConventionError: another one.
+        ConventionError: unknown convention.
     """
     return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
 
 
 _GAP_NS = NANOSECONDS // 2
-"""After longer than this the last pose is no better a start than none."""
+"""Age from which the last pose is not used as a start."""
 _POOR_FIT = 4.0
-"""Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
+"""Cost per measured coordinate, where 0.5 is expected, from which the fit is repeated without a start."""
 _STEPS, _TOLERANCE = 4, 2e-3
-"""Of a fit that starts from the frame before: at most so many steps, until one is smaller than this, rad and m."""
+"""Largest number of steps of a fit that starts from the frame before, and the step size that ends it, rad and m."""
 _MAX_RATE = 10.0
-"""rad/s and m/s: standard deviation of a rate of which nothing is known."""
+"""rad/s and m/s: prior standard deviation of a rate."""
 _TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
 
 
 class SkeletonFit:
     """Inverse kinematics of one frame after the other, each started from the one before.
 
-    The velocity is the one whose points move as the skeleton says (least squares); the deviations of the points'
-    velocities are the bounds of :mod:`body_tracking.kinematics.positional`.
+    The velocity is the least squares fit to the skeleton's velocities, whose standard deviations are the bounds of
+    :mod:`body_tracking.kinematics.positional`.
 
     Attributes:
         model: the body.
         lengths: the person's, from the frames so far.
-        counters: what happened since the construction, for diagnostics.
+        counters: event counts since the construction, for diagnostics.
     """
 
     def __init__(self, model: UpperBody | None = None) -> None:
@@ -82,8 +82,8 @@ class SkeletonFit:
             skeleton: in a frame with z up, with covariances; usually ``/filtered/skeleton``.
 
         Returns:
-            The estimate; the covariance knows of no tie between coordinates and rates, and without velocities in the
-            skeleton the rates are NaN with an infinite variance. None where no trunk is seen.
+            The estimate, without covariance between coordinates and rates; without velocities in the skeleton the rates
+            are NaN with an infinite variance. None where no trunk is seen.
         """
         if self._last is not None and not 0 <= skeleton.stamp_ns - self._last.stamp_ns <= _GAP_NS:
             self._last = None
@@ -114,7 +114,7 @@ class SkeletonFit:
         return self._last
 
     def _variance(self, skeleton: Skeleton) -> FloatArray:
-        """(19,) square metres per axis; infinity where the skeleton states none that makes sense."""
+        """(19,) square metres per axis; infinity where the skeleton has no positive one."""
         if skeleton.covariances is None:
             return np.full(len(self.model.joints), np.inf)
         diagonal = skeleton.covariances[self.model.joints].diagonal(axis1=1, axis2=2)
@@ -164,14 +164,10 @@ class AngleStream:
 
     Args:
         convention: one of ``ALL_CONVENTIONS``.
-        forget_after: seconds without the person after which the next frame is of somebody else.
-
-    Attributes:
-        model: the body.
-        fit: what follows skeletons.
+        forget_after: seconds without the person after which the next frame is of another one.
 
     Raises:
-        ConventionError: another one.
+        ConventionError: unknown convention.
     """
 
     def __init__(self, convention: str, forget_after: float = math.inf) -> None:
@@ -213,11 +209,11 @@ class AngleStream:
 
 
 class LengthChanges:
-    """Tells when the lengths of a person's segments are news: at first, when they change, and where they settle.
+    """Decides when to publish segment lengths: at first, when they change, and when they settle.
 
     Args:
-        tolerance: metres by which a length must differ from what was told last.
-        period: seconds between two pieces of news.
+        tolerance: least difference of a length from the published one, metres.
+        period: least time between two publications, seconds.
     """
 
     def __init__(self, tolerance: float = 0.002, period: float = 1.0) -> None:
@@ -232,7 +228,7 @@ class LengthChanges:
         self._before: FloatArray | None = None
 
     def due(self, stamp_ns: int, lengths: FloatArray) -> bool:
-        """Whether to tell these (n,) lengths, metres, of this capture time; if so, they count as told."""
+        """Whether to publish these (n,) lengths, metres, of this capture time; if so, they count as published."""
         settled = self._before is not None and np.array_equal(self._before, lengths)
         self._before = lengths
         if self._published is not None:
@@ -248,7 +244,7 @@ class LengthChanges:
 def state_estimate(
     model: UpperBody, stamp_ns: int, frame_id: str, q: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> ModelEstimate:
-    """An estimate of the pose alone, as angles need it: of lengths nothing is known.
+    """An estimate of the pose, with default lengths of infinite standard deviation.
 
     Args:
         model: the body.

@@ -59,7 +59,7 @@ _AXES: tuple[tuple[tuple[str, FloatArray], ...] | None, ...] = (
 )
 
 SHOULDER_AXES: Final = {"left": (-_Y, _X, -_Z), "right": (-_Y, -_X, _Z)}
-"""Axes of flexion, abduction and inward rotation, intrinsic in this order, where the ball joint is told as angles."""
+"""Axes of flexion, abduction and inward rotation, intrinsic in this order, for the ball joint as angles."""
 
 UNOBSERVED: tuple[str, ...] = (
     "lumbar_axial",
@@ -366,7 +366,7 @@ class UpperBody:
         return Linearisation(posture, jacobian, by_lengths, turning)
 
     def turning(self, q: FloatArray, segment: int) -> tuple[FloatArray, FloatArray]:
-        """Of one segment alone what :meth:`linearise` says, in half the time.
+        """:meth:`linearise` for one segment, in half the time.
 
         Args:
             q: (..., 35) configurations.
