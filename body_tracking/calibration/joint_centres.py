@@ -165,7 +165,7 @@ def body_axes(positions: FloatArray) -> FloatArray:
     return np.array(_axes(*positions.take(_THORAX, axis=0).tolist())).T
 
 
-def in_current_pose(positions: FloatArray, local: FloatArray) -> FloatArray:
+def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
     """Rotate vectors from the frames of the segments into the axes of the positions.
 
     In scalars, because it runs for each frame of each camera and is three times as fast as with such small arrays.
@@ -255,9 +255,7 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
     covariance = np.diag(prior) - (rows * prior).T @ gain
     left = np.einsum("ij,jk,ik->i", angles, covariance, angles) / (angles**2 @ prior)
     # from the axes of the thorax into those of the segments
-    frames = in_current_pose(
-        positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy()
-    )  # rows: the frames' axes
+    frames = posed(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
     local = np.einsum("jab,jb->ja", frames, offsets)
     blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
     distance = float(residual @ np.linalg.solve(innovation, residual))
@@ -495,7 +493,7 @@ class JointCentres:
         if self.offsets is None:
             return positions
         known = positions if measured.all() else np.where(measured[:, None], positions, np.nan)
-        offsets = in_current_pose(known, self._in_force(stamp_ns)[:, None])[:, 0]
+        offsets = posed(known, self._in_force(stamp_ns)[:, None])[:, 0]
         if not math.isfinite(offsets.sum()):
             return positions
         # by the corrected pose: an arm that is measured bent may be straight
@@ -520,7 +518,7 @@ class JointCentres:
         known = self.offsets
         if known is None:
             return covariances
-        axes = in_current_pose(positions, known.axes)
+        axes = posed(positions, known.axes)
         if not np.isfinite(axes).all():
             return covariances
         mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
@@ -542,7 +540,7 @@ class JointCentres:
         if self.offsets is None:
             return result
         count = len(LEARNT)
-        frames = in_current_pose(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+        frames = posed(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
         if not np.isfinite(frames).all():
             return result
         blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)

@@ -17,7 +17,7 @@ from body_tracking.calibration.joint_centres import (
     POSE_STDDEV,
     JointCentres,
     body_axes,
-    in_current_pose,
+    posed,
     retained,
     t_pose_offsets,
 )
@@ -46,7 +46,7 @@ def some_offsets(seed: int = 0) -> FloatArray:
 def seen(positions: FloatArray, local: FloatArray) -> FloatArray:
     """(25, 3) with joints beside where they are."""
     result = positions.copy()
-    result[LEARNT] += in_current_pose(positions, local[:, None])[:, 0]
+    result[LEARNT] += posed(positions, local[:, None])[:, 0]
     return result
 
 
@@ -81,7 +81,7 @@ def without(positions: FloatArray, *joints: Joint) -> FloatArray:
 
 def test_offsets_turn_as_the_frames_of_the_segments_do() -> None:
     frames = segment_frames(POSES)[:, LEARNT]
-    axes = np.stack([in_current_pose(each, EYE) for each in POSES])
+    axes = np.stack([posed(each, EYE) for each in POSES])
     of_thorax = LEARNT != Joint.SPINE_BASE  # a pelvis has its own frame there
     assert_allclose(axes.swapaxes(-1, -2)[:, of_thorax], frames[:, of_thorax], atol=1e-9)
 
@@ -92,14 +92,14 @@ def test_offsets_turn_with_the_body(turn: tuple[float, float, float], pose: int)
     rotation = Rotation.from_rotvec(turn).as_matrix()
     moved = POSES[pose] @ rotation.T + [1.0, 2.0, 3.0]
     local = some_offsets()[:, None]
-    assert_allclose(in_current_pose(moved, local), in_current_pose(POSES[pose], local) @ rotation.T, atol=1e-9)
+    assert_allclose(posed(moved, local), posed(POSES[pose], local) @ rotation.T, atol=1e-9)
 
 
 def test_a_bone_that_is_not_seen_turns_nothing_and_without_a_thorax_nothing_is_told() -> None:
-    hidden = in_current_pose(without(POSES[3], Joint.HAND_LEFT), EYE)
-    assert_allclose(hidden[5], in_current_pose(POSES[3], EYE)[5])
+    hidden = posed(without(POSES[3], Joint.HAND_LEFT), EYE)
+    assert_allclose(hidden[5], posed(POSES[3], EYE)[5])
     assert np.isfinite(hidden).all()
-    assert np.isnan(in_current_pose(without(POSES[3], Joint.SPINE_MID), EYE)).all()
+    assert np.isnan(posed(without(POSES[3], Joint.SPINE_MID), EYE)).all()
 
 
 def drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -140,7 +140,7 @@ def test_what_is_known_of_offsets_is_as_good_as_stated() -> None:
         found = t_pose_offsets(points, transient)
         distances.append(found.distance)
         expected = found.dimension
-        local = in_current_pose(points, EYE) @ offsets[:, :, None]
+        local = posed(points, EYE) @ offsets[:, :, None]
         off = (found.local - local[:, :, 0]).reshape(-1)
         errors.append(off @ np.linalg.solve(found.covariance, off))
     # chi-square in the mean; the body's axes are those of joints that are off, which the equations do not know
@@ -156,8 +156,8 @@ def test_left_and_right_are_treated_alike() -> None:
     other = own[MIRROR] * flip
     transient = 0.3 * BASE_STDDEV[LEARNT] ** 2
     one, two = t_pose_offsets(own, transient), t_pose_offsets(other, transient)
-    shift_one = (one.local[:, None] @ in_current_pose(own, EYE))[:, 0]
-    shift_two = (two.local[:, None] @ in_current_pose(other, EYE))[:, 0]
+    shift_one = (one.local[:, None] @ posed(own, EYE))[:, 0]
+    shift_two = (two.local[:, None] @ posed(other, EYE))[:, 0]
     exchanged = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6]
     assert_allclose(shift_two, shift_one[exchanged] * flip, atol=1e-9)
     assert one.distance == pytest.approx(two.distance)
@@ -301,7 +301,7 @@ def test_broken_numbers_and_stamps_do_no_harm() -> None:
     assert np.isfinite(centres.offsets.local).all()
 
 
-def test_sensors_are_told_apart_and_what_they_saw_is_put_together() -> None:
+def test_evidence_of_several_sensors_is_combined() -> None:
     local = some_offsets(4)
     both, one = JointCentres({}), JointCentres({})
     for number in range(60):

@@ -58,7 +58,7 @@ def assign_frame(
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 10_000), order=st.permutations(range(5)))
-def test_the_order_of_bodies_changes_nothing(seed: int, order: list[int]) -> None:
+def test_assignment_is_independent_of_the_order_of_bodies(seed: int, order: list[int]) -> None:
     rng = np.random.default_rng(seed)
     starts, ends = rng.uniform(-2.0, 2.0, (2, 5, 2))
     paths = {who: (starts[who].tolist(), ends[who].tolist()) for who in range(5)}
@@ -70,7 +70,7 @@ def test_the_order_of_bodies_changes_nothing(seed: int, order: list[int]) -> Non
         assert other.assign("kinect1", [bodies[who] for who in order]) == tuple(expected[who] for who in order)
 
 
-def test_torsos_are_the_same_with_left_and_right_exchanged_and_a_joint_astray() -> None:
+def test_torso_distance_ignores_swapped_sides_and_an_outlier() -> None:
     points = torso_points(np.stack([FIGURE, FIGURE[MIRROR]]))
     assert torso_distances(points[:1], points[1:])[0, 0] == pytest.approx(0.0, abs=1e-12)
     astray = FIGURE.copy()
@@ -84,7 +84,7 @@ def test_torsos_are_the_same_with_left_and_right_exchanged_and_a_joint_astray() 
 
 
 @pytest.mark.parametrize("gap", [0.5, 0.8 * HOLD])
-def test_who_is_hidden_for_a_while_keeps_the_number_and_who_is_away_for_long_does_not(gap: float) -> None:
+def test_a_hidden_person_keeps_the_number_for_the_hold_time_only(gap: float) -> None:
     association = Association()
     standing = {0: np.array([2.0, 0.0]), 1: np.array([2.5, 1.5])}
     for stamp_ns, places in walked(1.0, {who: (at.tolist(), at.tolist()) for who, at in standing.items()}):
@@ -107,7 +107,7 @@ def test_who_is_hidden_for_a_while_keeps_the_number_and_who_is_away_for_long_doe
 
 @pytest.mark.parametrize("numbers", ["kept", "exchanged", "shuffled"])
 @pytest.mark.parametrize("hidden", [0.0, 0.6])
-def test_who_crosses_keeps_the_number_whatever_the_sensor_calls_them(numbers: str, hidden: float) -> None:
+def test_crossing_people_keep_their_numbers_whatever_the_sensor_calls_them(numbers: str, hidden: float) -> None:
     """Two pass each other 0.6 m apart at 1.2 m/s each; the farther one may be hidden meanwhile."""
     rng = np.random.default_rng(5)
     association = Association()
@@ -129,7 +129,7 @@ def test_who_crosses_keeps_the_number_whatever_the_sensor_calls_them(numbers: st
     assert association.counters["new"] == 2 and association.counters["lost"] == 0
 
 
-def test_one_person_in_two_sensors_has_one_number_and_three_have_three() -> None:
+def test_people_have_the_same_numbers_in_both_sensors() -> None:
     rng = np.random.default_rng(6)
     for count in (1, 3):
         association = Association()
@@ -145,7 +145,7 @@ def test_one_person_in_two_sensors_has_one_number_and_three_have_three() -> None
         assert association.people == tuple(range(1, count + 1))
 
 
-def test_bodies_beyond_the_gate_are_two_people_and_one_when_they_turn_out_to_be() -> None:
+def test_bodies_beyond_the_gate_are_two_people_until_merged() -> None:
     association = Association()
     for step, (stamp_ns, places) in enumerate(walked(4.0, {0: ((2.0, 0.0), (2.0, 0.0))})):
         # the second sensor stands elsewhere than it is taken to, until that is put right
@@ -160,7 +160,7 @@ def test_bodies_beyond_the_gate_are_two_people_and_one_when_they_turn_out_to_be(
     assert association.counters["merged"] == 1
 
 
-def test_an_assignment_that_other_sensors_contradict_for_long_is_changed() -> None:
+def test_an_assignment_that_other_sensors_contradict_for_long_changes() -> None:
     """One sensor sees both; the other has seen only the second since it was near the first, and takes it for that."""
     association = Association()
     assigned: list[int | None] = []
@@ -176,7 +176,7 @@ def test_an_assignment_that_other_sensors_contradict_for_long_is_changed() -> No
     assert association.counters["exchanged"] >= 1 and association.counters["lost"] == 0
 
 
-def test_everybody_is_forgotten_at_once_and_numbers_go_on() -> None:
+def test_reset_forgets_all_people_and_reuses_no_number() -> None:
     association = Association()
     assert assign_frame(association, "kinect1", START_NS, {0: np.zeros(2), 1: np.ones(2)}) == {0: 1, 1: 2}
     assert association.assign("kinect1", []) == ()

@@ -88,7 +88,7 @@ def lowered(by: float) -> Callable[[Skeleton], Skeleton]:
 # --- what it is
 
 
-def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
+def test_noiseless_frames_give_the_truth_once_per_reference_frame() -> None:
     fused = run(fusion(), frames(8.0))
     assert len(fused) == 240
     assert np.diff([each.stamp_ns for each in fused]).min() > 0
@@ -98,7 +98,7 @@ def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
     assert errors(fused)[30:].max() < 0.03
 
 
-def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
+def test_two_noisy_sensors_have_smaller_error_and_covariance_than_one() -> None:
     alone = run(fusion(["kinect1"]), of_one(8.0, 0.02))
     together = run(fusion(), frames(8.0, 0.02))
     one, both = errors(alone)[30:90], errors(together)[30:90]
@@ -118,7 +118,7 @@ def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
     )
 
 
-def test_disagreement_makes_uncertain() -> None:
+def test_disagreement_increases_the_covariance() -> None:
     trunk = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
     agreed, apart = (
         run(fusion(), frames(3.0)),
@@ -133,7 +133,7 @@ def test_disagreement_makes_uncertain() -> None:
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=draws(6, 15), deadline=None)
-def test_arrival_a_few_milliseconds_earlier_or_later_changes_nothing(seed: int) -> None:
+def test_output_is_independent_of_small_changes_of_arrival(seed: int) -> None:
     rng = np.random.default_rng(seed)
     orderly = frames(4.0, 0.01, phase=0.004)
     shaken = sorted(
@@ -191,7 +191,7 @@ def test_the_thesis_methods_take_its_weights() -> None:
 # --- when sensors fail
 
 
-def test_a_sensor_that_falls_silent_is_dropped_within_a_tenth_of_a_second_and_taken_back() -> None:
+def test_a_silent_sensor_is_dropped_within_a_tenth_of_a_second_and_faded_in_again() -> None:
     def paused(seen: Skeleton) -> Skeleton | None:
         # While it is heard it lies by 10 cm, so that one sees when it counts.
         return None if 2.0 < seen.stamp - OFFSET < 4.0 else lowered(0.1)(seen)
@@ -208,7 +208,7 @@ def test_a_sensor_that_falls_silent_is_dropped_within_a_tenth_of_a_second_and_ta
     assert np.abs(np.diff(wrong[(stamps > 4.0) & (stamps < 4.6)])).max() < 0.012
 
 
-def test_the_others_go_on_while_the_reference_is_silent() -> None:
+def test_output_continues_while_the_reference_is_silent() -> None:
     def gone(seen: Skeleton) -> Skeleton | None:
         return None if 2.0 < seen.stamp < 4.0 else seen
 
@@ -221,9 +221,7 @@ def test_the_others_go_on_while_the_reference_is_silent() -> None:
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", [0.3, 1.2, 3.0])
-def test_one_sensor_that_reverses_for_a_while_is_not_followed_and_not_held_against_the_other(
-    sensor: str, seconds: float
-) -> None:
+def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds: float) -> None:
     """Whichever is believed: nobody turns round between two frames, and the other sensor does not say so."""
 
     def reverse(skeleton: Skeleton) -> Skeleton:
@@ -236,7 +234,7 @@ def test_one_sensor_that_reverses_for_a_while_is_not_followed_and_not_held_again
 
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
-def test_nor_is_one_that_turns_the_body_at_once_by_more_than_anybody_can(sensor: str) -> None:
+def test_an_impossible_turn_in_one_sensor_is_rejected(sensor: str) -> None:
     """Seen from the side a body whose sides are exchanged is turned by less than half a turn, too."""
 
     def turn(skeleton: Skeleton) -> Skeleton:
@@ -265,7 +263,7 @@ def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
     assert width[60:].min() > 0.75 * np.median(width[:60])
 
 
-def test_both_sensors_reversing_at_once_is_held_and_then_followed_without_a_mirror() -> None:
+def test_a_common_reversal_is_held_and_then_followed_by_turning() -> None:
     def turned(seen: Skeleton) -> Skeleton:
         return seen.mirrored() if seen.stamp > 3.0 else seen
 
@@ -280,7 +278,7 @@ def test_both_sensors_reversing_at_once_is_held_and_then_followed_without_a_mirr
     assert errors(fused)[-1].max() > 0.2
 
 
-def test_outliers_of_one_joint_are_gated_and_a_new_place_is_accepted_in_the_end() -> None:
+def test_outliers_of_a_joint_are_gated_and_a_lasting_change_is_accepted() -> None:
     def wild(seen: Skeleton) -> Skeleton:
         positions = seen.positions.copy()
         clock = seen.stamp
@@ -312,7 +310,7 @@ def test_late_repeated_and_backward_stamps() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_joints_that_are_nowhere_are_left_out() -> None:
+def test_joints_that_are_not_valid_are_left_out() -> None:
     def damaged(seen: Skeleton) -> Skeleton:
         positions, states = seen.positions.copy(), seen.states.copy()
         positions[Joint.HAND_LEFT] = np.nan

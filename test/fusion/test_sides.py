@@ -40,14 +40,14 @@ def accepted_headings(seconds: float, seen: Mapping[str, tuple[float, float]], h
 
 
 @pytest.mark.parametrize("others", [1, 2, 3])
-def test_one_that_turns_the_body_at_once_is_not_followed(others: int) -> None:
+def test_a_reversal_seen_by_one_sensor_is_rejected(others: int) -> None:
     right = {f"right{number}": (0.0, 0.0) for number in range(others)}
     assert accepted_headings(6.0, {"wrong": (2.0, 4.5)} | right) == pytest.approx([0.0] * 180)
     assert accepted_headings(6.0, right | {"wrong": (2.0, 4.5)}) == pytest.approx([0.0] * 180)
 
 
 @pytest.mark.parametrize("right", [["front"], ["front", "left"]])
-def test_one_that_still_errs_does_not_keep_the_others_from_being_believed(right: list[str]) -> None:
+def test_a_sensor_that_still_errs_does_not_block_a_correct_majority(right: list[str]) -> None:
     """Two sensors behind somebody err alike; the believed one comes to its senses, the other one never does."""
     seen = {"behind": (0.0, 3.0)} | dict.fromkeys(right, (0.0, 0.0)) | {"also behind": (0.0, 8.0)}
     found = accepted_headings(8.0, seen)
@@ -55,7 +55,7 @@ def test_one_that_still_errs_does_not_keep_the_others_from_being_believed(right:
 
 
 @pytest.mark.parametrize("wrong", [2.5, 4.0])
-def test_who_was_seen_to_face_a_sensor_is_not_turned_round_for_as_long_as_sensors_err(wrong: float) -> None:
+def test_a_temporary_reversal_of_a_person_facing_the_sensors_is_rejected(wrong: float) -> None:
     """Even at the beginning, and where all sensors err at once."""
     for begin in (0.5, 5.0):
         seen = {"left": (begin, begin + wrong), "right": (begin, begin + 2.0)}
@@ -63,7 +63,7 @@ def test_who_was_seen_to_face_a_sensor_is_not_turned_round_for_as_long_as_sensor
 
 
 @pytest.mark.parametrize(("wrong", "until"), [(0.3, 0.3 + MIN_HOLD), (3.0, 6.0)])
-def test_who_was_first_seen_from_behind_is_turned_round_after_as_long(wrong: float, until: float) -> None:
+def test_a_wrong_start_is_corrected_after_its_own_duration(wrong: float, until: float) -> None:
     """A Kinect takes everybody to face it: where it does not it errs more often than where it does."""
     found = accepted_headings(10.0, {"alone": (0.0, wrong)}, hold=10.0)
     turned = round(30 * until)
@@ -71,13 +71,13 @@ def test_who_was_first_seen_from_behind_is_turned_round_after_as_long(wrong: flo
     assert found[turned + 2 :] == pytest.approx([0.0] * (298 - turned))
 
 
-def test_who_is_seen_from_behind_for_long_is_believed_to_be() -> None:
+def test_a_lasting_reversal_is_accepted_after_the_hold_time() -> None:
     found = accepted_headings(30.0, {"alone": (5.0, 30.0)}, hold=10.0)
     assert found[: 30 * 15] == pytest.approx([0.0] * 450)
     assert np.abs(found[30 * 15 + 2 :]) == pytest.approx(ROUND)
 
 
-def test_who_takes_over_from_a_sensor_that_vanishes_is_held_to_what_that_saw() -> None:
+def test_the_heading_survives_the_loss_of_the_trusted_sensor() -> None:
     sides, counters, found = Sides(), Counter[str](), []
     for number in range(240):
         time = number / 30.0
@@ -92,7 +92,7 @@ def test_who_takes_over_from_a_sensor_that_vanishes_is_held_to_what_that_saw() -
     assert sides.trusted == "side"
 
 
-def test_a_sensor_beside_the_body_is_not_believed_on_its_heading_though_it_is_trusted() -> None:
+def test_a_trusted_sensor_with_a_side_view_has_little_weight_on_the_heading() -> None:
     """The trusted sensor comes to see the body from the side, its hips 6 cm apart, while another faces it."""
     sides, counters = Sides(), Counter[str]()
     for number in range(60):
@@ -103,7 +103,7 @@ def test_a_sensor_beside_the_body_is_not_believed_on_its_heading_though_it_is_tr
     assert accepted == pytest.approx([1.2, 1.2], abs=0.15)
 
 
-def test_nobodys_shoulders_are_turned_round_above_the_hips() -> None:
+def test_shoulders_and_hips_are_never_reversed_against_each_other() -> None:
     """However long a sensor says so of one half: the other half of what it sees speaks against it."""
     sides, counters = Sides(), Counter[str]()
     for number in range(600):
@@ -113,7 +113,7 @@ def test_nobodys_shoulders_are_turned_round_above_the_hips() -> None:
         assert math.cos(upper - lower) > 0.0
 
 
-def test_one_that_sees_badly_reverses_nobody_while_the_other_is_silent_for_a_moment() -> None:
+def test_a_sensor_of_small_weight_reverses_no_body_during_a_short_silence() -> None:
     """Beside the body a Kinect tells any heading; the trusted one is silent for a quarter of a second."""
     sides, counters = Sides(), Counter[str]()
     for number in range(150):
@@ -125,7 +125,7 @@ def test_one_that_sees_badly_reverses_nobody_while_the_other_is_silent_for_a_mom
     assert np.cos(headings).min() > 0.8
 
 
-def test_a_hip_that_is_elsewhere_at_once_does_not_turn_the_hips() -> None:
+def test_a_jump_of_one_hip_does_not_turn_the_hips() -> None:
     """A label that jumps by 25 cm for two frames, in the only sensor."""
     sides = Sides()
     hips, shoulders = PAIRS[1], PAIRS[0]

@@ -292,7 +292,7 @@ OUTER = {
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
-def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> None:
+def test_the_standard_deviation_grows_towards_a_singular_pose(name: str) -> None:
     """Outer angles: growing towards the singular pose, until they may be anything; the middle one stays what it is."""
     stddev, before = 0.5 * DEGREE, 0.0
     flexion, abduction = SINGULAR[name]
@@ -349,7 +349,7 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
-def test_rates_of_held_angles_are_those_of_the_angles_that_are_told(name: str) -> None:
+def test_rates_of_held_angles_are_the_derivatives_of_the_held_angles(name: str) -> None:
     """One degree beside the singular pose, known to 3 deg: the first angle stands, the last takes the whole turn."""
     q = arms(SINGULAR[name][0] + 0.6, SINGULAR[name][1] - 0.8)
     rng = np.random.default_rng(5)
@@ -383,7 +383,7 @@ def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
     assert spread[columns].max() < 60.0
 
 
-def test_an_angle_that_nothing_observes_has_the_deviation_of_its_prior() -> None:
+def test_an_unobserved_angle_has_the_deviation_of_its_prior() -> None:
     """What is known of it is handed out; infinity is left to what has no estimate at all (DESIGN, 4)."""
     prior = PosturePrior(MODEL, RANGES)
     covariance = np.diag(np.append(np.zeros(6), prior.stddev**2).tolist() + [0.0] * NV)
@@ -394,7 +394,7 @@ def test_an_angle_that_nothing_observes_has_the_deviation_of_its_prior() -> None
     assert np.isfinite(angles.position_stddev).all()
 
 
-def test_infinite_variances_and_missing_velocities_stay_where_they_belong() -> None:
+def test_infinite_variances_and_missing_velocities_affect_their_angles_only() -> None:
     number = MODEL.coordinate_names.index("lumbar_axial")
     covariance = 1e-6 * np.eye(2 * NV)
     covariance[number, number] = np.inf
@@ -411,7 +411,7 @@ def test_infinite_variances_and_missing_velocities_stay_where_they_belong() -> N
     np.testing.assert_array_equal(np.isnan(angles.velocity), np.isinf(angles.position_stddev))
 
 
-def test_wrong_names_are_refused() -> None:
+def test_unknown_conventions_and_other_previous_angles_raise() -> None:
     now = estimate(MODEL.neutral())
     with pytest.raises(ConventionError, match="'euler': not one of model, isb, rep155, dh26"):
         angles_of(now, MODEL, "euler")
@@ -437,7 +437,7 @@ def test_segment_quaternions_are_the_models_rotations() -> None:
             np.testing.assert_allclose(so3.quat_to_matrix(result.relative[segment]), expected, rtol=0, atol=1e-12)
 
 
-def test_segment_quaternions_state_their_scatter_even_in_the_t_pose() -> None:
+def test_segment_quaternion_deviations_match_their_scatter_in_the_t_pose() -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(NV, NV))
     covariance = np.zeros((2 * NV, 2 * NV))

@@ -72,7 +72,7 @@ def correlated_noise(times: FloatArray, rng: np.random.Generator, persistence: f
     return found
 
 
-def test_of_perfect_points_the_lengths_are_exact() -> None:
+def test_lengths_of_noiseless_points_are_exact() -> None:
     for seed in range(5):
         times, points, lengths = moving_person(seed, 4.0)
         assert_allclose(estimated(times, points).lengths, lengths, rtol=0.0, atol=1e-6)
@@ -80,7 +80,7 @@ def test_of_perfect_points_the_lengths_are_exact() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
+def test_lengths_are_invariant_under_rigid_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     times, points, _ = moving_person(3, 4.0, rate=10.0)
     points = points + rng.normal(scale=0.01, size=points.shape)
@@ -90,7 +90,7 @@ def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
     assert_allclose(one.covariance, two.covariance, rtol=0.0, atol=1e-9)
 
 
-def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
+def test_without_measurements_the_estimate_is_the_prior() -> None:
     for seen in (SegmentLengths(), gathered(*moving_person(0, 4.0)[:2], tracked=~EVERY)):
         estimate = seen.estimate()
         assert_allclose(estimate.lengths, MODEL.default_lengths())
@@ -100,7 +100,7 @@ def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
         assert between < 0.1 * estimate.covariance[left, left]
 
 
-def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
+def test_an_unseen_arm_has_the_lengths_of_the_other_one() -> None:
     times, points, lengths = moving_person(4, 10.0)
     hidden = np.isin(POINTS, [Joint[f"{name}_LEFT"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")])
     estimate = estimated(times, points, tracked=~hidden)
@@ -112,7 +112,7 @@ def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.02, 0.04])
-def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
+def test_white_noise_biases_no_length_and_is_in_the_covariance(noise: float) -> None:
     off, normalised = [], []
     for seed in range(12):
         times, points, lengths = moving_person(seed, 12.0)
@@ -124,14 +124,14 @@ def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
     assert 0.3 < np.square(normalised).mean() < 2.0
 
 
-def test_the_more_frames_the_surer_as_long_as_the_noise_is_white() -> None:
+def test_stddev_falls_with_the_square_root_of_time_under_white_noise() -> None:
     times, points, _ = moving_person(5, 32.0)
     points = points + np.random.default_rng(5).normal(scale=0.02, size=points.shape)
     short, long = (stddev(estimated(times[times < end], points[times < end], 0.02)) for end in (8.0, 32.0))
     assert np.median(long / short) < 0.7  # half, as variances fall with the time
 
 
-def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out() -> None:
+def test_correlated_errors_do_not_average_out_as_white_noise() -> None:
     """Two halves of a minute differ as is stated, by far more than if every frame were new."""
     normalised, as_if_new = [], []
     for seed in range(10):
@@ -148,7 +148,7 @@ def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out(
     assert np.square(as_if_new).mean() > 5.0
 
 
-def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
+def test_outlier_frames_and_blocks_do_not_move_the_estimate() -> None:
     times, points, lengths = moving_person(6, 20.0)
     rng = np.random.default_rng(6)
     points = points + rng.normal(scale=0.01, size=points.shape)
@@ -163,7 +163,7 @@ def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
     assert np.abs(bad.lengths - good.lengths).max() < 0.015
 
 
-def test_seconds_seen_badly_count_less() -> None:
+def test_blocks_of_large_variance_have_less_weight() -> None:
     times, points, lengths = moving_person(7, 20.0)
     late = times >= 10.0
     points = points + np.random.default_rng(7).normal(scale=0.003, size=points.shape)
@@ -176,13 +176,13 @@ def test_seconds_seen_badly_count_less() -> None:
     assert off_badly < 0.5 * off_alike
 
 
-def test_stated_slow_errors_keep_a_few_seconds_from_being_sure() -> None:
+def test_stated_slow_errors_increase_the_stddev() -> None:
     times, points, _ = moving_person(8, 6.0)
     sure, unsure = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
     assert (unsure > 2.0 * sure).all()
 
 
-def test_two_sensors_are_gathered_apart() -> None:
+def test_each_sensor_has_its_own_blocks() -> None:
     times, points, lengths = moving_person(9, 6.0)
     seen = SegmentLengths()
     zero = np.zeros(len(POINTS))
@@ -193,14 +193,14 @@ def test_two_sensors_are_gathered_apart() -> None:
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
-def test_a_sensor_of_few_frames_is_learnt_from_too() -> None:
+def test_a_slow_sensor_gives_blocks() -> None:
     times, points, lengths = moving_person(10, 12.0, rate=2.0)
     seen = gathered(times, points)
     assert len(seen.blocks) >= 4
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
-def test_only_as_many_blocks_are_kept_as_the_memory_has() -> None:
+def test_old_blocks_are_dropped() -> None:
     times, points, lengths = moving_person(11, 12.0)
     seen = SegmentLengths(memory=3)
     taller = np.where((times < 6.0)[:, None, None], points, 1.1 * points)
@@ -210,7 +210,7 @@ def test_only_as_many_blocks_are_kept_as_the_memory_has() -> None:
     assert_allclose(seen.estimate().lengths, 1.1 * lengths, rtol=0.0, atol=1e-6)
 
 
-def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> None:
+def test_an_unfinished_block_can_be_used_from_the_first_frame() -> None:
     times, points, lengths = moving_person(12, 0.9)
     for count in (1, 2, 3, 4, len(times)):
         seen = gathered(times[:count], points[:count])
@@ -224,7 +224,7 @@ def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> Non
 # --- of filtered skeletons
 
 
-def test_lengths_of_skeletons_are_there_at_once_and_never_jump() -> None:
+def test_lengths_of_skeletons_start_at_once_and_never_jump() -> None:
     times, points, lengths = moving_person(13, 12.0)
     tracker = SkeletonLengths()
     course = []
@@ -239,7 +239,7 @@ def test_lengths_of_skeletons_are_there_at_once_and_never_jump() -> None:
     assert_allclose(tracker.lengths, MODEL.default_lengths())
 
 
-def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> None:
+def test_lengths_adapt_to_another_person_within_a_minute() -> None:
     times, points, lengths = moving_person(14, 140.0, rate=10.0)
     tracker = SkeletonLengths()
     for time, frame in zip(times, np.where((times < 80.0)[:, None, None], 0.85 * points, points), strict=True):
@@ -248,7 +248,7 @@ def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> Non
 
 
 @pytest.mark.slow
-def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
+def test_both_halves_of_a_real_recording_give_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
     import_files([shared_data / "kinect_pairs" / "p02_45deg.csv.gz"], tmp_path / "in")
     replay(tmp_path / "in", tmp_path / "out", ReplaySettings(()))
     with BagReader(tmp_path / "out") as reader:

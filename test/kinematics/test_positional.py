@@ -228,7 +228,7 @@ def test_impossible_bodies_are_unknown_and_do_not_warn(fill: float) -> None:
     assert np.isinf(angles.velocity_stddev).all()
 
 
-def test_nothing_is_claimed_without_covariances_or_velocities() -> None:
+def test_without_covariances_or_velocities_the_deviations_are_infinite() -> None:
     angles = positional_angles(skeleton(bent_pose(0)))
     assert np.isfinite(angles.position).all() and np.isnan(angles.velocity).all()
     assert np.isinf(angles.position_stddev).all() and np.isinf(angles.velocity_stddev).all()
