@@ -204,7 +204,7 @@ class Ranges:
         """The same posture told by angles that leave the ranges less.
 
         An upper arm turned by half a turn about itself, the elbow bent the other way and the forearm turned by half a
-        turn put everything where it was. A fit to points can come out in either branch; the ranges tell them apart.
+        turn are the same posture. A fit to points can converge to either branch; the ranges distinguish them.
 
         Args:
             q: (nq,) one configuration.

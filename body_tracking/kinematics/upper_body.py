@@ -388,10 +388,10 @@ class UpperBody:
         return np.asarray(3 + np.flatnonzero(self._turns[self.segment_names.index(segment)]), dtype=np.intp)
 
     def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
-        """Where the points are on average, beside where they are at the mean of the configuration.
+        """Expectation of the points minus their positions at the mean of the configuration, to second order.
 
-        A point that swings about a joint stays behind its tangent: to second order by half the sum over all pairs of
-        coordinates of their covariance and the point's second derivative, axis x (derivative by the later one).
+        Half the sum over all pairs of coordinates of their covariance and the point's second derivative, axis x
+        (derivative by the later one).
 
         Args:
             lines: the linearisation at the mean, of one configuration.
