@@ -103,7 +103,7 @@ class Ordering:
                 self._left_ns = first.stamp_ns
                 for source in self._sources.values():
                     source.rhythm.record(arrived=source.rhythm not in due)
-            self.counters["in vain"] += waited and bool(due) and self._wait_ns > 0
+            self.counters["expired waits"] += waited and bool(due) and self._wait_ns > 0
             del self._waiting[0]
             ready.append((first.sensor, first.skeleton))
         return ready

@@ -201,7 +201,7 @@ class Ranges:
         return clipped
 
     def nearest_branch(self, q: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """The same posture told by angles that leave the ranges less.
+        """The same posture by angles that leave the ranges less.
 
         An upper arm turned by half a turn about itself, the elbow bent the other way and the forearm turned by half a
         turn are the same posture. A fit to points can converge to either branch; the ranges distinguish them.

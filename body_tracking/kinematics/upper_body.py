@@ -33,7 +33,7 @@ from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 
 _EYE3 = np.eye(3)
 _X, _Y, _Z = _EYE3
-# of a point x, [x]x beside the identity: (3, 6), row by row
+# of a point x, [x]x and the identity: (3, 6), row by row
 _ARM = np.concatenate([so3.SKEW.reshape(3, 3, 3), np.zeros((3, 3, 3))], axis=-1).reshape(3, 18)
 _BESIDE = np.concatenate([np.zeros((3, 3)), _EYE3], axis=-1).reshape(18)
 _CROSS = -so3.SKEW

@@ -1,4 +1,4 @@
-"""Laws of the offsets of joints that a T-pose tells, on people of whom these are known."""
+"""Laws of the joint offsets estimated from a T-pose, on people with known offsets."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def some_offsets(seed: int = 0) -> FloatArray:
 
 
 def seen(positions: FloatArray, local: FloatArray) -> FloatArray:
-    """(25, 3) with joints beside where they are."""
+    """(25, 3) with joints displaced by offsets."""
     result = positions.copy()
     result[LEARNT] += posed(positions, local[:, None])[:, 0]
     return result
@@ -231,7 +231,7 @@ ODD = (
     T_POSE
     + 0.3 * np.isin(np.arange(N_JOINTS), (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT))[:, None] * body_axes(T_POSE)[:, 2]
 )
-"""What looks like a T-pose, and is nobody's."""
+"""Resembles a T-pose, and is impossible for a person."""
 
 
 @pytest.mark.parametrize(

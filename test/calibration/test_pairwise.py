@@ -1,4 +1,4 @@
-"""The pose estimate survives what Kinect skeletons do, and says how sure it is."""
+"""The pose estimate is robust against the errors of Kinect skeletons, with a consistent covariance."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_memory_is_bounded_and_spread_over_places() -> None:
     coverage = Coverage(per_place=5, capacity=60)
     body = walk(np.zeros(1))[0]
     nothing = np.zeros((25, 3))
-    for index in range(1000):  # somebody who stands
+    for index in range(1000):  # a standing person
         coverage.add(index * 0.1, body, body, nothing, np.ones(25))
     assert len(coverage) == 5
     assert coverage.oldest == pytest.approx(99.5)

@@ -1,4 +1,4 @@
-"""Who is whom: laws of the assignment of bodies to people."""
+"""Laws of the assignment of bodies to people."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from body_tracking.fusion.association import HOLD, Association, torso_distances,
 from walkers import performed
 
 FIGURE = performed("standing_still", np.zeros(1))[0]
-"""(25, 3) metres: somebody who stands at the origin."""
+"""(25, 3) metres: a person who stands at the origin."""
 
 START_NS = 40 * NANOSECONDS
 TRACKED = np.full(25, 2, np.uint8)
@@ -49,7 +49,7 @@ def assign_frame(
     numbers: Mapping[int, int] | None = None,
     rng: np.random.Generator | None = None,
 ) -> Who:
-    """One frame of a sensor, which sees these people."""
+    """Assign one frame of a sensor, with these people in it."""
     bodies = [
         body(place.tolist(), stamp_ns, who if numbers is None else numbers[who], rng) for who, place in places.items()
     ]
@@ -79,8 +79,8 @@ def test_torso_distance_ignores_swapped_sides_and_an_outlier() -> None:
     partly[7] = FIGURE[7]  # a hand alone
     apart = torso_distances(points[:1], torso_points(np.stack([astray, partly])))[0]
     assert apart[0] == pytest.approx(0.0, abs=1e-12) and 0.0 < apart[1] < 1.0
-    nobody = torso_points(np.full((1, 25, 3), np.nan))
-    assert torso_distances(points[:1], nobody)[0, 0] == np.inf
+    unknown = torso_points(np.full((1, 25, 3), np.nan))
+    assert torso_distances(points[:1], unknown)[0, 0] == np.inf
 
 
 @pytest.mark.parametrize("gap", [0.5, 0.8 * HOLD])
@@ -98,7 +98,7 @@ def test_a_hidden_person_keeps_the_number_for_the_hold_time_only(gap: float) -> 
     later_ns = end_ns + round((HOLD + 0.5) * NANOSECONDS)
     for at_ns in range(end_ns, later_ns, NANOSECONDS // 30):
         assign_frame(association, "kinect1", at_ns + 1, {0: standing[0]})
-    for step in range(12):  # not at once: a ghost is nobody
+    for step in range(12):  # a new person is confirmed after some frames
         after = assign_frame(association, "kinect1", later_ns + step * NANOSECONDS // 30, back)
         assert step > 0 or after[1] is None
     assert after[0] == before[0] and after[1] not in (None, *before.values())
@@ -108,7 +108,7 @@ def test_a_hidden_person_keeps_the_number_for_the_hold_time_only(gap: float) -> 
 @pytest.mark.parametrize("numbers", ["kept", "exchanged", "shuffled"])
 @pytest.mark.parametrize("hidden", [0.0, 0.6])
 def test_crossing_people_keep_their_numbers_whatever_the_sensor_calls_them(numbers: str, hidden: float) -> None:
-    """Two pass each other 0.6 m apart at 1.2 m/s each; the farther one may be hidden meanwhile."""
+    """Two people pass each other 0.6 m apart at 1.2 m/s each; the farther one may be hidden meanwhile."""
     rng = np.random.default_rng(5)
     association = Association()
     paths = {0: ((2.0, -1.5), (2.0, 1.5)), 1: ((2.6, 1.5), (2.6, -1.5))}
@@ -148,7 +148,7 @@ def test_people_have_the_same_numbers_in_both_sensors() -> None:
 def test_bodies_beyond_the_gate_are_two_people_until_merged() -> None:
     association = Association()
     for step, (stamp_ns, places) in enumerate(walked(4.0, {0: ((2.0, 0.0), (2.0, 0.0))})):
-        # the second sensor stands elsewhere than it is taken to, until that is put right
+        # the second sensor's pose is wrong until it is corrected
         wrong = np.array([0.0, 0.9]) if step < 60 else np.zeros(2)
         if step == 60:
             association.move_sensor("kinect2", np.eye(3), np.array([0.0, -0.9, 0.0]))
@@ -161,7 +161,7 @@ def test_bodies_beyond_the_gate_are_two_people_until_merged() -> None:
 
 
 def test_an_assignment_that_other_sensors_contradict_for_long_changes() -> None:
-    """One sensor sees both; the other has seen only the second since it was near the first, and takes it for that."""
+    """One sensor sees both; the other one has seen only the second person, and assigned it to the first, nearby."""
     association = Association()
     assigned: list[int | None] = []
     for step, (stamp_ns, places) in enumerate(walked(4.0, {0: ((2.0, 0.0), (2.0, 0.0)), 1: ((2.4, 0.1), (2.6, 0.9))})):

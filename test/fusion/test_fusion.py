@@ -1,4 +1,4 @@
-"""One skeleton from several sensors: by stamp, weighted, and not fooled by one of them."""
+"""One skeleton from several sensors: by stamp, weighted, and robust against one of them."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def changed(given_frames: list[Frame], sensor: str, change: Callable[[Skeleton],
 
 
 def lowered(by: float) -> Callable[[Skeleton], Skeleton]:
-    """Everything so many metres lower: the optical y axis points down."""
+    """Shift all joints down, metres: the optical y axis points down."""
     return lambda seen: replace(seen, positions=seen.positions + [0.0, by, 0.0])
 
 
@@ -93,7 +93,7 @@ def test_noiseless_frames_give_the_truth_once_per_reference_frame() -> None:
     assert len(fused) == 240
     assert np.diff([each.stamp_ns for each in fused]).min() > 0
     assert {each.frame_id for each in fused} == {"world"}
-    # What extrapolation over half a frame cannot know of the hands of a waving person.
+    # The extrapolation error of a waving person's hands over half a frame.
     assert errors(fused)[30:].mean() < 0.002
     assert errors(fused)[30:].max() < 0.03
 
@@ -193,7 +193,7 @@ def test_the_thesis_methods_take_its_weights() -> None:
 
 def test_a_silent_sensor_is_dropped_within_a_tenth_of_a_second_and_faded_in_again() -> None:
     def paused(seen: Skeleton) -> Skeleton | None:
-        # While it is heard it lies by 10 cm, so that one sees when it counts.
+        # Its frames are 10 cm off, which shows when they have weight.
         return None if 2.0 < seen.stamp - OFFSET < 4.0 else lowered(0.1)(seen)
 
     fused = run(fusion(fade_in=0.5), changed(frames(8.0), "kinect2", paused))
@@ -222,7 +222,7 @@ def test_output_continues_while_the_reference_is_silent() -> None:
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", [0.3, 1.2, 3.0])
 def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds: float) -> None:
-    """Whichever is believed: nobody turns round between two frames, and the other sensor does not say so."""
+    """Whichever is the trusted one: the other sensor sees no reversal."""
 
     def reverse(skeleton: Skeleton) -> Skeleton:
         stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
@@ -235,7 +235,7 @@ def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 def test_an_impossible_turn_in_one_sensor_is_rejected(sensor: str) -> None:
-    """Seen from the side a body whose sides are exchanged is turned by less than half a turn, too."""
+    """In a side view, swapped sides can turn the body by less than half a turn."""
 
     def turn(skeleton: Skeleton) -> Skeleton:
         stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
@@ -251,7 +251,7 @@ def test_an_impossible_turn_in_one_sensor_is_rejected(sensor: str) -> None:
 
 
 def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
-    """A sensor whose axis lies across the believed one loses its say on left and right, not the rest."""
+    """Of a sensor whose axis is across the accepted one, only the joints of left and right are rejected."""
 
     def twisted(seen: Skeleton) -> Skeleton:
         centre = seen.positions[Joint.SPINE_SHOULDER]
@@ -269,12 +269,12 @@ def test_a_common_reversal_is_held_and_then_followed_by_turning() -> None:
 
     made = fusion(["kinect1"])
     fused = run(made, changed(of_one(16.0), "kinect1", turned))
-    assert errors(fused)[[each.stamp < 3.0 + HOLD for each in fused]].max() < 0.1  # nobody turns round at once
+    assert errors(fused)[[each.stamp < 3.0 + HOLD for each in fused]].max() < 0.1
     axes = np.stack([left_right_axes(each.positions)[0] for each in fused])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     assert np.einsum("ni,ni->n", axes[1:], axes[:-1]).min() > 0.4  # never through a mirror
     assert made.counters["reversals_accepted"] > 0
-    # In the end the sensor is believed: it may have been wrong before.
+    # In the end the reversal is accepted.
     assert errors(fused)[-1].max() > 0.2
 
 

@@ -71,7 +71,7 @@ def test_frames_of_steady_sensors_leave_once_and_in_order(
             left.append((skeleton.stamp_ns, now_ns))
     left += [(skeleton.stamp_ns, 0) for _, skeleton in ordering.flush()]
     assert sorted(stamp for stamp, _ in left) == sorted(stamp for _, stamp, _ in events)
-    # in the beginning nothing tells that a sensor is there at all
+    # before its first frame a sensor is unknown
     settled = [stamp for stamp, _ in left if stamp > (33 + 32) * MS]
     assert settled == sorted(settled)
 
@@ -90,14 +90,14 @@ def test_of_frames_that_arrived_together_the_oldest_goes_first() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     now = known(ordering, {"a": 10 * MS, "b": 0})
     assert ordering.push("a", frame(now + 10 * MS), now + 10 * MS) == []
-    # nobody looked for longer than it may wait
+    # no poll for longer than the wait
     later = now + 60 * MS
     ordering.hold("a", frame(now + 10 * MS + PERIOD), later)
     ordering.hold("b", frame(now), later)
     ordering.hold("b", frame(now + PERIOD), later)
     assert stamps(ordering.poll(later)) == [now, now + 10 * MS, now + PERIOD, now + 10 * MS + PERIOD]
     assert ordering.deadline_ns is None
-    assert ordering.counters["in vain"] == 0
+    assert ordering.counters["expired waits"] == 0
 
 
 def test_waiting_frames_go_first_after_a_jump_back() -> None:
@@ -119,9 +119,9 @@ def test_a_frame_leaves_alone_at_its_deadline() -> None:
         ordering.push("a", frame(now + 10 * MS), now + 10 * MS)
     assert stamps(polled.poll(now + 30 * MS)) == [now + 10 * MS]
     assert stamps(polled.push("b", frame(now), now + 31 * MS)) == [now]
-    # whether somebody polled in between makes no difference to what goes first
+    # polls in between do not change the order
     assert stamps(pushed.push("b", frame(now), now + 31 * MS)) == [now + 10 * MS, now]
-    assert polled.counters == pushed.counters == {"in vain": 1}
+    assert polled.counters == pushed.counters == {"expired waits": 1}
 
 
 def test_with_zero_wait_frames_pass_at_once() -> None:

@@ -1,4 +1,4 @@
-"""Whom to believe on left and right, by the headings that sensors report."""
+"""Left and right from the headings that sensors report."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_reversal_seen_by_one_sensor_is_rejected(others: int) -> None:
 
 @pytest.mark.parametrize("right", [["front"], ["front", "left"]])
 def test_a_sensor_that_still_errs_does_not_block_a_correct_majority(right: list[str]) -> None:
-    """Two sensors behind somebody err alike; the believed one comes to its senses, the other one never does."""
+    """Two sensors behind a person err alike; the trusted one recovers, the other one does not."""
     seen = {"behind": (0.0, 3.0)} | dict.fromkeys(right, (0.0, 0.0)) | {"also behind": (0.0, 8.0)}
     found = accepted_headings(8.0, seen)
     assert found[round(30 * (3.0 + HOLD)) + 2 :] == pytest.approx([0.0] * 118)
@@ -56,7 +56,7 @@ def test_a_sensor_that_still_errs_does_not_block_a_correct_majority(right: list[
 
 @pytest.mark.parametrize("wrong", [2.5, 4.0])
 def test_a_temporary_reversal_of_a_person_facing_the_sensors_is_rejected(wrong: float) -> None:
-    """Even at the beginning, and where all sensors err at once."""
+    """Also at the beginning, and where all sensors err at once."""
     for begin in (0.5, 5.0):
         seen = {"left": (begin, begin + wrong), "right": (begin, begin + 2.0)}
         assert accepted_headings(12.0, seen, hold=10.0) == pytest.approx([0.0] * 360)
@@ -64,7 +64,7 @@ def test_a_temporary_reversal_of_a_person_facing_the_sensors_is_rejected(wrong: 
 
 @pytest.mark.parametrize(("wrong", "until"), [(0.3, 0.3 + MIN_HOLD), (3.0, 6.0)])
 def test_a_wrong_start_is_corrected_after_its_own_duration(wrong: float, until: float) -> None:
-    """A Kinect takes everybody to face it: where it does not it errs more often than where it does."""
+    """A Kinect assumes that people face it, so a back view is the rarer error."""
     found = accepted_headings(10.0, {"alone": (0.0, wrong)}, hold=10.0)
     turned = round(30 * until)
     assert np.abs(found[: turned - 2]) == pytest.approx(ROUND)
@@ -104,7 +104,7 @@ def test_a_trusted_sensor_with_a_side_view_has_little_weight_on_the_heading() ->
 
 
 def test_shoulders_and_hips_are_never_reversed_against_each_other() -> None:
-    """However long a sensor says so of one half: the other half of what it sees speaks against it."""
+    """However long a sensor reports one half reversed."""
     sides, counters = Sides(), Counter[str]()
     for number in range(600):
         seen = [[0.0 if number < 60 else ROUND, 0.0]]
@@ -114,7 +114,7 @@ def test_shoulders_and_hips_are_never_reversed_against_each_other() -> None:
 
 
 def test_a_sensor_of_small_weight_reverses_no_body_during_a_short_silence() -> None:
-    """Beside the body a Kinect tells any heading; the trusted one is silent for a quarter of a second."""
+    """In a side view a Kinect reports any heading; the trusted one is silent for a quarter of a second."""
     sides, counters = Sides(), Counter[str]()
     for number in range(150):
         silent = 60 <= number < 68

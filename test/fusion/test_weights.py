@@ -1,4 +1,4 @@
-"""The thesis's weights: what its text says, and what its formula gives (DESIGN 4.2)."""
+"""The thesis's weights: by its text and by its formula (DESIGN 4.2)."""
 
 from __future__ import annotations
 

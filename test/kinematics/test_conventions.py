@@ -73,7 +73,7 @@ def arms(flexion: float, abduction: float, rotation: float = 0.0, elbow: float =
     return q
 
 
-def told(angles: JointAngles) -> dict[str, float]:
+def degrees_of(angles: JointAngles) -> dict[str, float]:
     return dict(zip(angles.names, angles.position.tolist(), strict=True))
 
 
@@ -206,7 +206,7 @@ def test_the_angles_rebuild_the_rotations(name: str) -> None:
     for q in (*poses(100), *(arms(*pose, rotation=20.0, elbow=50.0) for pose in singular)):
         angles = angles_of(estimate(q), MODEL, name)
         assert np.isfinite(angles.position).all()
-        REBUILT[name](q, told(angles))
+        REBUILT[name](q, degrees_of(angles))
 
 
 OWN = ((0, 0, 0, 0), (0, 90, 0, 0), (90, 0, 0, 0), (170, 0, 0, 0), (0, 170, 0, 0), (-40, 0, 0, 90), (0, 30, 50, 90))
@@ -235,7 +235,7 @@ HERS = tuple(f"theta{number}" for number in (13, 14, 15, 16, 17, 20, 24))
 )
 def test_textbook_poses(convention: str, keys: tuple[str, ...], pose: tuple[int, ...], values: tuple[int, ...]) -> None:
     """Degrees of both arms; all other angles are zero but the ISB's pronation, which is 90 with thumbs forward."""
-    for label, angle in told(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
+    for label, angle in degrees_of(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
         key = label[2:] if label[2:] in keys else label.removesuffix("_left").removesuffix("_right")
         known = dict(zip(keys, values, strict=True))
         rest = 90.0 if key == "elbow_pronation" else 0.0
@@ -311,7 +311,7 @@ def test_the_standard_deviation_grows_towards_a_singular_pose(name: str) -> None
 
 def _path(kind: str, offset: float) -> list[FloatArray]:
     """An arm that swings through a pose and a little past it, degrees per step at most 3."""
-    steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # nobody's arm goes far behind straight up
+    steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # an arm does not go far behind straight up
     if kind == "hanging":
         return [arms(t, offset) for t in steps]
     if kind == "t_pose":
@@ -339,7 +339,7 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
             assert step.max() < 15.0, [(n, s) for n, s in zip(angles.names, step, strict=True) if s > 5]
         if name == "model":
             for side, _ in SIDES:
-                a = told(angles)
+                a = degrees_of(angles)
                 t = [a[f"shoulder_{k}_{side}"] for k in ("flexion", "abduction", "rotation")]
                 built = np.linalg.multi_dot([turn(axis, x) for axis, x in zip(SHOULDER_AXES[side], t, strict=True)])
                 r = rotations_of(q)
@@ -350,7 +350,7 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_rates_of_held_angles_are_the_derivatives_of_the_held_angles(name: str) -> None:
-    """One degree beside the singular pose, known to 3 deg: the first angle stands, the last takes the whole turn."""
+    """One degree from the singular pose, known to 3 deg: the first angle is held, the last takes the whole turn."""
     q = arms(SINGULAR[name][0] + 0.6, SINGULAR[name][1] - 0.8)
     rng = np.random.default_rng(5)
     velocity = np.concatenate([np.zeros(6), rng.normal(size=NV - 6)])

@@ -1,4 +1,4 @@
-"""Segment lengths from distances between points: exact, robust, and as sure as errors that last for seconds allow."""
+"""Segment lengths from distances between points: exact, robust, and with a covariance for correlated errors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def gathered(
     model: FloatArray | None = None,
     slow: float = 0.0,
 ) -> SegmentLengths:
-    """What frames of one sensor tell; ``white`` is a standard deviation, ``model`` (n, 19)."""
+    """The measurements of one sensor's frames; ``white`` is a standard deviation, ``model`` (n, 19)."""
     seen = SegmentLengths()
     for k, (time, frame) in enumerate(zip(times, points, strict=True)):
         variance = BASE if model is None else model[k]
@@ -63,7 +63,7 @@ def stddev(estimate: LengthEstimate) -> FloatArray:
 
 
 def correlated_noise(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
-    """(n, size) deviates of unit variance that last (Ornstein-Uhlenbeck)."""
+    """(n, size) samples of unit variance of an Ornstein-Uhlenbeck process."""
     kept = np.exp(-np.diff(times) / persistence)
     found = np.empty((len(times), size))
     found[0] = rng.normal(size=size)
@@ -132,7 +132,7 @@ def test_stddev_falls_with_the_square_root_of_time_under_white_noise() -> None:
 
 
 def test_correlated_errors_do_not_average_out_as_white_noise() -> None:
-    """Two halves of a minute differ as is stated, by far more than if every frame were new."""
+    """Two halves of a minute differ as stated, by far more than with independent frames."""
     normalised, as_if_new = [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -178,8 +178,8 @@ def test_blocks_of_large_variance_have_less_weight() -> None:
 
 def test_stated_slow_errors_increase_the_stddev() -> None:
     times, points, _ = moving_person(8, 6.0)
-    sure, unsure = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
-    assert (unsure > 2.0 * sure).all()
+    without, with_slow = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
+    assert (with_slow > 2.0 * without).all()
 
 
 def test_each_sensor_has_its_own_blocks() -> None:

@@ -257,7 +257,7 @@ def test_joint_classes_cover_every_joint() -> None:
 
 
 def test_a_raised_arm_keeps_its_plane_where_a_hanging_one_has_none() -> None:
-    """What decides is whether the arm is surely raised, not how exactly its plane is known."""
+    """The criterion is whether the elevation is significant, not the accuracy of the plane."""
     for elevation, known in ((8.0, False), (80.0, True)):
         positions = t_pose()
         direction = np.sin(np.radians(elevation)) * LEFT - np.cos(np.radians(elevation)) * UP
