@@ -80,12 +80,7 @@ class Coverage:
         """All stored pairs."""
         n = self._count
         points = self._points[:n]
-        return Pairs(
-            points[:, 0],
-            points[:, 1],
-            self._variance[:n],
-            len(np.unique(self._key[:n], axis=0)) if n else 0,
-        )
+        return Pairs(points[:, 0], points[:, 1], self._variance[:n], len(np.unique(self._key[:n], axis=0)) if n else 0)
 
     def shift_clock(self, offset: float, drift: float) -> None:
         """Move the stored sensor frames along their velocity after a correction of the sensor's clock.

@@ -24,12 +24,7 @@ from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, st
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.measurement import joint_stddev
-from body_tracking.core.sensor_poses import (
-    CalibrationResult,
-    SensorPose,
-    SensorQuality,
-    level_pose,
-)
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
@@ -718,9 +713,7 @@ class OnlineCalibration:
             )
             clocks[name] = other.clock
             quality[name] = replace(
-                other.quality,
-                clock_stddev=other.clock.stddev,
-                clock_drift_stddev_ppm=other.clock.drift_stddev_ppm,
+                other.quality, clock_stddev=other.clock.stddev, clock_drift_stddev_ppm=other.clock.drift_stddev_ppm
             )
         stamped = {
             name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)

@@ -49,10 +49,7 @@ def is_t_pose(positions: FloatArray) -> bool:
     with np.errstate(invalid="ignore"):
         pose = np.where(known, positions, 0.0).sum(axis=0) / known.sum(axis=0)
     across = pose[Joint.SHOULDER_LEFT] - pose[Joint.SHOULDER_RIGHT]
-    arms = (
-        pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT],
-        pose[Joint.SHOULDER_RIGHT] - pose[Joint.WRIST_RIGHT],
-    )
+    arms = (pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT], pose[Joint.SHOULDER_RIGHT] - pose[Joint.WRIST_RIGHT])
     return all(float(arm @ across) > 0.85 * float(np.linalg.norm(arm) * np.linalg.norm(across)) for arm in arms)
 
 

@@ -16,12 +16,7 @@ from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import Association
 from body_tracking.fusion.placement import Placement
-from body_tracking.pipeline.people import (
-    ALL,
-    FIRST,
-    PeopleParameters,
-    SubjectSelector,
-)
+from body_tracking.pipeline.people import ALL, FIRST, PeopleParameters, SubjectSelector
 
 _PRESENT = round(0.2 * NANOSECONDS)
 """A person may be chosen when seen within this time, nanoseconds."""

@@ -132,8 +132,7 @@ class EulerSequences:
         np.cos(b, out=cb)
         np.sin(b, out=sb)
         c = np.arctan2(
-            sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2],
-            row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2],
+            sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2], row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2]
         )
         angles[..., 1] = b + self._offset
         angles[..., 2] = self._sign * c

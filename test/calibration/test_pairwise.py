@@ -101,9 +101,7 @@ def test_moving_one_sensors_coordinates_moves_the_answer_along() -> None:
     turn, shift = Rotation.from_euler("yxz", [25, 8, -5], degrees=True).as_matrix(), np.array([0.5, -0.2, 0.3])
     plain = estimate(pairs, ROTATION, TRANSLATION)
     moved = estimate(
-        replace(pairs, sensor=pairs.sensor @ turn.T + shift),
-        ROTATION @ turn.T,
-        TRANSLATION - ROTATION @ turn.T @ shift,
+        replace(pairs, sensor=pairs.sensor @ turn.T + shift), ROTATION @ turn.T, TRANSLATION - ROTATION @ turn.T @ shift
     )
     assert_allclose(moved.rotation, plain.rotation @ turn.T, atol=1e-9)
     assert_allclose(moved.translation, plain.translation - plain.rotation @ turn.T @ shift, atol=1e-9)

@@ -120,10 +120,7 @@ def test_two_noisy_sensors_have_smaller_error_and_covariance_than_one() -> None:
 
 def test_disagreement_increases_the_covariance() -> None:
     trunk = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
-    agreed, apart = (
-        run(fusion(), frames(3.0)),
-        run(fusion(), changed(frames(3.0), "kinect2", lowered(0.16))),
-    )
+    agreed, apart = (run(fusion(), frames(3.0)), run(fusion(), changed(frames(3.0), "kinect2", lowered(0.16))))
     for near, far in zip(agreed[10:], apart[10:], strict=True):
         assert near.covariances is not None
         assert far.covariances is not None

@@ -73,7 +73,7 @@ def arms(flexion: float, abduction: float, rotation: float = 0.0, elbow: float =
     return q
 
 
-def degrees_of(angles: JointAngles) -> dict[str, float]:
+def by_name(angles: JointAngles) -> dict[str, float]:
     return dict(zip(angles.names, angles.position.tolist(), strict=True))
 
 
@@ -206,7 +206,7 @@ def test_the_angles_rebuild_the_rotations(name: str) -> None:
     for q in (*poses(100), *(arms(*pose, rotation=20.0, elbow=50.0) for pose in singular)):
         angles = angles_of(estimate(q), MODEL, name)
         assert np.isfinite(angles.position).all()
-        REBUILT[name](q, degrees_of(angles))
+        REBUILT[name](q, by_name(angles))
 
 
 OWN = ((0, 0, 0, 0), (0, 90, 0, 0), (90, 0, 0, 0), (170, 0, 0, 0), (0, 170, 0, 0), (-40, 0, 0, 90), (0, 30, 50, 90))
@@ -235,7 +235,7 @@ HERS = tuple(f"theta{number}" for number in (13, 14, 15, 16, 17, 20, 24))
 )
 def test_textbook_poses(convention: str, keys: tuple[str, ...], pose: tuple[int, ...], values: tuple[int, ...]) -> None:
     """Degrees of both arms; all other angles are zero but the ISB's pronation, which is 90 with thumbs forward."""
-    for label, angle in degrees_of(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
+    for label, angle in by_name(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
         key = label[2:] if label[2:] in keys else label.removesuffix("_left").removesuffix("_right")
         known = dict(zip(keys, values, strict=True))
         rest = 90.0 if key == "elbow_pronation" else 0.0
@@ -339,7 +339,7 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
             assert step.max() < 15.0, [(n, s) for n, s in zip(angles.names, step, strict=True) if s > 5]
         if name == "model":
             for side, _ in SIDES:
-                a = degrees_of(angles)
+                a = by_name(angles)
                 t = [a[f"shoulder_{k}_{side}"] for k in ("flexion", "abduction", "rotation")]
                 built = np.linalg.multi_dot([turn(axis, x) for axis, x in zip(SHOULDER_AXES[side], t, strict=True)])
                 r = rotations_of(q)

@@ -12,13 +12,7 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.conventions import ConventionError, angles_of
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.kinematics.tracking import (
-    ALL_CONVENTIONS,
-    AngleStream,
-    LengthChanges,
-    SkeletonFit,
-    segment_poses,
-)
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, SkeletonFit, segment_poses
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 
 MODEL = UpperBody()
