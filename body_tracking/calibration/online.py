@@ -378,7 +378,8 @@ class OnlineCalibration:
         if not self._changed:
             return []
         self._changed = False
-        return [self._update(now + round(self.parameters.activation_delay * NANOSECONDS))]
+        valid_from_ns = now + round(self.parameters.activation_delay * NANOSECONDS)
+        return [CalibrationUpdate(valid_from_ns, self._result(valid_from_ns, published=True))]
 
     # --- one sensor
 
@@ -694,12 +695,9 @@ class OnlineCalibration:
 
     # --- results
 
-    def _update(self, valid_from_ns: int) -> CalibrationUpdate:
-        return CalibrationUpdate(valid_from_ns, self._result(valid_from_ns, published=True))
-
     def _result(self, valid_from_ns: int, *, published: bool) -> CalibrationResult:
         base_rotation = self._base.rotation
-        poses = {self.reference: self._base}
+        poses = {self.reference: replace(self._base, valid_from_ns=valid_from_ns)}
         clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0, 0.0, 0.0)}
         quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0, 0.0)}
         for name, other in self._sensors.items():
@@ -710,20 +708,17 @@ class OnlineCalibration:
                 name,
                 base_rotation @ translation + self._base.translation,
                 Rotation.from_matrix(base_rotation @ rotation).as_quat(),
+                valid_from_ns,
             )
             clocks[name] = other.clock
             quality[name] = replace(
                 other.quality, clock_stddev=other.clock.stddev, clock_drift_stddev_ppm=other.clock.drift_stddev_ppm
             )
-        stamped = {
-            name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
-            for name, pose in poses.items()
-        }
-        return CalibrationResult(self.reference, stamped, clocks, quality)
+        return CalibrationResult(self.reference, poses, clocks, quality)
 
     def current_update(self) -> CalibrationUpdate:
         """The present result, valid for all times, to publish at the start."""
-        return self._update(0)
+        return CalibrationUpdate(0, self._result(0, published=True))
 
     def result(self) -> CalibrationResult:
         """The best estimate so far, not slewed."""

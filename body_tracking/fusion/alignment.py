@@ -126,7 +126,7 @@ class SensorAlignment:
         if source is None:
             self.counters["unknown_sensor"] += 1
             return None
-        self._note(sensor, source, skeleton.stamp_ns)
+        self._check_clock(sensor, source, skeleton.stamp_ns)
         stamp = source.stamp(skeleton.stamp_ns)
         if stamp is None:
             self.counters["other_clock"] += 1
@@ -145,7 +145,7 @@ class SensorAlignment:
         self.counters["aligned"] += 1
         return self._corrected(sensor, seen)
 
-    def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
+    def _check_clock(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
         """Reset the sensor, or all for the reference, when its clock jumped back."""
         if jumped_back(stamp_ns, source.last_ns):
             if sensor == self.reference:
@@ -176,13 +176,13 @@ class SensorAlignment:
 
     def _corrected(self, sensor: str, seen: _Frame) -> Skeleton:
         """The frame with left and right corrected by all sensors' frames near that time."""
+        newest = {name: seen if name == sensor else source.newest for name, source in self._sensors.items()}
         fresh = {
-            name: seen if name == sensor else source.newest
-            for name, source in self._sensors.items()
-            if name == sensor
-            or (source.newest is not None and abs(seen.stamp_ns - source.newest.stamp_ns) <= FRESH * NANOSECONDS)
+            name: frame
+            for name, frame in newest.items()
+            if frame is not None and abs(seen.stamp_ns - frame.stamp_ns) <= FRESH * NANOSECONDS
         }
-        frames = [frame for frame in fresh.values() if frame is not None]
+        frames = list(fresh.values())
         angles, headings = [frame.angle for frame in frames], [frame.headings for frame in frames]
         weights = [frame.weights for frame in frames]
         accepted = self._sides.accepted_headings(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)

@@ -114,8 +114,7 @@ class Ordering:
         self._flushed = []
         self._waiting.clear()
         self._left_ns = None
-        for sensor in self._sources:
-            self._sources[sensor] = _Source()
+        self._sources = {sensor: _Source() for sensor in self._sources}
         return ready
 
     @property

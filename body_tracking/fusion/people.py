@@ -180,11 +180,8 @@ class People:
         source.used = pose
         whose = self._association.assign(sensor, [_in_world(body, stamp_ns, pose) for body in seen])
         self._choose(stamp_ns)
-        found = []
-        for person, body in zip(whose, seen, strict=True):
-            number = None if person is None else self._number(person)
-            if number is not None:
-                found.append((number, body))
+        numbers = (None if person is None else self._number(person) for person in whose)
+        found = [(number, body) for number, body in zip(numbers, seen, strict=True) if number is not None]
         return sorted(found, key=lambda each: each[0])
 
     def _number(self, person: int) -> int | None:

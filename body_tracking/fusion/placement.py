@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import replace
 
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import SensorPose
@@ -60,8 +61,7 @@ class Placement:
         """Put the newest pose and clock in force for all times, after a reset of time."""
         del self._poses[:-1], self._clocks[:-1]
         if self._poses:
-            pose = self._poses[0]
-            self._poses[0] = SensorPose(pose.sensor, pose.translation, pose.quat_xyzw)
+            self._poses[0] = replace(self._poses[0], valid_from_ns=0)
 
 
 def _valid_from(pose: SensorPose) -> int:

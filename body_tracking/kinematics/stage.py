@@ -144,11 +144,8 @@ class AnglesStage(Stage):
 
         Nothing changes while there is no filter, as during its restart.
         """
-        before, self._seen = self._seen, ""
-        for source, topic in ((graph.MODEL_INPUT, self._covariance), (graph.SKELETON_INPUT, graph.FILTERED)):
-            if published(topic):
-                self._seen = source
-                break
+        before, inputs = self._seen, ((graph.MODEL_INPUT, self._covariance), (graph.SKELETON_INPUT, graph.FILTERED))
+        self._seen = next((source for source, topic in inputs if published(topic)), "")
         if self._seen != before or self._seen in ("", self._published):
             return False
         self._published = self._seen
