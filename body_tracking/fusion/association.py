@@ -25,7 +25,6 @@ from body_tracking.pipeline.people import HOLD
 _MIDLINE = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK], dtype=np.intp)
 _LEFT = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
-TORSO_POINTS = len(_MIDLINE) + len(_LEFT)
 
 _CONFIRM = round(0.3 * NANOSECONDS)
 """An unassigned body becomes a person when seen for this long, nanoseconds: ghosts last a few frames."""

@@ -47,7 +47,6 @@ UNIFORM_STDDEV = np.pi / np.sqrt(3.0)
 """Radians: the standard deviation of a uniformly distributed angle, near a singular pose."""
 _ROUNDING = 1e-9
 _X, _Y, _Z = np.eye(3)
-_FULL = (-180.0, 180.0)
 
 
 class ConventionError(BodyTrackingError):
