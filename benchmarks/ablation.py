@@ -59,8 +59,8 @@ _FIRST_SEED = 5000
 
 
 def _no_exemption(gated: Callable[..., FloatArray]) -> Callable[..., FloatArray]:
-    return lambda self, stamp, names, points, variance, as_believed: gated(
-        self, stamp, names, points, variance, np.zeros_like(as_believed)
+    return lambda self, stamp, names, points, variance, heading_agrees: gated(
+        self, stamp, names, points, variance, np.zeros_like(heading_agrees)
     )
 
 

@@ -1,7 +1,5 @@
-"""Where each sensor stands in ``world``, how its clock runs against the reference sensor's, and how well that is known.
+"""Calibration of the sensors: poses in ``world``, clocks against the reference sensor's, and their uncertainty.
 
-``result`` holds what a calibration says, ``storage`` keeps it in a file; the rest finds it: from one still pose as
-Schlagenhauf (2017) does, and, by default, refined robustly over movement. It knows ``skeleton`` and numpy, and neither
-fusion nor filters nor ROS. The calibration node, ``body_tracking calibrate`` and the offline replay import it;
-``messages`` and ``fusion`` import ``result`` alone.
+Estimated from one still pose as by Schlagenhauf (2017) and, by default, refined robustly over movement; ``storage``
+reads and writes the files.
 """

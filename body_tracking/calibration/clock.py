@@ -1,7 +1,7 @@
 """The offset between two sensors' clocks, from the motion that both saw.
 
-A first guess comes from the times of receipt; it can be wrong by a burst of the network. The speeds of the joints do
-not depend on where a sensor stands, so their correlation over time finds the offset before any pose is known.
+The times of receipt give a first guess, with an error of up to a network burst. The speeds of the joints do not depend
+on the sensors' poses, so their correlation over time gives the offset before any pose is known.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from body_tracking.calibration.clock_correlation import STEP, Series, correlate
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 
 RECEIPT_PRIOR = 0.05
-"""Standard deviation of what the times of receipt say of an offset, seconds: sensors deliver after different delays.
-In nine recordings of two Kinects on two computers these are 15 to 40 ms apart."""
+"""Standard deviation of an offset by times of receipt, seconds: sensors have different delays. In nine recordings of
+two Kinects on two computers these are 15 to 40 ms apart."""
 
 LIKE = 60.0
-"""Seconds of motion after which more of it says no more of the offset: a twist that is seen from its side moves an
-offset by up to 60 ms, for as long as somebody twists."""
+"""Seconds of motion whose variance of the offset equals that of the systematic error: a twist that is seen from its
+side changes the offset by up to 60 ms, for as long as it lasts."""
 
 _OVERLAP = 2.0
-"""Seconds that both sensors must have seen at an offset for it to count."""
+"""Least overlap of both sensors' motion at an offset, seconds."""
 
 _SPAN = 4
-"""Speeds are taken over this many frames: limbs move at up to about 5 Hz, what is faster is noise."""
+"""Frames over which a speed is taken: limbs move at up to about 5 Hz, higher frequencies are noise."""
 
 _SMOOTHING = (0.0625, 0.25, 0.375, 0.25, 0.0625)
 """Weights of neighbouring speeds."""
 
 _MIN_JOINTS = 8
-"""Joints that must be seen in both of two frames for their speed to count."""
+"""Least number of joints known in both frames of a speed."""
 
 _LIMB_JOINTS: IntArray = np.array([0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 12, 13, 16, 17, 20], dtype=np.intp)
 
 _INDEPENDENT = 0.5
-"""Joint speeds closer together than this are one observation where offsets far apart are compared, seconds: limbs go to
-and fro about once a second, and a few swings look like a few others."""
+"""Time between independent joint speeds where offsets far apart are compared, seconds: limbs swing about once a second,
+and swings resemble each other."""
 
 _UNLIKE = 0.05
-"""Share of the joint speeds' variance in which two sensors differ at least: more than this, no correlation can tell."""
+"""Least share of unexplained variance of the joint speeds between two sensors: bounds the likelihood."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,9 @@ class OffsetEstimate:
     Attributes:
         offset: seconds.
         correlation: normalised correlation of the joint speeds at that offset, -1 to 1.
-        likely: the correlation that would be as likely at the guess itself: the less, the farther it lies from there
-            and the less motion there was.
-        margin: by how much that exceeds the same of every offset more than 0.3 s away.
+        likely: correlation of the same likelihood at the guess itself: smaller for an offset far from it and for little
+            motion.
+        margin: difference of ``likely`` to the best offset more than 0.3 s away.
     """
 
     offset: float
@@ -81,18 +81,18 @@ def joint_speeds(stamps: FloatArray, positions: FloatArray) -> Series:
     good: BoolArray = (known.sum(axis=1) >= _MIN_JOINTS) & (step < _SPAN * 0.07)
     # A label that jumps is faster than any limb; the logarithm keeps it from deciding alone.
     value = np.log1p(5.0 * np.minimum(np.where(known, speed, 0.0), 5.0))
-    # A joint that is not seen moves as the rest does on average.
+    # An unknown joint gets the mean speed of the others.
     mean = value.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     value = np.where(known, value, mean[:, None])
-    # Between two samples noise is halved, and it would draw the offset to where all are taken half-way: neighbours that
-    # have most of their noise in common do not.
+    # Interpolation half-way between independent samples halves their noise and would bias the offset towards it;
+    # smoothing correlates neighbours.
     value = correlate1d(value, _SMOOTHING, axis=0, mode="nearest")
     good = minimum_filter1d(good, len(_SMOOTHING))
     return Series(0.5 * (stamps[_SPAN:] + stamps[:-_SPAN]), value, good)
 
 
 def _time_of_motion(speeds: FloatArray, known: BoolArray) -> float:
-    """For how long somebody moved, seconds: of the squared deviations e from the mean, (sum e)^2 / sum e^2 samples."""
+    """Effective duration of motion, seconds: (sum e)^2 / sum e^2 samples, e the squared deviations from the mean."""
     moved = ((speeds - speeds.sum(axis=0) / max(known.sum(), 1)) ** 2).sum(axis=1) * known
     return STEP * max(float(moved.sum() ** 2 / np.maximum((moved**2).sum(), 1e-12)), 1.0)
 
@@ -116,9 +116,9 @@ def correlate_clocks(
     if found is None:
         return None
     lag, score = found.lags, np.where(found.overlap < _OVERLAP, -1.0, found.rho)
-    # Someone who waves looks the same a period later, and of little motion much looks alike: a correlation rho of n
-    # independent samples adds n / 2 log(1 / (1 - rho^2)) to the log-likelihood, and the guess a Cauchy prior, for it is
-    # rarely far off, but may be by any burst. Both together are a correlation again.
+    # Periodic or little motion correlates at several offsets. A correlation rho of n independent samples adds
+    # n / 2 log(1 / (1 - rho^2)) to the log-likelihood, and the guess a Cauchy prior, because its error is heavy-tailed.
+    # Their sum is expressed as a correlation again.
     worse = (1.0 + (lag / RECEIPT_PRIOR) ** 2) ** (2.0 * _INDEPENDENT / _time_of_motion(*found.reference))
     unlike = np.maximum(1.0 - score**2, _UNLIKE) * worse
     likely = np.where(score > 0.0, np.sqrt(np.maximum(1.0 - unlike, 0.0)), score)

@@ -1,4 +1,4 @@
-"""Offset and drift of a clock from a motion that was measured in it and in a reference clock.
+"""Offset and drift of a clock from a motion measured in it and in a reference clock.
 
 Two series of how fast something moves are compared at every offset of a window (:func:`correlate`), and windows of
 motion around a known offset are fitted with a line, offset plus drift (:class:`ClockFit`).
@@ -24,13 +24,13 @@ alone has 10-100 ppm."""
 _DRIFT_STEP, _DRIFT_STEPS = 100e-6, 15
 
 PEAK_WIDTH = 0.03
-"""Half width of the parabolas that smooth the likelihood, seconds: a frame, so that it does not follow the jitter."""
+"""Half width of the parabolas that smooth the likelihood, seconds: a frame, to suppress the jitter."""
 
 _MAX_WINDOWS = 240
-"""Windows remembered: twenty minutes of five-second windows."""
+"""Windows stored: twenty minutes of five-second windows."""
 
 FINE_RANGE = 0.15
-"""The fit looks this far around the offset first found, seconds."""
+"""Half width of the fit's search around its base, seconds."""
 
 _FINE_STEP = 0.005
 _LAGS = _FINE_STEP * (round(-FINE_RANGE / _FINE_STEP) + np.arange(round(2 * FINE_RANGE / _FINE_STEP) + 1))
@@ -39,12 +39,12 @@ SAMPLE_TIME = 0.1
 """Samples closer together than this are one observation, seconds."""
 
 MIN_STDDEV = 0.002
-"""No amount of motion tells the offset better than this, seconds: stamps jitter, and sensors smooth differently."""
+"""Least standard deviation of an offset, seconds: stamps jitter, and sensors smooth differently."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """How fast something moves, in one clock.
+    """Speeds in one clock.
 
     Attributes:
         stamps: (n,) seconds, ascending.
@@ -71,11 +71,11 @@ class Series:
         return np.where(known[:, None], value, 0.0), known
 
     def earlier(self, offset: float) -> Series:
-        """The same by a clock that shows so many seconds less."""
+        """The series with stamps reduced by an offset, seconds."""
         return replace(self, stamps=self.stamps - offset)
 
     def between(self, begin: float, end: float) -> Series:
-        """The samples from one time to another, which is left out."""
+        """The samples in [begin, end)."""
         part = slice(*np.searchsorted(self.stamps, [begin, end]))
         return replace(self, stamps=self.stamps[part], values=self.values[part], good=self.good[part])
 
@@ -88,7 +88,7 @@ class Correlation:
         lags: (l,) seconds by which the sensor's motion comes later than the reference's.
         overlap: (l,) seconds that both cover.
         rho: (l,) Pearson's correlation, over all values of a series together.
-        variance: (l,) the smaller one of the two series' variances.
+        variance: (l,) the smaller of the two series' variances.
         reference: (m, k) and (m,) values on the grid, and where they are known.
         sensor: (m + l - 1, k) and (m + l - 1,) likewise; the lag n compares its samples from n on.
     """
@@ -109,7 +109,7 @@ def correlate(reference: Series, sensor: Series, window: float, least_overlap: f
     """
     if len(reference.stamps) < 2 or len(sensor.stamps) < 2:
         return None
-    # The grid is a multiple of the step, so that slightly different stamps are looked at with the same lags.
+    # The grid is a multiple of the step, so that slightly different stamps get the same lags.
     first = STEP * np.floor(max(reference.stamps[0], sensor.stamps[0] - window) / STEP)
     count = int((min(reference.stamps[-1], sensor.stamps[-1] + window) - first) / STEP)
     lags = int(window / STEP)
@@ -147,20 +147,18 @@ def correlation_time(values: FloatArray, step: float) -> float:
 class ClockFit:
     """Offset and drift of one clock, from all the motion so far.
 
-    Every window of motion leaves the correlation rho of the series for each lag of a grid. The line
-    ``offset + drift t`` with the highest likelihood wins: each window of n independent samples adds
-    n / 2 log(1 / (1 - rho^2)) at its lag, the drift has a prior, and so has the offset where something is known
-    of it. No window has to decide alone, and one in which a sensor sees the body turned around, or nothing moves,
-    correlates badly and says little.
+    The maximum likelihood line ``offset + drift t`` over all windows: a window of n independent samples with the
+    correlation rho at its lag adds n / 2 log(1 / (1 - rho^2)), and drift and offset have priors. Windows with little
+    motion, or with the body seen reversed, correlate badly and have little weight.
 
     Args:
-        base: the clock so far; the fit looks for offsets of up to :data:`FINE_RANGE` beside it.
+        base: the clock so far; the search covers offsets within :data:`FINE_RANGE` of it.
         zero_ns: reference time from which ``elapsed`` counts.
-        like: seconds of motion after which more of it says no more of the offset, though of the drift: what looks
-            different from either side does so again whenever it is done again.
-        caution: an independent sample takes this many correlation times of what one series leaves unexplained of the
-            other; 0 for :data:`SAMPLE_TIME`.
-        least_stddev: of the values in a window that counts; less is no motion.
+        like: seconds of motion whose variance of the offset equals that of an error common to all windows, such as the
+            different views of a repeated motion; the drift is not affected.
+        caution: correlation times of the residual between the series per independent sample; 0 for
+            :data:`SAMPLE_TIME`.
+        least_stddev: least standard deviation of the values in a window with motion.
     """
 
     def __init__(
@@ -177,7 +175,7 @@ class ClockFit:
         self._sums: list[FloatArray] = []  # (4, lags) per window: a b, a a, b b, seconds
 
     def add(self, elapsed: float, reference: Series, sensor: Series) -> bool:
-        """Take a window of motion.
+        """Add a window of motion.
 
         Args:
             elapsed: reference time of its middle since ``zero_ns``, seconds.
@@ -185,12 +183,12 @@ class ClockFit:
             sensor: the other series, by the clock of the base, in the window and its surroundings.
 
         Returns:
-            Whether the two overlap enough to say anything.
+            Whether the window was used: enough overlap and motion.
         """
         if len(reference.stamps) < 2 or len(sensor.stamps) < 2:
             return False
         sampled = [sensor.at(reference.stamps + lag) for lag in _LAGS]
-        # The same frames at every lag, or their number would decide.
+        # The same frames at every lag, so that their number does not decide.
         both = reference.good & np.logical_and.reduce([known for _, known in sampled])
         step = float(np.median(np.diff(reference.stamps)))
         seconds = float(both.sum() * step)
@@ -219,8 +217,8 @@ class ClockFit:
         """The clock so far.
 
         Args:
-            expected: what is known of it without this motion, if anything. Not to be believed where its offset is
-                farther than :data:`FINE_RANGE` from the base's.
+            expected: prior without this motion; ignored where its offset is farther than :data:`FINE_RANGE` from the
+                base's.
 
         Returns:
             The clock; None while there is no motion or the best offset is at the grid's edge.
@@ -277,8 +275,8 @@ class ClockFit:
         if abs(line[0]) >= FINE_RANGE - PEAK_WIDTH or abs(line[1]) > drifts[-1]:
             return None
         motion = line_information(elapsed, -on(line, bend))
-        # An error that all windows have in common, of the variance T / like times that of the offset by the motion:
-        # by the formula of Sherman and Morrison, and the estimate is drawn to what is expected by as much.
+        # An error common to all windows, of the variance T / like times that of the offset by the motion, by the
+        # formula of Sherman and Morrison; the prior gains the weight that the motion loses.
         share = np.zeros(2)
         if motion[0, 0] > 0.0:
             share = motion[0] / (motion[0, 0] * (1.0 + self._like / float(sums[:, 3, 0].sum())))
@@ -287,7 +285,7 @@ class ClockFit:
             return None
         line = line - np.linalg.solve(information, share * gradient[0])
         found = clock_of_line(line, information, self._zero_ns + round(middle * NANOSECONDS), MIN_STDDEV)
-        # What the motion says of the drift counts as much less as it does of the offset for the jitter.
+        # The information on the drift is reduced for the jitter by the same share as that on the offset.
         jitter = 1.0 - (MIN_STDDEV / found.stddev) ** 2
         drift_trust += max((1e-6 * found.drift_stddev_ppm) ** -2 - drift_trust, 0.0) * jitter
         return replace(found, drift_stddev_ppm=1e6 * drift_trust**-0.5).plus(self._base)

@@ -1,4 +1,4 @@
-"""Which pairs of frames to remember: a bounded number, spread over where the person went and faced."""
+"""Selection of the pairs of frames to store: a bounded number, spread over the person's places and headings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Coverage:
     def add(
         self, elapsed: float, reference: FloatArray, sensor: FloatArray, velocity: FloatArray, variance: FloatArray
     ) -> None:
-        """Remember one pair.
+        """Store one pair.
 
         Args:
             elapsed: seconds of reference time since the anchor of the clock.
@@ -71,24 +71,19 @@ class Coverage:
         if self._count < self._capacity:
             self._count += 1
             return self._count - 1
-        # Full: the place with the most pairs gives up its oldest.
+        # Full: replace the oldest pair of the place with the most.
         _, place, sizes = np.unique(self._key, axis=0, return_inverse=True, return_counts=True)
         crowded = np.flatnonzero(place.reshape(-1) == np.argmax(sizes))
         return int(crowded[np.argmin(self._order[crowded])])
 
     def pairs(self) -> Pairs:
-        """Everything remembered."""
+        """All stored pairs."""
         n = self._count
         points = self._points[:n]
-        return Pairs(
-            points[:, 0],
-            points[:, 1],
-            self._variance[:n],
-            len(np.unique(self._key[:n], axis=0)) if n else 0,
-        )
+        return Pairs(points[:, 0], points[:, 1], self._variance[:n], len(np.unique(self._key[:n], axis=0)) if n else 0)
 
     def shift_clock(self, offset: float, drift: float) -> None:
-        """Move the remembered sensor frames along their velocity after the sensor's clock was corrected.
+        """Move the stored sensor frames along their velocity after a correction of the sensor's clock.
 
         Args:
             offset: seconds added to the sensor's clock offset at the anchor.
@@ -104,5 +99,4 @@ class Coverage:
         return float(self._elapsed[: self._count].min(initial=np.inf))
 
     def clear(self) -> None:
-        """Forget everything."""
         self._count = 0

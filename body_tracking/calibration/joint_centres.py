@@ -1,34 +1,34 @@
-"""Where sensors take the centres of a person's joints to be, learnt while the person holds a T-pose.
+"""Systematic offsets between a sensor's joints and the anatomical ones, estimated while the person holds a T-pose.
 
-A skeleton camera places joints some centimetres beside the anatomical ones, and much alike in the body's own axes
-whatever the person does: a real Kinect v2 against Vicon (UI-PRMD, five clips of a stretched right arm) has the elbow
-straighter by 13 to 15 degrees in four of them, +- 4 between hanging and level. Two such sensors are wrong together, so
-that no fusion helps. What helps is a pose that is known: in a T-pose upper arms and forearms point sideways at a right
-angle to the thorax, and left and right are alike, but for what a person who is asked for it does wrongly.
+A skeleton camera places joints some centimetres off the anatomical ones, nearly constant in the body's axes: a real
+Kinect v2 against Vicon (UI-PRMD, five clips of a stretched right arm) has the elbow straighter by 13 to 15 degrees in
+four of them, +- 4 between hanging and level. Two such sensors have the same error, so that fusion does not remove it. A
+known pose does: in a T-pose upper arms and forearms point sideways, perpendicular to the thorax, and left and right are
+symmetric, up to the person's own deviation from it.
 
-With joints at ``m = p + b + e`` in the axes that they show, ``p`` the anatomical ones, ``b ~ N(0, P)`` what stays and
-``e ~ N(0, T)`` what does not, and a pose that says ``H p = c + w``, ``w ~ N(0, R)``, in the body's own axes, which are
-turned by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the offsets are known by
-(conditional normal distribution; ``G a = -H (a x m)``)
+With measured joints ``m = p + b + e`` in the axes of the measured thorax, ``p`` the anatomical ones, ``b ~ N(0, P)``
+the constant offsets and ``e ~ N(0, T)`` the transient error, and a pose with ``H p = c + w``, ``w ~ N(0, R)``, in the
+body's own axes, which are rotated by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the
+offsets are (conditional normal distribution; ``G a = -H (a x m)``)
 
     r = H m - c,  S = H (P + T) H^T + G A G^T + R                                                                  (1)
     b = P H^T S^-1 r,  Cov(b) = P - P H^T S^-1 H P                                                                 (2)
 
-Only combinations that the pose speaks of become known: where the whole arm is does not. ``r^T S^-1 r`` is chi-square
-with as many degrees of freedom as (1) has rows where it was a T-pose at all.
+Only combinations that the pose determines become observable; the place of the whole arm does not. For a T-pose,
+``r^T S^-1 r`` is chi-square with as many degrees of freedom as (1) has rows.
 
-From then on the offsets are taken off, each in the frame of the segment that ends in the joint
-(:mod:`body_tracking.evaluation.segments` says how these turn), as far as they stay. How a bone is rotated about itself
-its joints do not show; so the farther it points from where it did in the T-pose, the less is known of its offset there,
+From then on the offsets are subtracted, each in the frame of the segment that ends in the joint (these turn as in
+:mod:`body_tracking.evaluation.segments`), in part: the joints do not show how a bone is rotated about itself, so the
+farther it points from its direction in the T-pose, the less is known of its offset,
 
     b' = d b + sqrt(1 - d^2) n,  n ~ N(0, P),  d = E[cos(roll)] = exp(-sigma^2 / 2)                                (3)
 
-and from the elbow on, ``d`` besides is times, with the elbow bent by ``beta``,
+and from the elbow on ``d`` is multiplied, with the elbow bent by ``beta``, by
 
     1 - (1 - cos(beta))^2  up to a right angle, 0 beyond                                                           (4)
 
-as a camera takes a bent elbow to be elsewhere: the same Kinect has the same person's elbow bent more by 7 degrees, not
-less by 13, where it is bent by 67.
+because a camera's error of a bent elbow is another one: the same Kinect has the same person's elbow bent more by 7
+degrees, not less by 13, where it is bent by 67.
 
 Over 500 lines: one estimator with its derivation; its steps share their notation.
 """
@@ -63,74 +63,74 @@ _FOLLOWERS = {
     _J.HAND_LEFT: (_J.HAND_TIP_LEFT, _J.THUMB_LEFT),
     _J.HAND_RIGHT: (_J.HAND_TIP_RIGHT, _J.THUMB_RIGHT),
 }
-"""Joints that are displaced as the one before them."""
+"""Joints with the offset of the one that they follow."""
 _MOVED = np.array([*LEARNT, *(each for joint in _FOLLOWERS for each in _FOLLOWERS[joint])], dtype=np.intp)
 _MOVED_AS = np.array(
     [*range(len(LEARNT)), *(_PLACE[joint] for joint in _FOLLOWERS for _ in _FOLLOWERS[joint])], dtype=np.intp
 )
 _CHAINS = len(_TRUNK) + np.arange(8).reshape(2, 4)
-"""(2, 4) places of shoulder, elbow, wrist and hand in them."""
+"""(2, 4) indices of shoulder, elbow, wrist and hand in ``LEARNT``."""
 _THORAX = np.array([_J.SPINE_SHOULDER, _J.SPINE_MID, _J.SHOULDER_LEFT, _J.SHOULDER_RIGHT], dtype=np.intp)
 _THIRD = math.sqrt(1.0 / 3.0)
-_LEAST = 1e-6
-"""Metres: a shorter bone points nowhere."""
+_MIN_LENGTH = 1e-6
+"""Metres: least length of a bone with a direction."""
 
 HOLD = 0.7
 """Seconds for which a pose has to be held."""
-_FEWEST = 5
-"""Frames in it."""
-_STRAY = 0.025
-"""Metres (root mean square) by which elbows and wrists may move meanwhile against the shoulders."""
+_MIN_FRAMES = 5
+"""Least number of frames of a held pose."""
+_MAX_MOTION = 0.025
+"""Metres (root mean square): largest motion of elbows and wrists against the shoulders in a held pose."""
 _CHECK_NS, _CHECK_AGAIN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
-"""How long until it is looked for again in what a sensor sees: where there was none, and where one was learnt from."""
+"""Time to the next check of a sensor's frames for a T-pose: without one, and after one that was used."""
 _BREAK_NS, _LATE_NS = NANOSECONDS // 3, NANOSECONDS // 2
-"""Frames farther apart do not show one pose; one that is older than the last by more is of a time that jumped back."""
+"""Longest interval between frames of one pose; delay of a stamp from which time jumped back."""
 _ANOTHER_NS = 2 * _CHECK_AGAIN_NS
-"""A pose that is held so much later than the last one is another."""
-_EASE = 0.3
-"""Seconds (time constant) in which offsets that were learnt come into force: nothing jumps."""
-_PROBABLE = 0.999
-"""Quantile of chi-square beyond which it was another pose."""
+"""Interval from which held poses count as two."""
+_FADE_IN = 0.3
+"""Seconds: time constant with which new offsets come into force, so that the output does not jump."""
+_GATE_QUANTILE = 0.999
+"""Quantile of chi-square of the gate."""
 POSE_STDDEV = math.radians(6.0)
-"""Radians by which a person's joints are off a T-pose, per axis."""
-_STRETCHED = math.radians(4.0)
-"""Radians by which elbows that are meant to be stretched are bent, palms down: forward, on average and by the standard
-deviation. They come to a stop at 0.6 +- 3.1 degrees (Boone and Azen 1979)."""
-_ALIKE = 0.01
-"""Metres by which left and right of a person's bones, and of where these meet, differ."""
+"""Radians: standard deviation of a person's T-pose, per axis of a joint."""
+_STRAIGHT_ELBOW = math.radians(4.0)
+"""Radians: mean and standard deviation of the forward flexion of elbows in a T-pose with palms down. Their limit is 0.6
++- 3.1 degrees (Boone and Azen 1979)."""
+_SYMMETRY_STDDEV = 0.01
+"""Metres: standard deviation of the difference between left and right of bones and of their joints."""
 _ROLL_STDDEV = math.radians(40.0)
-"""Radians by which a bone is rotated about itself that points at a right angle to where it did, or farther: of an even
-distribution over the +-70 degrees that a shoulder allows."""
-_SLOW = 0.3
-"""Share of a joint's stated variance that comes and goes (``slow_scale`` of the extended filter)."""
-_TOGETHER = 0.8
-"""Correlation of what comes and goes between the joints of an arm. With these two an arm's elevation varies by 6
-degrees and the elbow's flexion by 5; that real Kinect's errors vary by 3 to 8 and by 3 to 6.5 about their means, in
+"""Radians: standard deviation of a bone's rotation about itself at 90 degrees or more from its direction in the T-pose:
+of a uniform distribution over the +-70 degrees that a shoulder allows."""
+_TRANSIENT_SHARE = 0.3
+"""Share of a joint's stated variance that is transient (``slow_scale`` of the extended filter)."""
+_ARM_CORRELATION = 0.8
+"""Correlation of the transient errors between the joints of an arm. With these two an arm's elevation varies by 6
+degrees and the elbow's flexion by 5; the errors of that real Kinect vary by 3 to 8 and by 3 to 6.5 about their means in
 each of six clips."""
 _AXES_STDDEV = 0.3
-"""Radians by which the axes of the joints are turned against the body's: more than is ever the case."""
-_SHOWN = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
-"""(11, 3) in which of the directions forward, left and up a T-pose shows where a joint is, against its neighbours: not
-along an arm, and of the spine, whose bend differs between people, only to the sides."""
+"""Radians: standard deviation of the measured thorax's axes against the body's, an upper bound."""
+_OBSERVED = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
+"""(11, 3) directions (forward, left, up) in which a T-pose determines a joint against its neighbours: not along an arm,
+and for the spine, whose bend differs between people, only sideways."""
 _UNSEEN = 1.0
 """Square metres: variance of a joint that is not seen."""
 
 _CORRELATION = np.eye(len(LEARNT))
 for _arm in _CHAINS:
-    _CORRELATION[np.ix_(_arm, _arm)] += _TOGETHER * (1.0 - np.eye(len(_arm)))
+    _CORRELATION[np.ix_(_arm, _arm)] += _ARM_CORRELATION * (1.0 - np.eye(len(_arm)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Offsets:
-    """What a T-pose tells.
+    """Offsets estimated from a T-pose.
 
     Attributes:
-        local: (11, 3) metres from the anatomical joints to those that are seen, in the frames of the segments.
+        local: (11, 3) metres from the anatomical to the measured joints, in the frames of the segments.
         covariance: (33, 33) of these.
         axes: (11, 3, 3) unit vectors, which in the T-pose pointed forward, left and up, in these frames.
-        share: of the variance of the arms' angles that offsets cause, how much is left: the largest of all.
+        share: largest remaining share of the variance of an arm's angle that offsets cause.
         distance: ``r^T S^-1 r``.
-        dimension: its expectation, if it was a T-pose.
+        dimension: its expectation for a T-pose.
     """
 
     local: FloatArray
@@ -155,7 +155,7 @@ def _axes(top: _Vector, middle: _Vector, left: _Vector, right: _Vector) -> tuple
 
 def _unit(x: float, y: float, z: float) -> _Vector:
     length = math.sqrt(x * x + y * y + z * z)
-    if not length > _LEAST:
+    if not length > _MIN_LENGTH:
         return math.nan, math.nan, math.nan
     return x / length, y / length, z / length
 
@@ -165,17 +165,17 @@ def body_axes(positions: FloatArray) -> FloatArray:
     return np.array(_axes(*positions.take(_THORAX, axis=0).tolist())).T
 
 
-def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
-    """Vectors that stay with the body, in the axes of its positions.
+def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
+    """Rotate vectors from the frames of the segments into the axes of the positions.
 
-    Number by number: for each frame of each camera, and three times as fast as the same by arrays of so few.
+    In scalars, because it runs for each frame of each camera and is three times as fast as with such small arrays.
 
     Args:
         positions: (25, 3) metres, any frame, NaN where unknown.
         local: (11, k, 3) vectors in the frame of the segment that ends in each of the joints ``LEARNT``.
 
     Returns:
-        (11, k, 3) likewise; NaN where the thorax is unknown. For a bone that is unknown the one before it stands.
+        (11, k, 3) likewise; NaN where the thorax is unknown. An unknown bone is replaced by the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
     _, middle, top, *arms = points
@@ -206,11 +206,11 @@ def turned(positions: FloatArray, local: FloatArray) -> FloatArray:
     return np.array(result)
 
 
-def kept(positions: FloatArray) -> FloatArray:
-    """(11,) ``d`` of eq. (3) and (4): 1 of the trunk and of all that points as in a T-pose.
+def retained(positions: FloatArray) -> FloatArray:
+    """(11,) ``d`` of eq. (3) and (4): 1 for the trunk and for bones that point as in a T-pose.
 
     Args:
-        positions: (25, 3) metres, any frame, NaN where unknown. For a bone that is unknown the one before it stands.
+        positions: (25, 3) metres, any frame, NaN where unknown. An unknown bone is replaced by the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
     _, (lx, ly, lz), _ = _axes(points[2], points[1], points[3], points[7])
@@ -235,11 +235,11 @@ def kept(positions: FloatArray) -> FloatArray:
 
 
 def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
-    """The offsets of joints by how a T-pose looks (eq. 1-2).
+    """The offsets of joints by a measured T-pose (eq. 1-2).
 
     Args:
         positions: (25, 3) metres, forward, left and up in the axes of the thorax; any value where unknown.
-        transient: (11,) square metres per axis, of what does not stay, of the joints ``LEARNT``.
+        transient: (11,) square metres per axis: variance of the transient error of the joints ``LEARNT``.
     """
     points = positions[LEARNT]
     rows, wanted, stddev, angles = _t_pose(points)  # H, c, square root of R
@@ -255,7 +255,7 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
     covariance = np.diag(prior) - (rows * prior).T @ gain
     left = np.einsum("ij,jk,ik->i", angles, covariance, angles) / (angles**2 @ prior)
     # from the axes of the thorax into those of the segments
-    frames = turned(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
+    frames = posed(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
     local = np.einsum("jab,jb->ja", frames, offsets)
     blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
     distance = float(residual @ np.linalg.solve(innovation, residual))
@@ -264,14 +264,14 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
 
 
 def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """What a T-pose says of (11, 3) points: rows (n, 33), values and deviations (n,); and rows (8, 33) of angles."""
+    """The constraints of a T-pose on (11, 3) points: rows H (n, 33), c and sqrt(R) (n,); and rows (8, 33) of angles."""
     rows: list[FloatArray] = []
     values: list[float] = []
     stddev: list[float] = []
     angles: list[FloatArray] = []
     forward, left, up = range(3)
 
-    def say(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
+    def add_row(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
         row = np.zeros(points.shape)
         for joint, factor in terms:
             row[_PLACE[joint], axis] += factor
@@ -291,25 +291,25 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         # plane of elevation: the upper arm goes on along the line of the shoulders
         ratio = upper / width
         terms = (elbow, 1.0), (shoulder, -1.0 - ratio), (other[0], ratio)
-        angles.append(say(forward, 0.0, upper * POSE_STDDEV, *terms))
+        angles.append(add_row(forward, 0.0, upper * POSE_STDDEV, *terms))
         # elevation: at a right angle to the thorax, which leans by how its ends are off sideways
-        row = say(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
+        row = add_row(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
         row[_PLACE[top], left], row[_PLACE[middle], left] = sign * upper / thorax, -sign * upper / thorax
         angles.append(row)
-        for axis, bend, deviation in ((forward, _STRETCHED, _STRETCHED), (up, 0.0, POSE_STDDEV)):
+        for axis, bend, deviation in ((forward, _STRAIGHT_ELBOW, _STRAIGHT_ELBOW), (up, 0.0, POSE_STDDEV)):
             ratio = fore / upper
             terms = (wrist, 1.0), (elbow, -1.0 - ratio), (shoulder, ratio)
-            angles.append(say(axis, fore * bend, fore * deviation, *terms))
+            angles.append(add_row(axis, fore * bend, fore * deviation, *terms))
             ratio = palm / fore
-            say(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
+            add_row(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
     for start, end in zip(range(3), range(1, 4), strict=True):
         terms_of_both = ((arm[end], 1.0) for arm in (_LEFT, _RIGHT)), ((arm[start], -1.0) for arm in (_LEFT, _RIGHT))
-        say(left, 0.0, _ALIKE, *terms_of_both[0], *terms_of_both[1])
+        add_row(left, 0.0, _SYMMETRY_STDDEV, *terms_of_both[0], *terms_of_both[1])
     shoulders = _LEFT[0], _RIGHT[0]
     for axis in (forward, up):
-        say(axis, 0.0, _ALIKE, (shoulders[0], 1.0), (shoulders[1], -1.0))
+        add_row(axis, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 1.0), (shoulders[1], -1.0))
     for joint in (base, middle, top):
-        say(left, 0.0, _ALIKE, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
+        add_row(left, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
     return (
         np.array(rows).reshape(len(rows), -1),
         np.array(values),
@@ -322,8 +322,8 @@ _LONG_AGO_NS = -(2**62)
 
 
 @dataclass(slots=True, eq=False)
-class _Seen:
-    """What one sensor has seen of the person; arrays are never written into."""
+class _Evidence:
+    """One sensor's frames of the person's T-poses; arrays are immutable."""
 
     recent: deque[Skeleton] = field(default_factory=deque)
     check_ns: int = _LONG_AGO_NS
@@ -332,15 +332,15 @@ class _Seen:
     counts: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
     variance: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
 
-    def copied(self) -> _Seen:
+    def copied(self) -> _Evidence:
         return replace(self, recent=self.recent.copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Memory:
-    """All that is known of a person's joints at some time."""
+class Snapshot:
+    """State of :class:`JointCentres` at some time."""
 
-    sensors: Mapping[str, _Seen]
+    sensors: Mapping[str, _Evidence]
     offsets: Offsets | None
     before: FloatArray
     since_ns: int
@@ -348,22 +348,21 @@ class Memory:
     held_ns: int
     refused_ns: int
 
-    def from_the_beginning(self) -> Memory:
-        """The same, as if it had been known long before."""
+    def as_long_known(self) -> Snapshot:
+        """The same, with the offsets fully in force."""
         return replace(self, since_ns=_LONG_AGO_NS, first_ns=_LONG_AGO_NS)
 
 
 class JointCentres:
-    """Learns the offsets of one person's joints, and takes them off.
+    """Estimates the offsets of one person's joints, and subtracts them.
 
-    Only skeletons that state covariances are learnt from: others say nothing of where they take joints to be.
+    Only skeletons with covariances are used.
 
     Args:
-        counters: of who has it; counts ``t_poses`` that were learnt from, and ``t_poses_refused``, which looked as no
-            T-pose of a person does.
+        counters: counts ``t_poses`` that were used, and ``t_poses_refused``, which failed the gate.
 
     Attributes:
-        offsets: what is known; None before.
+        offsets: the estimate; None before the first T-pose.
     """
 
     def __init__(self, counters: dict[str, int]) -> None:
@@ -374,34 +373,34 @@ class JointCentres:
 
     def reset(self) -> None:
         """Forget the person."""
-        self.recall(Memory({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
+        self.restore(Snapshot({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
 
-    def memory(self) -> Memory:
-        """What is known now, to go back to."""
+    def snapshot(self) -> Snapshot:
+        """The present state, for :meth:`restore`."""
         sensors = {name: seen.copied() for name, seen in self._sensors.items()}
         times = self._since_ns, self._first_ns, self._held_ns, self._refused_ns
-        return Memory(sensors, self.offsets, self._before, *times)
+        return Snapshot(sensors, self.offsets, self._before, *times)
 
-    def recall(self, memory: Memory) -> None:
-        """Know what was known then, and nothing else."""
-        self._sensors = {name: seen.copied() for name, seen in memory.sensors.items()}
-        self.offsets, self._before = memory.offsets, memory.before
-        self._since_ns, self._first_ns = memory.since_ns, memory.first_ns
-        self._held_ns, self._refused_ns = memory.held_ns, memory.refused_ns
+    def restore(self, snapshot: Snapshot) -> None:
+        """Return to an earlier state."""
+        self._sensors = {name: seen.copied() for name, seen in snapshot.sensors.items()}
+        self.offsets, self._before = snapshot.offsets, snapshot.before
+        self._since_ns, self._first_ns = snapshot.since_ns, snapshot.first_ns
+        self._held_ns, self._refused_ns = snapshot.held_ns, snapshot.refused_ns
 
-    def see(self, skeleton: Skeleton, sensor: str = "") -> bool:
-        """Look for a T-pose.
+    def update(self, skeleton: Skeleton, sensor: str = "") -> bool:
+        """Check a frame for a T-pose, and update the offsets with it.
 
         Args:
-            skeleton: in a fixed frame, with left and right as they are.
-            sensor: whose it is.
+            skeleton: in a fixed frame, left and right not swapped.
+            sensor: name of its sensor.
 
         Returns:
-            Whether offsets came to be known that were not.
+            Whether there is an estimate for the first time.
         """
         if skeleton.covariances is None:
             return False
-        seen = self._sensors.setdefault(sensor, _Seen())
+        seen = self._sensors.setdefault(sensor, _Evidence())
         recent, stamp_ns = seen.recent, skeleton.stamp_ns
         after_ns = stamp_ns - recent[-1].stamp_ns if recent else 1
         if -_LATE_NS < after_ns <= 0:
@@ -415,7 +414,7 @@ class JointCentres:
             recent.popleft()
         if stamp_ns < seen.check_ns:
             return False
-        # at times that do not depend on which frames came: where some are lost, no more is different than these
+        # at fixed times, so that lost frames do not shift the later checks
         seen.check_ns = (stamp_ns // _CHECK_NS + 1) * _CHECK_NS
         if not is_t_pose(_known([skeleton])) or not self._is_held(recent):
             return False
@@ -423,7 +422,7 @@ class JointCentres:
 
     def _is_held(self, recent: deque[Skeleton]) -> bool:
         """Whether a T-pose is held still over these frames."""
-        if recent[-1].stamp_ns - recent[0].stamp_ns < HOLD * NANOSECONDS or len(recent) < _FEWEST:
+        if recent[-1].stamp_ns - recent[0].stamp_ns < HOLD * NANOSECONDS or len(recent) < _MIN_FRAMES:
             return False
         positions = _known(recent)
         if not is_t_pose(positions):
@@ -431,15 +430,15 @@ class JointCentres:
         arms = positions[:, _ARMS]
         moving = arms[:, :, 1:3] - arms[:, :, :1]
         moving = moving[np.isfinite(moving).all(axis=(1, 2, 3))]
-        return len(moving) >= _FEWEST and bool((moving.var(axis=0).sum(axis=-1) < _STRAY**2).all())
+        return len(moving) >= _MIN_FRAMES and bool((moving.var(axis=0).sum(axis=-1) < _MAX_MOTION**2).all())
 
-    def _learn(self, seen: _Seen, stamp_ns: int) -> bool:
-        """Take what is new, and what all sensors saw together."""
+    def _learn(self, seen: _Evidence, stamp_ns: int) -> bool:
+        """Add a sensor's new frames, and estimate from all sensors together."""
         new = [each for each in seen.recent if each.stamp_ns > seen.taken_ns]
         if not new:
             return False
         points, variance = _in_body_axes(new)
-        candidate = _Seen()
+        candidate = _Evidence()
         there = np.isfinite(points).all(axis=-1) & np.isfinite(variance)
         candidate.sum = np.where(there[..., None], points, 0.0).sum(axis=0)
         candidate.variance = np.where(there, variance, 0.0).sum(axis=0)
@@ -466,13 +465,13 @@ class JointCentres:
 
     def _gate(self, dimension: int) -> float:
         if dimension not in self._gates:
-            self._gates[dimension] = float(chdtri(dimension, 1.0 - _PROBABLE))
+            self._gates[dimension] = float(chdtri(dimension, 1.0 - _GATE_QUANTILE))
         return self._gates[dimension]
 
     @staticmethod
     def _progress(since_ns: int, stamp_ns: int) -> float:
-        """From 0 when something was learnt to 1 when it is in force."""
-        return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_EASE * NANOSECONDS)))
+        """From 0 at the time of an estimate to 1 when it is in force."""
+        return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_FADE_IN * NANOSECONDS)))
 
     def _in_force(self, stamp_ns: int) -> FloatArray:
         """(11, 3) metres, in the frames of the segments."""
@@ -481,68 +480,71 @@ class JointCentres:
         return self._before + self._progress(self._since_ns, stamp_ns) * (self.offsets.local - self._before)
 
     def corrected(self, positions: FloatArray, measured: BoolArray, stamp_ns: int) -> FloatArray:
-        """Where joints are.
+        """Subtract the offsets.
 
         Args:
-            positions: (25, 3) metres, where they are seen.
+            positions: (25, 3) metres, as measured.
             measured: (25,) which are.
-            stamp_ns: when.
+            stamp_ns: capture time.
 
         Returns:
-            (25, 3) without the offsets; as they are where none are known, or where the thorax is not seen.
+            (25, 3) without the offsets; unchanged before the first estimate, or where the thorax is not seen.
         """
         if self.offsets is None:
             return positions
         known = positions if measured.all() else np.where(measured[:, None], positions, np.nan)
-        offsets = turned(known, self._in_force(stamp_ns)[:, None])[:, 0]
+        offsets = posed(known, self._in_force(stamp_ns)[:, None])[:, 0]
         if not math.isfinite(offsets.sum()):
             return positions
-        # by the pose as it is without them: a stretched arm that is seen bent is stretched
+        # by the corrected pose: an arm that is measured bent may be straight
         without = known.copy()
         without[LEARNT] -= offsets
-        offsets *= kept(without)[:, None]
+        offsets *= retained(without)[:, None]
         result = positions.copy()
         result[_MOVED] -= offsets[_MOVED_AS]
         return result
 
     def remaining(self, covariances: FloatArray, positions: FloatArray, stamp_ns: int) -> FloatArray:
-        """Covariances of corrected joints, such that angles between them are known as well as they are.
+        """Covariances of corrected joints, with the right variance of the angles between them.
 
-        What is left of the offsets moves joints together, which covariances of single joints cannot tell: across the
-        arms they are smaller than those of the joints' places by what makes the angles of the T-pose right.
+        The remaining offsets are correlated between joints, which covariances of single joints cannot express: across
+        the arms they are reduced to match the variance of the angles in the T-pose.
 
         Args:
-            covariances: (25, 3, 3) square metres, of the joints as they are seen.
+            covariances: (25, 3, 3) square metres, of the measured joints.
             positions: (25, 3) metres.
             stamp_ns: of both.
         """
         known = self.offsets
         if known is None:
             return covariances
-        axes = turned(positions, known.axes)
+        axes = posed(positions, known.axes)
         if not np.isfinite(axes).all():
             return covariances
         mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
-        gone = (1.0 - _SLOW) * (1.0 - known.share) * self._progress(self._first_ns, stamp_ns) * kept(positions) ** 2
-        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _SHOWN)
+        gone = (
+            (1.0 - _TRANSIENT_SHARE)
+            * (1.0 - known.share)
+            * self._progress(self._first_ns, stamp_ns)
+            * retained(positions) ** 2
+        )
+        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _OBSERVED)
         scaling = axes.swapaxes(1, 2) @ (factors[:, :, None] * axes)
         result = covariances.copy()
         result[LEARNT] = scaling @ covariances[LEARNT] @ scaling
         return result
 
     def spread(self, positions: FloatArray, stamp_ns: int) -> FloatArray:
-        """(75, 75) covariance of the offsets that are left, in the axes of (25, 3) positions: as they are, without
-        what does not stay.
-        """
+        """(75, 75) covariance of the remaining offsets, in the axes of (25, 3) positions."""
         result = np.repeat(BASE_STDDEV**2, 3)[:, None] * np.eye(3 * N_JOINTS)
         if self.offsets is None:
             return result
         count = len(LEARNT)
-        frames = turned(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+        frames = posed(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
         if not np.isfinite(frames).all():
             return result
         blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)
-        share = kept(positions).repeat(3)
+        share = retained(positions).repeat(3)
         progress = self._progress(self._first_ns, stamp_ns) * share * share[:, None]
         places = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
         learnt = np.ix_(places, places)
@@ -566,8 +568,8 @@ def _in_body_axes(skeletons: list[Skeleton]) -> tuple[FloatArray, FloatArray]:
     return np.stack(points), np.stack(variances)
 
 
-def _offsets(sensors: list[_Seen]) -> Offsets | None:
-    """By what sensors saw, each by how much it states; None where a joint is missing that says what the arms do."""
+def _offsets(sensors: list[_Evidence]) -> Offsets | None:
+    """By all sensors' frames, weighted by their stated precision; None where a joint of trunk or arms is missing."""
     precision, total = np.zeros(len(LEARNT)), np.zeros((len(LEARNT), 3))
     for each in sensors:
         seen = each.counts > 0.0
@@ -579,7 +581,7 @@ def _offsets(sensors: list[_Seen]) -> Offsets | None:
         return None
     seen = precision > 0.0
     points = total / np.where(seen, precision, 1.0)[:, None]
-    transient = np.where(seen, _SLOW / np.where(seen, precision, 1.0), _UNSEEN)
+    transient = np.where(seen, _TRANSIENT_SHARE / np.where(seen, precision, 1.0), _UNSEEN)
     positions = np.full((N_JOINTS, 3), np.nan)
     positions[LEARNT] = points
     return t_pose_offsets(positions, transient)

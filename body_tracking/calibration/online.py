@@ -1,10 +1,9 @@
 """Calibration while people move: skeletons in, poses and clocks of the sensors out.
 
-Everything is a function of the stamps: an estimate at reference time T uses what was captured up to T minus
-``settle_time`` and holds from T plus ``activation_delay``, so that a live run and an offline one, in which messages
-arrive a little earlier or later, give the same numbers.
+Everything is a function of the stamps: an estimate at reference time T uses frames captured up to T minus
+``settle_time`` and holds from T plus ``activation_delay``, so that times of arrival do not change the numbers.
 
-Over 500 lines: one state machine from first frame to published pose; the estimators that it uses are beside it.
+Over 500 lines: one state machine from first frame to published pose, over estimators in their own modules.
 """
 
 from __future__ import annotations
@@ -25,62 +24,54 @@ from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, st
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.measurement import joint_stddev
-from body_tracking.core.sensor_poses import (
-    CalibrationResult,
-    SensorPose,
-    SensorQuality,
-    level_pose,
-)
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
 PAIR_PERIOD = 0.1
-"""Seconds of reference time between remembered pairs: frames closer together err alike."""
+"""Seconds of reference time between stored pairs: errors of frames closer together are correlated."""
 
 MAX_BRACKET = 0.09
-"""Interpolate between two frames of a sensor only where they are at most this far apart, seconds."""
+"""Longest interval between two frames of a sensor for interpolation, seconds."""
 
 GUESS_FRAMES = 30
 """Frames of a sensor whose delay of receipt gives the first guess of its clock."""
 
 GUESS_GRID = 0.1
-"""The guess is rounded to this, seconds: a few milliseconds of network then make no difference."""
+"""The guess is rounded to this, seconds, so that network delays do not change it."""
 
 RECEIPT_FRAMES = 90
-"""Frames of a sensor whose median delay of receipt gives its clock until motion tells it better: three seconds ..."""
+"""Frames of a sensor whose median delay of receipt gives its clock until the motion does: three seconds ..."""
 
 RECEIPT_GRID = 0.04
-"""... rounded to this, seconds. The medians of a live run and of its recording differ by some tenths of a millisecond,
-so that they seldom part here; the least delays differ by 30 ms and more, because a frame that overtakes the ``/clock``
-of a bag seems to have come early."""
+"""... rounded to this, seconds. The medians of a live run and of its recording differ by some tenths of a millisecond
+and seldom round differently; the minima differ by 30 ms and more, because a frame can overtake a bag's ``/clock``."""
 
-REPAIR_CLOCK = 0.004
+PAIR_AGAIN_CLOCK = 0.004
 """Interpolate the frames anew when the clock has moved by more than this since they were paired, seconds."""
 
 CLOCK_WINDOW_NS = 5 * NANOSECONDS
-"""Length of the windows of motion that each tell the offset of the clock."""
+"""Length of the windows of motion that each measure the offset of the clock."""
 
 REBASE_CLOCK = 0.05
-"""The offset is looked for around another line when the clock has gone this far from the one so far, seconds."""
+"""The fit gets a new base when the clock differs from its base by this, seconds."""
 
 MOVED_SIGMAS = 5.0
-"""A sensor has been moved, or its clock set, when its pose or clock is this many standard deviations from the saved
-one."""
+"""Standard deviations between estimate and saved pose or clock from which the saved one is dropped."""
 
 WANDER_PPM = 50.0
-"""Standard deviation by which the drift of a clock changes after it was saved, parts per million: quartz follows the
-temperature."""
+"""Standard deviation of a saved clock's change of drift, parts per million: quartz depends on the temperature."""
 
-NO_POSE_AFTER = 8.0
-"""Seconds after which nobody waits any longer for a still pose, or for motion that tells the clock."""
+START_TIMEOUT = 8.0
+"""Longest wait for a still pose, or for motion that determines the clock, seconds."""
 
-HALF_TURN = 0.5 * np.pi
-"""A published pose that is farther than this from a better one is put right at once, radians: it is of no use."""
+JUMP_ANGLE = 0.5 * np.pi
+"""A published pose farther than this from a better one is replaced at once, radians."""
 
 FOREIGN_CLOCK = 5.0
-"""Seconds; a saved clock that is further off is not of stamps in ROS time, whose offsets are small."""
+"""Largest saved offset, seconds: clocks in ROS time have small ones."""
 
 CLOCK_STEP = 1.0
-"""A saved offset that is farther from the guess by the times of receipt is of another clock, seconds."""
+"""Largest difference of a saved offset from the one by times of receipt, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +180,7 @@ class CalibrationParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationUpdate:
-    """A result to be published.
+    """A result to publish.
 
     Attributes:
         valid_from_ns: reference time from which it holds; 0 for always.
@@ -230,7 +221,7 @@ class _Track:
                 del values[:old]
 
     def delay(self, first_ns: int, last_ns: int) -> float | None:
-        """Median delay of receipt of the frames of a time, nanoseconds; None where there are few."""
+        """Median delay of receipt of the frames in an interval, nanoseconds; None for fewer than GUESS_FRAMES."""
         found = self.delays[bisect_left(self.stamps, first_ns) : bisect_right(self.stamps, last_ns)]
         return float(np.median(found)) if len(found) >= GUESS_FRAMES else None
 
@@ -261,7 +252,7 @@ class _Track:
 
 
 class _Sensor:
-    """What is known of one sensor beside the reference; rotations and translations are sensor to reference, optical."""
+    """State of one sensor other than the reference; rotations and translations are sensor to reference, optical."""
 
     def __init__(self, parameters: CalibrationParameters) -> None:
         self.parameters = parameters
@@ -271,12 +262,12 @@ class _Sensor:
         self.target: tuple[FloatArray, FloatArray, FloatArray] | None = None  # rotation, translation, centre
         self.clock = ClockModel()  # in use
         self.loaded: ClockModel | None = None  # from another session
-        self.quality = SensorQuality()  # but for the clock
+        self.quality = SensorQuality()  # of the pose
         self.turned = 0.0
         self.forget()
 
     def forget(self) -> None:
-        """Start estimating anew; what is published stays."""
+        """Start estimating anew; the published pose stays."""
         self.clock = replace(self.clock, stddev=np.inf, drift_stddev_ppm=np.inf)
         self.clock_guessed = False
         self.clock_saved = False
@@ -295,7 +286,7 @@ class _Sensor:
         self.movement_since: int | None = None
 
 
-def _clock_from(sensor: _Sensor) -> str:
+def _clock_source(sensor: _Sensor) -> str:
     if sensor.clock_locked:
         return "motion"
     return "saved" if sensor.clock_saved else "receipt"
@@ -342,7 +333,7 @@ class OnlineCalibration:
             received_ns: when it arrived, in a clock common to all sensors.
 
         Returns:
-            What is to be published now, mostly nothing.
+            The results to publish, usually none.
         """
         if sensor == self.reference:
             if not self._track.push(skeleton, received_ns):
@@ -375,27 +366,28 @@ class OnlineCalibration:
         self._now = now
         horizon = now - round(self.parameters.settle_time * NANOSECONDS)
         for name, other in self._sensors.items():
-            self._follow(name, other, horizon)
+            self._process(name, other, horizon)
         self._track.forget_before(now - round(self.parameters.history * NANOSECONDS))
         if self._last_step is not None and now - self._last_step < PAIR_PERIOD * NANOSECONDS:
             return []
         elapsed = 0.0 if self._last_step is None else (now - self._last_step) / NANOSECONDS
         self._last_step = now
         for other in self._sensors.values():
-            # While nobody was seen, nothing can jump.
+            # The pose may jump after a gap: no person was seen.
             self._changed |= self._slew(other, np.inf if gap else elapsed)
         if not self._changed:
             return []
         self._changed = False
-        return [self._update(now + round(self.parameters.activation_delay * NANOSECONDS))]
+        valid_from_ns = now + round(self.parameters.activation_delay * NANOSECONDS)
+        return [CalibrationUpdate(valid_from_ns, self._result(valid_from_ns, published=True))]
 
     # --- one sensor
 
-    def _follow(self, name: str, other: _Sensor, horizon: int) -> None:
+    def _process(self, name: str, other: _Sensor, horizon: int) -> None:
         if not other.clock_guessed and not self._guess_clock(name, other):
             return
         if other.received is None:
-            self._receive_clock(name, other, horizon)
+            self._clock_from_receipt(name, other, horizon)
         own_horizon = other.clock.to_sensor(horizon)
         other.track.forget_before(own_horizon - round(self.parameters.history * NANOSECONDS))
         if not other.track.stamps or other.track.stamps[-1] < own_horizon - 2 * NANOSECONDS:
@@ -413,7 +405,7 @@ class OnlineCalibration:
             if other.received is not None and not other.clock_locked:
                 self._lock_clock(name, other, horizon)
             if other.clock_locked:
-                self._follow_clock(name, other, horizon)
+                self._update_clock(name, other, horizon)
             self._estimate(name, other)
 
     def _guess_clock(self, name: str, other: _Sensor) -> bool:
@@ -432,22 +424,22 @@ class OnlineCalibration:
         elif other.loaded is None:
             other.clock_saved = True  # of this session, whose motion is not to count twice
         else:
-            other.clock = other.clock_expected = self._carried(other.loaded)
+            other.clock = other.clock_expected = self._at_session_start(other.loaded)
             other.clock_saved = other.clock.stddev < RECEIPT_PRIOR
         other.clock_guessed = True
         return True
 
-    def _carried(self, loaded: ClockModel) -> ClockModel:
-        """What a clock of another session says of the beginning of this one."""
+    def _at_session_start(self, loaded: ClockModel) -> ClockModel:
+        """A clock of another session, predicted to the beginning of this one."""
         assert self._anchor is not None
         return loaded.carried_to(self._anchor, WANDER_PPM)
 
-    def _receive_clock(self, name: str, other: _Sensor, horizon: int) -> None:
-        """Better than the guess: the delays over some seconds, of the frames that both sensors took in them."""
+    def _clock_from_receipt(self, name: str, other: _Sensor, horizon: int) -> None:
+        """Replace the guess by the median delays over some seconds, of the frames that both sensors took in them."""
         stamps = other.track.stamps
         start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
         stop = start + RECEIPT_FRAMES - 1
-        # Only what was captured long enough ago, or another order of arrival would make this happen a frame later.
+        # Only frames captured long enough ago, so that the order of arrival does not matter.
         if stop >= len(stamps) or other.clock.to_sensor(horizon) < stamps[stop]:
             return
         first, last = stamps[start], stamps[stop]
@@ -463,16 +455,16 @@ class OnlineCalibration:
                 other.clock = replace(
                     other.received, offset_ns=other.clock.offset_ns_at(middle), drift_ppm=other.clock.drift_ppm
                 )
-            return  # a clock that was calibrated is better, where it has not drifted away since
+            return  # a calibrated clock that has not drifted away is better
         if other.clock_saved:
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
         other.loaded = other.clock_expected = None
         other.clock = other.received
         self._pair_anew(other, horizon)
         self._changed = True
 
     def _pair(self, other: _Sensor, horizon: int) -> None:
-        """Remember pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
+        """Store pairs for the reference frames up to the horizon, one per :data:`PAIR_PERIOD`."""
         assert self._anchor is not None
         track, period = self._track, round(PAIR_PERIOD * NANOSECONDS)
         start = 0 if other.paired_until is None else bisect_right(track.stamps, other.paired_until)
@@ -505,7 +497,7 @@ class OnlineCalibration:
             try:
                 found = [still_pose_registration(own[1:], theirs[1:])]
                 if self.parameters.method == "robust":
-                    # One of them may see the body turned around.
+                    # One of them may see the body reversed.
                     exchanged = theirs[1][:, MIRROR], theirs[2][:, MIRROR]
                     found.append(still_pose_registration(own[1:], exchanged))
             except CalibrationError:
@@ -516,18 +508,18 @@ class OnlineCalibration:
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
-                self._aim(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
-        elif self.parameters.method == "robust" and self._moved_enough(other, horizon):
-            # Nobody stands still: the movement itself is a start.
+                self._set_target(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
+        elif self.parameters.method == "robust" and self._can_start_from_movement(other, horizon):
+            # Without a still pose the movement itself is a start.
             start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from movement, no still pose was seen")
                 other.started = start
 
     @staticmethod
-    def _moved_enough(other: _Sensor, horizon: int) -> bool:
-        """Whether movement may be the start: its clock is known from motion, or has been from receipt for a while."""
-        waited = other.received is not None and horizon - other.received.anchor_ns > NO_POSE_AFTER * NANOSECONDS
+    def _can_start_from_movement(other: _Sensor, horizon: int) -> bool:
+        """Whether the clock is known from motion, or has been known from receipt for a while."""
+        waited = other.received is not None and horizon - other.received.anchor_ns > START_TIMEOUT * NANOSECONDS
         return len(other.pairs) >= 20 and (other.clock_locked or waited)
 
     def _lock_clock(self, name: str, other: _Sensor, horizon: int) -> None:
@@ -543,7 +535,7 @@ class OnlineCalibration:
             return
         other.clock_base = replace(other.clock, offset_ns=other.clock.offset_ns + round(found.offset * NANOSECONDS))
         if other.clock_expected is not None and abs(found.offset) > FINE_RANGE:
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
         other.clock_locked = True
         other.movement_since = self._now
         self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
@@ -559,7 +551,7 @@ class OnlineCalibration:
         self, track: _Track, clock: ClockModel, start: int | None, stop: int
     ) -> tuple[FloatArray, FloatArray]:
         """Of the frames in (start, stop] of a clock: reference seconds (n,) since the anchor, and positions."""
-        # Stamps since an epoch have no room for microseconds in a float.
+        # Differences first: a float has too few digits for microseconds since the epoch.
         first = 0 if start is None else bisect_right(track.stamps, start)
         last = bisect_right(track.stamps, stop)
         assert self._anchor is not None
@@ -567,23 +559,23 @@ class OnlineCalibration:
         stamps = np.array(since) / NANOSECONDS
         return stamps, np.array(track.positions[first:last]).reshape(-1, N_JOINTS, 3)
 
-    def _not_as_saved(self, name: str, other: _Sensor) -> None:
+    def _drop_saved_clock(self, name: str, other: _Sensor) -> None:
         self.events.append(f"{name}: its clock was set since it was calibrated")
         other.loaded = other.clock_expected = None
 
     def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockModel | None:
-        """The clock by all the motion so far and by what was known before it, unless these contradict each other."""
+        """The clock by all the motion so far and the expected clock, unless these contradict each other."""
         found, expected = fit.solve(other.received), other.clock_expected
         if found is None or expected is None:
             return found
         apart = (found.offset_ns - expected.offset_ns_at(found.anchor_ns)) / NANOSECONDS
         if abs(apart) > MOVED_SIGMAS * np.hypot(found.stddev, expected.stddev_at(found.anchor_ns)):
-            self._not_as_saved(name, other)
+            self._drop_saved_clock(name, other)
             return found
         return fit.solve(expected)
 
-    def _follow_clock(self, name: str, other: _Sensor, horizon: int) -> None:
-        """Measure the offset over every window of motion that is complete, and fit the clock to all of them."""
+    def _update_clock(self, name: str, other: _Sensor, horizon: int) -> None:
+        """Measure the offset over every complete window of motion, and fit the clock to all of them."""
         assert self._anchor is not None and other.clock_window_end is not None
         around = round(2 * FINE_RANGE * NANOSECONDS)
         measured = False
@@ -610,12 +602,12 @@ class OnlineCalibration:
         other.clock = found
         gone = other.clock.to_sensor(other.clock_window_end) - other.clock_base.to_sensor(other.clock_window_end)
         if abs(gone) > REBASE_CLOCK * NANOSECONDS:
-            # What is known by now is what the next fit expects.
+            # The estimate so far is the next fit's prior.
             other.clock_expected, other.clock_base, other.clock_fit = other.clock, other.clock, None
         assert self._now is not None
         moved = (other.clock.to_sensor(self._now) - other.paired_clock.to_sensor(self._now)) / NANOSECONDS
-        if abs(moved) > REPAIR_CLOCK:
-            if self._remembers_all(other) and other.paired_until is not None:
+        if abs(moved) > PAIR_AGAIN_CLOCK:
+            if self._covers_all_pairs(other) and other.paired_until is not None:
                 self._pair_anew(other, other.paired_until)
             else:
                 other.pairs.shift_clock(
@@ -635,17 +627,17 @@ class OnlineCalibration:
         other.started = best.rotation, best.translation
         other.turned = best.turned
         if not other.estimated and best.rotation_stddev > other.quality.rotation_stddev:
-            # A calibration that was loaded is better than what this session knows so far, unless they contradict.
+            # A loaded calibration of smaller stated uncertainty stays, unless the estimate contradicts it.
             if not other.clock_locked or not self._contradicts(best, other):
                 return
             self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
         other.estimated = True
         other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, frames=len(pairs))
-        self._aim(other, best.rotation, best.translation, best.centre)
+        self._set_target(other, best.rotation, best.translation, best.centre)
 
     @staticmethod
     def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
-        """Whether the published pose is farther from an estimate than both are uncertain."""
+        """Whether published pose and estimate differ by more than their uncertainties explain."""
         assert other.rotation is not None
         apart = Rotation.from_matrix(found.rotation @ other.rotation.T).magnitude()
         place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
@@ -655,7 +647,7 @@ class OnlineCalibration:
             or shift > 0.05 + MOVED_SIGMAS * np.hypot(found.translation_stddev, other.quality.translation_stddev)
         )
 
-    def _remembers_all(self, other: _Sensor) -> bool:
+    def _covers_all_pairs(self, other: _Sensor) -> bool:
         """Whether the raw frames still reach back to the oldest pair."""
         assert self._anchor is not None
         if not len(other.pairs):
@@ -664,7 +656,7 @@ class OnlineCalibration:
         return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
 
     def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
-        """The best from three starts: the last estimate, half a turn from it, the spines, which know no sides."""
+        """The best from three starts: the last estimate, half a turn from it, and the spines, which have no sides."""
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)
@@ -675,16 +667,16 @@ class OnlineCalibration:
             starts.append(opposite)
         return best_estimate(pairs, starts)
 
-    def _aim(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
+    def _set_target(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
         other.target = rotation, translation, centre
-        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > HALF_TURN:
+        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > JUMP_ANGLE:
             other.rotation, other.translation = rotation, translation
             self._changed = True
 
     def _slew(self, other: _Sensor, elapsed: float) -> bool:
         """Move the published pose toward the target; True when it moved.
 
-        The turn is about the person, so that what the person does is disturbed least.
+        The rotation is about the person's place, to disturb the person's motion least.
         """
         if other.target is None or other.rotation is None:
             return False
@@ -703,12 +695,9 @@ class OnlineCalibration:
 
     # --- results
 
-    def _update(self, valid_from_ns: int) -> CalibrationUpdate:
-        return CalibrationUpdate(valid_from_ns, self._result(valid_from_ns, published=True))
-
     def _result(self, valid_from_ns: int, *, published: bool) -> CalibrationResult:
         base_rotation = self._base.rotation
-        poses = {self.reference: self._base}
+        poses = {self.reference: replace(self._base, valid_from_ns=valid_from_ns)}
         clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0, 0.0, 0.0)}
         quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0, 0.0)}
         for name, other in self._sensors.items():
@@ -719,51 +708,46 @@ class OnlineCalibration:
                 name,
                 base_rotation @ translation + self._base.translation,
                 Rotation.from_matrix(base_rotation @ rotation).as_quat(),
+                valid_from_ns,
             )
             clocks[name] = other.clock
             quality[name] = replace(
-                other.quality,
-                clock_stddev=other.clock.stddev,
-                clock_drift_stddev_ppm=other.clock.drift_stddev_ppm,
+                other.quality, clock_stddev=other.clock.stddev, clock_drift_stddev_ppm=other.clock.drift_stddev_ppm
             )
-        stamped = {
-            name: SensorPose(pose.sensor, pose.translation, pose.quat_xyzw, valid_from_ns)
-            for name, pose in poses.items()
-        }
-        return CalibrationResult(self.reference, stamped, clocks, quality)
+        return CalibrationResult(self.reference, poses, clocks, quality)
 
     def current_update(self) -> CalibrationUpdate:
-        """What holds now, to be published at the start; valid always."""
-        return self._update(0)
+        """The present result, valid for all times, to publish at the start."""
+        return CalibrationUpdate(0, self._result(0, published=True))
 
     def result(self) -> CalibrationResult:
         """The best estimate so far, not slewed."""
         return self._result(0, published=False)
 
     def finish(self) -> CalibrationResult:
-        """The best estimate from everything that was pushed, up to the last frame; for recordings."""
+        """The best estimate from all frames up to the last one; for recordings."""
         if self._now is not None and self._anchor is not None and self.parameters.method == "robust":
             for name, other in self._sensors.items():
                 if not other.clock_guessed:
                     continue
                 if other.clock_locked and self._track.stamps[0] <= self._anchor:
-                    # The recording is still here as a whole: measure every window with what is known now.
+                    # All frames are still stored: measure every window again with the final clock.
                     other.clock_fit, other.clock_window_end = None, self._anchor
                     other.clock_base = other.clock
-                    other.clock_expected = None if other.loaded is None else self._carried(other.loaded)
+                    other.clock_expected = None if other.loaded is None else self._at_session_start(other.loaded)
                 if other.clock_locked:
-                    self._follow_clock(name, other, self._now)
-                    if self._remembers_all(other):
+                    self._update_clock(name, other, self._now)
+                    if self._covers_all_pairs(other):
                         self._pair_anew(other, self._now)
                 self._pair(other, self._now)
                 self._estimate(name, other)
         return self.result()
 
     def load(self, result: CalibrationResult) -> None:
-        """Take an earlier calibration; it holds until movement shows a better one.
+        """Load an earlier calibration; it holds until there is a better estimate.
 
-        Its clocks count as known from other motion than this session's: given what the same recording told before,
-        clocks are stated to be known better by up to the square root of two.
+        Its clocks count as independent of this session's motion: a calibration from the same recording makes the stated
+        standard deviations of clocks too small, by up to the square root of two.
 
         Raises:
             CalibrationError: it belongs to another reference sensor.
@@ -804,7 +788,7 @@ class OnlineCalibration:
         return "calibrating: stand still (a T-pose is best) for two seconds, then walk about"
 
     def reset(self) -> str:
-        """Forget every calibration and start again."""
+        """Delete every calibration and start again."""
         for name, other in list(self._sensors.items()):
             fresh = _Sensor(self.parameters)
             fresh.track = other.track
@@ -815,7 +799,7 @@ class OnlineCalibration:
     def status(self) -> tuple[int, str, dict[str, object]]:
         """Diagnostic level (0 OK, 1 warning), one line, and values per sensor."""
         values: dict[str, object] = {"reference": self.reference, "method": self.parameters.method}
-        waiting, unsure = [], []
+        waiting, uncertain = [], []
         for name, other in self._sensors.items():
             if other.rotation is None:
                 waiting.append(name)
@@ -823,7 +807,7 @@ class OnlineCalibration:
             quality, clock = other.quality, other.clock
             at_ns = clock.anchor_ns if self._now is None else self._now
             if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
-                unsure.append(name)
+                uncertain.append(name)
             values |= {
                 f"{name} residual_mm": round(1e3 * quality.residual, 1),
                 f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
@@ -831,13 +815,13 @@ class OnlineCalibration:
                 f"{name} clock_offset_s": round(clock.offset_ns_at(at_ns) / NANOSECONDS, 4),
                 f"{name} clock_drift_ppm": round(clock.drift_ppm, 1),
                 f"{name} clock_stddev_ms": round(1e3 * clock.stddev_at(at_ns), 2),
-                f"{name} clock_from": _clock_from(other),
+                f"{name} clock_from": _clock_source(other),
                 f"{name} pairs": len(other.pairs),
                 f"{name} turned_share": round(other.turned, 3),
                 f"{name} late_frames": other.track.late,
             }
         if waiting:
             return 1, f"waiting for a still pose seen by {self.reference} and {', '.join(waiting)}", values
-        if unsure:
-            return 1, f"{', '.join(unsure)}: roughly calibrated, walk about to refine", values
+        if uncertain:
+            return 1, f"{', '.join(uncertain)}: roughly calibrated, walk about to refine", values
         return 0, "calibrated", values

@@ -1,11 +1,10 @@
-"""The pose of one sensor against another, from a person who moves.
+"""The pose of one sensor against another, from a moving person.
 
-What one still pose cannot give: Kinect skeletons are distorted by the direction from which they are seen, by an
-amount that stays while a person stands and faces the same way, so that averaging more of the same frames does not
-help (DESIGN 4.8). The estimator therefore carries an unknown constant offset per joint beside the pose. While a
-person stands still the offsets take part of what the pose should explain, and the stated uncertainty is large; as the
-person moves, the motion of every joint determines the pose and the offsets are only what is left. The more places and
-headings the pairs come from, the smaller the offset that an average over them can have, so its prior tightens.
+The systematic error of a Kinect skeleton depends on the viewing direction and is constant while a person stands and
+faces the same way, so that averaging more frames of one pose does not reduce it (DESIGN 4.8). The estimator therefore
+has an unknown constant offset per joint in addition to the pose. Offsets and pose are ambiguous for a still person, and
+the stated uncertainty is large; motion separates them. Offsets average out over places and headings, so their prior
+variance falls with the number of these.
 """
 
 from __future__ import annotations
@@ -21,22 +20,21 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint
 MIDLINE: IntArray = np.array(
     [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD], dtype=np.intp
 )
-"""Joints that are the same whether left and right are exchanged or not."""
+"""Joints that do not change when left and right are swapped."""
 
 OFFSET_STDDEV = 0.06
-"""Prior of the constant offset between two sensors' ideas of one joint, metres (60 mm: what pairs of Kinect v2 at 45 to
-90 degrees show)."""
+"""Prior of the constant offset of a joint between two sensors, metres (from pairs of Kinect v2 at 45 to 90 degrees)."""
 
 CAUCHY = 1.3
-"""Residuals beyond this many standard deviations lose influence (Cauchy weights)."""
+"""Scale of the Cauchy weights, in standard deviations."""
 
 FRAMES_PER_SAMPLE = 10.0
-"""Pairs of frames 0.1 s apart err together; this many count as one independent observation."""
+"""Pairs of frames, 0.1 s apart, per independent observation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """What two sensors saw at the same instants.
+    """Frames of two sensors at the same instants.
 
     Attributes:
         reference: (n, 25, 3) metres in the reference sensor's optical frame.
@@ -63,9 +61,9 @@ class PairEstimate:
         translation: (3,) metres.
         covariance: (6, 6) of (rotation vector about ``centre``, translation there), square radians and metres.
         centre: (3,) metres, where the person was on average, in the reference frame.
-        residual: median distance between what both sensors say of a joint, metres.
+        residual: median distance between both sensors' positions of a joint, metres.
         cost: robust cost of all pairs, for comparing estimates from the same pairs.
-        turned: share of frames in which one sensor sees the body turned around or swapped.
+        turned: share of frames in which one sensor sees the body reversed or swapped.
     """
 
     rotation: FloatArray
@@ -78,12 +76,12 @@ class PairEstimate:
 
     @property
     def rotation_stddev(self) -> float:
-        """Radians, about the axis known worst."""
+        """Radians, about the least accurate axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     @property
     def translation_stddev(self) -> float:
-        """Metres, at the place where the person was, along the axis known worst."""
+        """Metres, at the person's mean place, along the least accurate axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
@@ -95,17 +93,17 @@ def same_sense(reference: FloatArray, sensor_in_reference: FloatArray) -> BoolAr
         sensor_in_reference: (n, 25, 3) metres, same frame.
 
     Returns:
-        (n,) false where one of them sees the body turned around or its sides swapped.
+        (n,) false where one of them sees the body reversed or its sides swapped.
     """
     same: BoolArray = np.einsum("ni,ni->n", body_heading(reference), body_heading(sensor_in_reference)) > 0.0
     return same
 
 
 def start_from_midline(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
-    """A start that does not depend on left and right: the spines, wherever the person went.
+    """A start from the spines, independent of left and right.
 
     Returns:
-        Rotation and translation, or None while the person has not moved enough to fix the rotation about the vertical.
+        Rotation and translation, or None while the person's motion does not determine the rotation about the vertical.
     """
     usable = np.isfinite(pairs.variance[:, MIDLINE]).all(axis=1)
     if usable.sum() < 10:
@@ -126,14 +124,14 @@ def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterat
 
         sum_nj rho(|a_nj - R s_nj - t - b_j| / sigma_nj) + sum_j |b_j|^2 / (2 sigma_b^2)
 
-    with Cauchy's rho, frames with a turned or swapped body left out, in blocks: pose by the SVD, offsets in closed
-    form, weights from the residuals.
+    with Cauchy's rho, without reversed or swapped frames, in blocks: pose by the SVD, offsets in closed form, weights
+    from the residuals.
 
     Args:
         pairs: at least ten.
         rotation: (3, 3) start.
         translation: (3,) start, metres.
-        iterations: how often the blocks are swept.
+        iterations: number of sweeps over the blocks.
 
     Raises:
         CalibrationError: too few pairs, or none in which the sensors agree on left and right.

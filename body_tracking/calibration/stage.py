@@ -29,7 +29,7 @@ _FIXED = {
 
 
 class CalibrationStage(Stage):
-    """Estimates where the sensors stand and how their clocks run, from a person who moves."""
+    """Estimates poses and clocks of the sensors from a moving person."""
 
     NAME = "calibration"
     PARAMETERS = (

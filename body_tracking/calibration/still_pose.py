@@ -11,14 +11,14 @@ FRAMES = 50
 """Frames in the average, as in the thesis ("less than two seconds")."""
 
 STILL_DRIFT = 0.035
-"""A body is still while half of its joints keep their mean place from the first half of the frames to the second to
-within this, metres: a sensor's error wanders by a few centimetres."""
+"""Largest median change of the joints' mean positions between both halves of a still pose's frames, metres: a sensor's
+error drifts by a few centimetres."""
 
 STILL_STDDEV = 0.06
-"""... and four of five stray less than this, metres: noise, not a wave of the hand."""
+"""... and largest standard deviation of four of five joints, metres."""
 
 LONGEST = 5.0
-"""Fifty frames that take longer than this are not one pose, seconds."""
+"""Longest duration of the fifty frames, seconds."""
 
 
 def is_still(stamps: FloatArray, positions: FloatArray) -> bool:
@@ -43,16 +43,13 @@ def is_t_pose(positions: FloatArray) -> bool:
     """Whether both arms are stretched out sideways, on average.
 
     Args:
-        positions: (n, 25, 3) metres, any frame, NaN where unknown; not, where one of the joints that matter always is.
+        positions: (n, 25, 3) metres, any frame, NaN where unknown; False where a joint of the arms always is.
     """
     known = np.isfinite(positions)
     with np.errstate(invalid="ignore"):
         pose = np.where(known, positions, 0.0).sum(axis=0) / known.sum(axis=0)
     across = pose[Joint.SHOULDER_LEFT] - pose[Joint.SHOULDER_RIGHT]
-    arms = (
-        pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT],
-        pose[Joint.SHOULDER_RIGHT] - pose[Joint.WRIST_RIGHT],
-    )
+    arms = (pose[Joint.WRIST_LEFT] - pose[Joint.SHOULDER_LEFT], pose[Joint.SHOULDER_RIGHT] - pose[Joint.WRIST_RIGHT])
     return all(float(arm @ across) > 0.85 * float(np.linalg.norm(arm) * np.linalg.norm(across)) for arm in arms)
 
 
@@ -67,7 +64,7 @@ def _average(positions: FloatArray, states: np.ndarray) -> tuple[FloatArray, Boo
 def still_pose_registration(
     reference: tuple[FloatArray, np.ndarray], sensor: tuple[FloatArray, np.ndarray]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Average what two sensors saw of one pose, and register the averages on every joint that both track.
+    """Average two sensors' frames of one pose, and register the averages on every joint that both track.
 
     Schlagenhauf 2017, section 5.3.1; she takes all 25 joints of a T-pose.
 

@@ -16,7 +16,7 @@ from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, Senso
 from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
 
 MAX_DRIFT_PPM = 10_000.0
-"""A clock that is a hundredth faster than another is no drift but a damaged number; NTP slews by 500 ppm at most."""
+"""Largest plausible drift; NTP slews by 500 ppm at most."""
 
 _HEADER = """\
 # Calibration written by body_tracking: the pose of each <sensor>_optical_frame (x right, y down, z forward) in world,

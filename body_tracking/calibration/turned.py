@@ -1,8 +1,8 @@
-"""The pose of a sensor where one of the two sees the body turned around: which of two half turns is the right one.
+"""The pose of a sensor where one of the two sees the body reversed.
 
-Labels lead a registration half a turn off while a sensor takes the back for the front, or has left and right exchanged
-in a side view. A body is not the same from behind, though: feet, head and arms are before the spine, so that the joints
-fit worse the wrong way round.
+A registration by labels is half a turn off while a sensor mistakes the back for the front, or swaps left and right in a
+side view. The body is not symmetric, though: feet, head and arms are in front of the spine, so that the wrong half turn
+has larger residuals.
 """
 
 from __future__ import annotations
@@ -20,17 +20,12 @@ Pose = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and translation (3,) metres, sensor to reference."""
 
 MIN_SAME = 0.2
-"""Where the sensors agree on left and right in fewer frames than this share, the others have to do."""
+"""Least share of frames in which the sensors agree on left and right for an estimate from these alone."""
 
 
 def with_sides_swapped(pairs: Pairs, frames: BoolArray) -> Pairs:
-    """The same pairs, left and right of the sensor exchanged in some frames.
-
-    Args:
-        pairs: n of them.
-        frames: (n,) in which.
-    """
-    # Which sensor's variance it was is not remembered: the larger of both sides is safe.
+    """The pairs with left and right of the sensor swapped in the frames of a mask (n,)."""
+    # The variance is a sum over both sensors: the larger of both sides is an upper bound.
     variance = np.maximum(pairs.variance, pairs.variance[:, MIRROR])
     return replace(
         pairs,
@@ -40,7 +35,7 @@ def with_sides_swapped(pairs: Pairs, frames: BoolArray) -> Pairs:
 
 
 def registration(pairs: Pairs) -> Pose | None:
-    """All joints of all frames registered by their labels; None where that determines nothing."""
+    """All joints of all frames registered by their labels; None where the pose is not determined."""
     known = np.isfinite(pairs.variance)
     try:
         return rigid_registration(pairs.reference[known], pairs.sensor[known])
@@ -49,15 +44,15 @@ def registration(pairs: Pairs) -> Pose | None:
 
 
 def half_turn_from(pairs: Pairs, rotation: FloatArray) -> Pose | None:
-    """The pose with which each frame says the opposite of left and right than with a given one."""
+    """The pose with which each frame has the opposite left and right than with a given one."""
     return registration(with_sides_swapped(pairs, same_sense(pairs.reference, pairs.sensor @ rotation.T)))
 
 
 def best_estimate(pairs: Pairs, starts: Iterable[Pose]) -> PairEstimate | None:
     """The best of the estimates from several starts, one of which should be half a turn from another.
 
-    Each is judged by all frames, the sides exchanged in those in which it makes the sensors disagree about them: a body
-    seen turned around is then evidence like any other.
+    The cost of each is over all frames, with left and right swapped where the sensors disagree about them, so that
+    reversed frames count, too.
 
     Args:
         pairs: at least ten.

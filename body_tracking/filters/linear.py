@@ -291,7 +291,7 @@ class LinearKalmanFilter:
             self._restart()
         step = self._arrivals.elapsed if arrival is Arrival.NEXT else 0.0
         if self.parameters.t_pose:
-            self._centres.see(skeleton)
+            self._centres.update(skeleton)
         positions, measured = self._measurement(skeleton)
         noise = self._measurement_noise(skeleton, positions, measured)
         rejected = self._filter(positions, noise, measured & self._alive, step)

@@ -290,7 +290,7 @@ class PersonFilter:
             assert estimate is not None  # a frame was taken
             self._prediction.arrived(skeleton.stamp_ns, now_ns)
             self._send(None, estimate)
-            if self._lengths.news(estimate.stamp_ns, estimate.lengths):
+            if self._lengths.due(estimate.stamp_ns, estimate.lengths):
                 from body_tracking.kinematics.urdf import urdf
 
                 text = urdf(self._model_filter.model, estimate.lengths, self._body)

@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
-from body_tracking.calibration.joint_centres import Memory
+from body_tracking.calibration.joint_centres import Snapshot
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
@@ -248,8 +248,8 @@ def smooth(
     if learn:
         learnt = _learnt(ekf, (skeletons[k] for k in order), tell)
         # what a T-pose told at any time holds all the time
-        centres = ekf._centres.memory().from_the_beginning()
-        ekf._centres.recall(centres)
+        centres = ekf._centres.snapshot().as_long_known()
+        ekf._centres.restore(centres)
         again = ExtendedKalmanFilter(replace(ekf.parameters, t_pose=False), ekf.model)
         forward = _Forward(again, learnt, centres)
     else:
@@ -331,11 +331,11 @@ def _learnt(
 class _Forward:
     """A filter that can be put back to an earlier place, and that never forgets what was learnt before."""
 
-    def __init__(self, ekf: ExtendedKalmanFilter, learnt: State | None = None, centres: Memory | None = None) -> None:
+    def __init__(self, ekf: ExtendedKalmanFilter, learnt: State | None = None, centres: Snapshot | None = None) -> None:
         self._ekf = ekf
         self._learnt, self._centres = learnt, centres
         if centres is not None:
-            ekf._centres.recall(centres)
+            ekf._centres.restore(centres)
         # as if the person had been out of sight for longer than is predicted
         self._absence_ns = round((ekf.parameters.predict_for + 1.0) * NANOSECONDS)
 
@@ -345,22 +345,22 @@ class _Forward:
         if self._learnt is not None and (ekf._state is None or ekf._frame_id != skeleton.frame_id):
             ekf.reset()
             if self._centres is not None:
-                ekf._centres.recall(self._centres)
+                ekf._centres.restore(self._centres)
             ekf._state = replace(self._learnt, stamp_ns=skeleton.stamp_ns - self._absence_ns)
             ekf._frame_id = skeleton.frame_id
         before = ekf._state
         ekf.update(skeleton, sensor)
         return None if ekf._state is before else ekf._state
 
-    def place(self) -> tuple[State | None, str, Memory]:
+    def place(self) -> tuple[State | None, str, Snapshot]:
         """From where to go on."""
-        return self._ekf._state, self._ekf._frame_id, self._ekf._centres.memory()
+        return self._ekf._state, self._ekf._frame_id, self._ekf._centres.snapshot()
 
-    def go_back(self, place: tuple[State | None, str, Memory]) -> None:
+    def go_back(self, place: tuple[State | None, str, Snapshot]) -> None:
         """Go on from an earlier place."""
         self._ekf.reset()
         self._ekf._state, self._ekf._frame_id, centres = place
-        self._ekf._centres.recall(centres)
+        self._ekf._centres.restore(centres)
 
 
 # --- live

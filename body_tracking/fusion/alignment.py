@@ -1,8 +1,8 @@
-"""One sensor's frames as they come, in ``world`` and the reference's clock: for a filter that takes each by itself.
+"""Single frames of calibrated sensors in ``world`` and the reference's clock, for a filter that updates with each.
 
-What :mod:`body_tracking.fusion.fusion` does with frames that it pairs is done here with each alone: poses and clocks
-come into force at their times, every joint states its uncertainty, and a body that a sensor sees turned around is
-corrected by what the others see at that time. Nothing waits and nothing is lost: late frames go on as they are.
+As in :mod:`body_tracking.fusion.fusion`, but frame by frame: poses and clocks come into force at their times, every
+joint gets a covariance, and left and right are swapped where the other sensors show the body reversed. No frame waits,
+and late frames are passed on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.sides import Sides
 
 FRESH = 0.1
-"""Frames of other sensors count for left and right while they are no further away in time than this, seconds."""
+"""Largest time to another sensor's frame that counts for left and right, seconds."""
 
 _DIAGONAL = np.arange(3)
 _KEEP = 5 * NANOSECONDS
@@ -31,7 +31,7 @@ _KEEP = 5 * NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class _Frame:
     """A frame in world."""
 
     stamp_ns: int
@@ -45,7 +45,7 @@ class _Seen:
 
 
 class _Sensor(Placement):
-    """Where and when a sensor is, and its newest frame."""
+    """Pose, clock and newest frame of a sensor."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,8 +53,8 @@ class _Sensor(Placement):
 
     def clear(self) -> None:
         self.last_ns: int | None = None  # in its own clock
-        self.newest: _Seen | None = None
-        self.ahead = False  # its clock is not what it is taken for: the reference's frames came from its past
+        self.newest: _Frame | None = None
+        self.ahead = False  # its clock relation is wrong: the reference's frames are from its past
 
 
 class SensorAlignment:
@@ -66,7 +66,7 @@ class SensorAlignment:
         world: the frame of the output.
 
     Attributes:
-        counters: what happened since the construction, for diagnostics.
+        counters: event counts since the construction, for diagnostics.
 
     Raises:
         FusionError: the reference is not among the sensors.
@@ -89,7 +89,7 @@ class SensorAlignment:
         self.counters["resets"] += 1
 
     def forget(self) -> None:
-        """Forget all frames, because the next ones are of somebody else."""
+        """Forget all frames, because the next ones are of another person."""
         for sensor in self._sensors.values():
             sensor.clear()
         self._sides.reset()
@@ -119,14 +119,14 @@ class SensorAlignment:
 
         Returns:
             The same body at its capture time in the reference's clock, with the covariances of
-            ``core/measurement.py`` in all directions alike; joints that are not valid, and those of a body half that is
-            seen across what is believed, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
+            ``core/measurement.py``, isotropic; joints that are not valid, and those of a body half whose axis is across
+            the accepted one, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
         """
         source = self._sensors.get(sensor)
         if source is None:
             self.counters["unknown_sensor"] += 1
             return None
-        self._note(sensor, source, skeleton.stamp_ns)
+        self._check_clock(sensor, source, skeleton.stamp_ns)
         stamp = source.stamp(skeleton.stamp_ns)
         if stamp is None:
             self.counters["other_clock"] += 1
@@ -143,10 +143,10 @@ class SensorAlignment:
         if source.newest is None or stamp > source.newest.stamp_ns:
             source.newest = seen
         self.counters["aligned"] += 1
-        return self._settled(sensor, seen)
+        return self._corrected(sensor, seen)
 
-    def _note(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
-        """Start anew when a sensor's clock jumped back: the reference's takes the others with it."""
+    def _check_clock(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
+        """Reset the sensor, or all for the reference, when its clock jumped back."""
         if jumped_back(stamp_ns, source.last_ns):
             if sensor == self.reference:
                 self.reset()
@@ -159,10 +159,9 @@ class SensorAlignment:
             self.counters["late"] += 1
 
     def _in_step(self, sensor: str, source: _Sensor, stamp: int) -> bool:
-        """Whether a frame is of the time in which the reference sensor is, as far as that can be told.
+        """Whether a frame's stamp is consistent with the reference sensor's newest one.
 
-        A sensor that was started again may count from another beginning, and its frames would throw a filter from one
-        time to another until the calibration has found its clock again.
+        The clock of a restarted sensor may have another offset until the calibration has estimated it again.
         """
         if sensor == self.reference:
             for other in self._sensors.values():
@@ -175,20 +174,20 @@ class SensorAlignment:
         source.ahead &= stamp > reference.stamp_ns + JUMP_BACK_NS
         return not source.ahead and not jumped_back(stamp, reference.stamp_ns)
 
-    def _settled(self, sensor: str, seen: _Seen) -> Skeleton:
-        """The frame with left and right as they are believed from what all sensors see at that time."""
+    def _corrected(self, sensor: str, seen: _Frame) -> Skeleton:
+        """The frame with left and right corrected by all sensors' frames near that time."""
+        newest = {name: seen if name == sensor else source.newest for name, source in self._sensors.items()}
         fresh = {
-            name: seen if name == sensor else source.newest
-            for name, source in self._sensors.items()
-            if name == sensor
-            or (source.newest is not None and abs(seen.stamp_ns - source.newest.stamp_ns) <= FRESH * NANOSECONDS)
+            name: frame
+            for name, frame in newest.items()
+            if frame is not None and abs(seen.stamp_ns - frame.stamp_ns) <= FRESH * NANOSECONDS
         }
-        frames = [frame for frame in fresh.values() if frame is not None]
+        frames = list(fresh.values())
         angles, headings = [frame.angle for frame in frames], [frame.headings for frame in frames]
         weights = [frame.weights for frame in frames]
-        believed = self._sides.believed(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
+        accepted = self._sides.accepted_headings(seen.stamp_ns, tuple(fresh), angles, headings, weights, self.counters)
         points, variance, states = seen.positions, seen.variance, seen.states
-        if halves := reversed_halves(seen.headings, believed):
+        if halves := reversed_halves(seen.headings, accepted):
             points, variance, states = points.copy(), variance.copy(), states.copy()
             swap_left_right(halves, points, variance, states)
         known = np.isfinite(variance)
@@ -207,7 +206,7 @@ class SensorAlignment:
         )
 
 
-def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Seen:
+def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Frame:
     known = skeleton.valid
     positions = np.where(known[:, None], skeleton.positions, np.nan)
     states = np.where(known, skeleton.states, 0)
@@ -215,4 +214,4 @@ def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Seen:
     variance = joint_stddev(positions, states, angle) ** 2
     placed = pose.apply(positions)
     headings, weights = headings_of(placed), heading_weights(placed, variance)
-    return _Seen(stamp_ns, placed, variance, states, float(angle), headings, weights, skeleton.body)
+    return _Frame(stamp_ns, placed, variance, states, float(angle), headings, weights, skeleton.body)

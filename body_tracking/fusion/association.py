@@ -1,13 +1,13 @@
-"""Whom the bodies that several sensors see belong to, over time: assignment of torsos to people who keep their ids.
+"""Association of the bodies that several sensors see with people, over time.
 
-A frame of one sensor is taken at its own time, for sensors are not paired. Each person is expected where the same
-sensor saw them last, or another one, whichever is the better known, moved on at a constant velocity that fades; how far
-off that may be grows with the time since. The bodies of the frame go to the people by the assignment of the least total
-cost (Kuhn 1955; ``scipy.optimize.linear_sum_assignment``) among those that are near enough: the negative logarithm of
-the likelihood of the distance between torsos. The sensor's own number of a body counts as evidence, not as truth.
+Each frame of one sensor is assigned at its own time. A person is predicted from the last sighting by the same sensor or
+by another one, whichever has the smaller variance, with a decaying velocity; the variance grows with the time since.
+The assignment of bodies to people within the gate minimises the total cost (Kuhn 1955;
+``scipy.optimize.linear_sum_assignment``), the negative log-likelihood of the distance between torsos. The sensor's own
+number of a body is evidence only.
 
-Torsos are compared by points that do not change when a sensor exchanges left and right, and by the median of their
-distances, so that a joint that jumps does not matter.
+Torsos are compared by points that do not change when a sensor swaps left and right, and by the median of their
+distances, which one outlier does not move.
 """
 
 from __future__ import annotations
@@ -25,47 +25,45 @@ from body_tracking.pipeline.people import HOLD
 _MIDLINE = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK], dtype=np.intp)
 _LEFT = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
-TORSO_POINTS = len(_MIDLINE) + len(_LEFT)
 
 _CONFIRM = round(0.3 * NANOSECONDS)
-"""A body that is nobody's becomes a person when it is seen for this long, nanoseconds: ghosts last a few frames."""
+"""An unassigned body becomes a person when seen for this long, nanoseconds: ghosts last a few frames."""
 
-_INSIST = round(1.0 * NANOSECONDS)
-"""Who is whom is changed when another assignment has been better for this long, nanoseconds."""
+_CHANGE_NS = round(1.0 * NANOSECONDS)
+"""The assignment changes when another one has been better for this long, nanoseconds."""
 
 _MARGIN = 0.3
 """... by this many metres in total."""
 
-_SAME = 0.35
-"""Two people nearer than this, whom no sensor sees both, are one, metres: no two torsos are."""
+_MERGE_DISTANCE = 0.35
+"""Two people nearer than this, whom no sensor sees both, are merged, metres: torsos do not come as close."""
 
-_OWN, _CROSS = 0.08, 0.2
+_OWN_STDDEV, _CROSS_STDDEV = 0.08, 0.2
 """Standard deviation of a torso against the same sensor's last frame, and against another sensor's, metres."""
 
-_GROWTH, _REACH, _FARTHEST = 0.6, 1.2, 2.5
-"""By which the deviation and the gate grow, metres per second, and the most by which the gate does, metres."""
+_GROWTH, _REACH, _MAX_GATE_GROWTH = 0.6, 1.2, 2.5
+"""Growth of the standard deviation and of the gate, metres per second, and the gate's largest growth, metres."""
 
-_FADE = 0.7
-"""Time constant with which a velocity fades while a person is not seen, seconds."""
+_VELOCITY_DECAY = 0.7
+"""Time constant of the velocity of a person who is not seen, seconds."""
 
-_FASTEST = 3.0
-"""Nobody walks faster in a room, metres per second."""
+_MAX_SPEED = 3.0
+"""Fastest walk in a room, metres per second."""
 
-_NUMBER = 6.0
-"""What the sensor's own number is worth, in squared deviations."""
+_ID_BONUS = 6.0
+"""Cost by which the sensor's own number favours the same person, in squared standard deviations."""
 
 _FRESH = round(0.2 * NANOSECONDS)
-"""What another sensor saw is of now for this long, nanoseconds."""
+"""Age up to which another sensor's sighting counts as current, nanoseconds."""
 
 _KEPT, _RECENT = 6, round(0.3 * NANOSECONDS)
-"""Sightings of a person by a sensor that are kept, and how old they may be, nanoseconds, for the velocity."""
+"""Number of a sensor's sightings that are kept, and their largest age for the velocity, nanoseconds."""
 
-_LOOK = round(1.0 * NANOSECONDS)
-"""One who is alone is looked at this often, nanoseconds."""
+_CHECK_NS = round(1.0 * NANOSECONDS)
+"""A lone person is assigned this often, nanoseconds."""
 
 GATE = 0.6
-"""Metres between a torso and where a person is expected, from which it is somebody else's; more for one long unseen."""
-
+"""Largest distance between a torso and a person's prediction, metres; it grows while the person is not seen."""
 
 _IMPOSSIBLE = 1e9
 
@@ -90,7 +88,7 @@ def torso_points(positions: FloatArray) -> FloatArray:
 
 
 def torso_distances(ones: FloatArray, others: FloatArray) -> FloatArray:
-    """The distances between torsos: the (lower) median over the points that both have, else that of their middles.
+    """Distances between torsos: the (lower) median over the points that both have, else that of their centres.
 
     Args:
         ones: (n, 6, 3) metres, as of :func:`torso_points`.
@@ -126,7 +124,7 @@ class _Sighting:
 
 @dataclass(slots=True, eq=False)
 class _Person:
-    """Somebody, and what each sensor saw of them last."""
+    """A person with each sensor's last sightings."""
 
     number: int
     since_ns: int
@@ -135,8 +133,7 @@ class _Person:
     sightings: dict[str, deque[_Sighting]] = field(default_factory=dict)
     bodies: dict[str, int] = field(default_factory=dict)  # the sensors' own numbers
 
-    def note(self, sensor: str, sighting: _Sighting, body: int) -> None:
-        """Seen."""
+    def record(self, sensor: str, sighting: _Sighting, body: int) -> None:
         track = self.sightings.setdefault(sensor, deque(maxlen=_KEPT))
         if track and sighting.stamp_ns <= track[-1].stamp_ns:
             return
@@ -145,17 +142,17 @@ class _Person:
         self.seen_ns = max(self.seen_ns, sighting.stamp_ns)
 
     def age_ns(self, sensor: str, stamp_ns: int) -> float:
-        """Since a sensor saw them; infinity where it did not."""
+        """Time since a sensor saw the person; infinity where it did not."""
         track = self.sightings.get(sensor)
         return abs(stamp_ns - track[-1].stamp_ns) if track else math.inf
 
     def by_others(self, sensor: str, stamp_ns: int) -> str | None:
-        """The other sensor that saw them last."""
+        """The other sensor with the newest sighting."""
         others = (name for name in self.sightings if name != sensor)
         return min(others, key=lambda name: self.age_ns(name, stamp_ns), default=None)
 
     def expected(self, sensor: str, stamp_ns: int) -> FloatArray:
-        """(6, 3) metres: where the torso is by what one sensor saw."""
+        """(6, 3) metres: prediction of the torso from one sensor's sightings."""
         track = self.sightings[sensor]
         last = track[-1]
         first = next(each for each in track if last.stamp_ns - each.stamp_ns <= _RECENT)
@@ -168,8 +165,8 @@ class _Person:
         if not known.any():
             return last.points
         velocity = np.median(moved[known], axis=0) / span
-        velocity *= min(1.0, _FASTEST / max(float(np.linalg.norm(velocity)), 1e-9))
-        carried = math.copysign(_FADE * -math.expm1(-abs(elapsed) / _FADE), elapsed)
+        velocity *= min(1.0, _MAX_SPEED / max(float(np.linalg.norm(velocity)), 1e-9))
+        carried = math.copysign(_VELOCITY_DECAY * -math.expm1(-abs(elapsed) / _VELOCITY_DECAY), elapsed)
         result: FloatArray = last.points + carried * velocity
         return result
 
@@ -181,42 +178,41 @@ class Association:
         hold: seconds for which a person whom no sensor sees keeps the id.
 
     Attributes:
-        counters: what happened since the construction: ``new`` people, ``lost`` ones, ``merged`` ones who were one,
-            ``exchanged`` assignments that were changed because others had been better for long, and bodies that a
-            sensor ``renumbered``.
+        counters: since the construction: ``new``, ``lost`` and ``merged`` people, ``exchanged`` assignments, and bodies
+            that a sensor ``renumbered``.
     """
 
     def __init__(self, hold: float = HOLD) -> None:
-        # Takes half a second, which only who assigns need pay; at a second person's first frame it would be too late.
+        # The import takes half a second: too long for a second person's first frame.
         from scipy.optimize import linear_sum_assignment
 
-        self._least_total = linear_sum_assignment
+        self._min_cost_assignment = linear_sum_assignment
         self.counters: Counter[str] = Counter()
         self._hold_ns = round(hold * NANOSECONDS)
         self._number = 0
         self.reset()
 
     def reset(self) -> None:
-        """Forget everybody; numbers go on."""
+        """Forget all people; numbers are not used again."""
         self._people: list[_Person] = []
         self._contested: dict[str, int] = {}
         self._alike: dict[tuple[int, int], tuple[int, int]] = {}
-        self._looked: dict[str, int] = {}
+        self._checked: dict[str, int] = {}
 
     def forget_sensor(self, sensor: str) -> None:
-        """Forget what one sensor saw, because its time jumped back."""
+        """Forget one sensor's sightings, because its time jumped back."""
         for person in self._people:
             person.sightings.pop(sensor, None)
             person.bodies.pop(sensor, None)
         self._contested.pop(sensor, None)
-        self._looked.pop(sensor, None)
+        self._checked.pop(sensor, None)
 
     def move_sensor(self, sensor: str, rotation: FloatArray, translation: FloatArray) -> None:
-        """A sensor turned out to stand elsewhere: what it saw is there too.
+        """Move a sensor's sightings after a change of its pose.
 
         Args:
             sensor: its name.
-            rotation: (3, 3) from where it was taken to be, in world.
+            rotation: (3, 3) from the old pose, in world.
             translation: (3,) metres, likewise.
         """
         for person in self._people:
@@ -227,73 +223,70 @@ class Association:
 
     @property
     def people(self) -> tuple[int, ...]:
-        """Everybody who is there, by number: the longest known first."""
+        """The numbers of the confirmed people, the longest known first."""
         return tuple(person.number for person in self._people if person.confirmed)
 
     def seen_ns(self, number: int) -> int | None:
-        """When somebody was seen last, by the reference's clock; None where nobody has this number."""
+        """Reference time of a person's last sighting; None for an unknown number."""
         return next((person.seen_ns for person in self._people if person.number == number), None)
 
     def place(self, number: int) -> FloatArray:
-        """(3,) metres in world: the middle of somebody's torso as last seen."""
+        """(3,) metres in world: the centre of a person's torso in the last sighting."""
         (person,) = (person for person in self._people if person.number == number)
         return _middle(max((track[-1] for track in person.sightings.values()), key=lambda each: each.stamp_ns).points)
 
     def alone(self, sensor: str, stamp_ns: int, body: int) -> int | None:
-        """The number of the only person, where a sensor's only body can be nobody else and no look is due.
+        """The number of the only person, where a sensor's only body must be that person and no assignment is due.
 
-        Whoever asks tells of the frame later, by :meth:`note`.
+        The caller passes the frame later, by :meth:`record`.
         """
-        if len(self._people) != 1 or stamp_ns - self._looked.get(sensor, -_LOOK) >= _LOOK:
+        if len(self._people) != 1 or stamp_ns - self._checked.get(sensor, -_CHECK_NS) >= _CHECK_NS:
             return None
         (person,) = self._people
         return person.number if person.confirmed and person.bodies.get(sensor) == body else None
 
-    def note(self, sensor: str, seen: Sequence[tuple[int, FloatArray]], body: int) -> None:
-        """What a sensor saw last of the only person, as (stamp, (25, 3) metres in world) in the order of the stamps."""
+    def record(self, sensor: str, seen: Sequence[tuple[int, FloatArray]], body: int) -> None:
+        """Record a sensor's last frames of the only person, (stamp, (25, 3) metres in world) in the order of stamps."""
         (person,) = self._people
         person.sightings.pop(sensor, None)
         for (stamp_ns, _), points in zip(
             seen, torso_points(np.stack([positions for _, positions in seen])), strict=True
         ):
-            person.note(sensor, _Sighting(stamp_ns, points), body)
+            person.record(sensor, _Sighting(stamp_ns, points), body)
 
     def assign(self, sensor: str, bodies: Sequence[Skeleton]) -> tuple[int | None, ...]:
-        """Who the bodies of one frame of one sensor are.
+        """Assign the bodies of one frame of one sensor to people.
 
         Args:
             sensor: its name.
             bodies: in world and in the reference's clock, all of one stamp; NaN for joints that are not known.
 
         Returns:
-            For each body the number of a person, the same for as long as the person is there; None for one of whom it
-            is not certain yet that it is a person.
+            For each body the number of its person, constant while the person is present; None for an unconfirmed one.
         """
         if not bodies:
             return ()
         stamp_ns = bodies[0].stamp_ns
-        self._forget_the_lost(stamp_ns)
+        self._drop_lost(stamp_ns)
         points = torso_points(np.stack([body.positions for body in bodies]))
         numbers = [body.body for body in bodies]
-        self._looked[sensor] = stamp_ns
+        self._checked[sensor] = stamp_ns
         whose = self._assignment(sensor, stamp_ns, points, numbers)
         if len(self._people) > 1:
-            whose = self._reconsidered(sensor, stamp_ns, points, whose)
+            whose = self._corrected(sensor, stamp_ns, points, whose)
         beginning = not any(person.confirmed for person in self._people)
-        # in the order of the sensor's numbers, whatever order they come in
+        # in the order of the sensor's numbers, so that the order of the bodies does not matter
         for index in sorted(range(len(bodies)), key=lambda each: numbers[each]):
             if whose[index] is None and np.isfinite(points[index]).any():
                 self._number += 1
-                person = _Person(self._number, stamp_ns, stamp_ns, confirmed=False)
-                whose[index] = person
-                self._people.append(person)
-        for index, known in enumerate(whose):
-            if known is None:
+                whose[index] = added = _Person(self._number, stamp_ns, stamp_ns, confirmed=False)
+                self._people.append(added)
+        for index, person in enumerate(whose):
+            if person is None:
                 continue
-            person = known
             before = person.bodies.get(sensor)
             self.counters["renumbered"] += before is not None and before != numbers[index]
-            person.note(sensor, _Sighting(stamp_ns, points[index]), numbers[index])
+            person.record(sensor, _Sighting(stamp_ns, points[index]), numbers[index])
             if not person.confirmed and (beginning or stamp_ns - person.since_ns >= _CONFIRM):
                 person.confirmed = True
                 self.counters["new"] += 1
@@ -301,7 +294,7 @@ class Association:
             self._merge(sensor, stamp_ns, whose)
         return tuple(person.number if person is not None and person.confirmed else None for person in whose)
 
-    def _forget_the_lost(self, stamp_ns: int) -> None:
+    def _drop_lost(self, stamp_ns: int) -> None:
         kept = []
         for person in self._people:
             if stamp_ns - person.seen_ns <= (self._hold_ns if person.confirmed else _CONFIRM):
@@ -313,7 +306,7 @@ class Association:
     def _assignment(
         self, sensor: str, stamp_ns: int, points: FloatArray, numbers: Sequence[int]
     ) -> list[_Person | None]:
-        """Of each body the person that it is most likely, if any."""
+        """The most likely person of each body, if any."""
         people = [person for person in self._people if person.sightings]
         whose: list[_Person | None] = [None] * len(points)
         if not people:
@@ -321,30 +314,36 @@ class Association:
         expected, stddev, gate = [], [], []
         for person in people:
             other = person.by_others(sensor, stamp_ns)
-            own = _GROWTH * person.age_ns(sensor, stamp_ns) / NANOSECONDS + _OWN
-            cross = math.inf if other is None else _GROWTH * person.age_ns(other, stamp_ns) / NANOSECONDS + _CROSS
-            by, spread, least = (sensor, own, _OWN) if other is None or own <= cross else (other, cross, _CROSS)
+            own = _GROWTH * person.age_ns(sensor, stamp_ns) / NANOSECONDS + _OWN_STDDEV
+            cross = (
+                math.inf if other is None else _GROWTH * person.age_ns(other, stamp_ns) / NANOSECONDS + _CROSS_STDDEV
+            )
+            by, spread, least = (
+                (sensor, own, _OWN_STDDEV) if other is None or own <= cross else (other, cross, _CROSS_STDDEV)
+            )
             expected.append(person.expected(by, stamp_ns))
             stddev.append(spread)
-            gate.append(GATE + min(_REACH / _GROWTH * (spread - least), _FARTHEST))
+            gate.append(GATE + min(_REACH / _GROWTH * (spread - least), _MAX_GATE_GROWTH))
         distances = torso_distances(np.stack(expected), points)
         spread_of = np.array(stddev)[:, None]
         # people move in the plane: two dimensions of likelihood
-        costs = (distances / spread_of) ** 2 + 4.0 * np.log(spread_of / _OWN)
-        costs -= _NUMBER * np.array([[person.bodies.get(sensor) == number for number in numbers] for person in people])
+        costs = (distances / spread_of) ** 2 + 4.0 * np.log(spread_of / _OWN_STDDEV)
+        costs -= _ID_BONUS * np.array(
+            [[person.bodies.get(sensor) == number for number in numbers] for person in people]
+        )
         costs[~(distances <= np.array(gate)[:, None])] = _IMPOSSIBLE
         rows: IntArray
         columns: IntArray
-        rows, columns = self._least_total(costs)
+        rows, columns = self._min_cost_assignment(costs)
         for row, column in zip(rows, columns, strict=True):
             if costs[row, column] < _IMPOSSIBLE:
                 whose[column] = people[row]
         return whose
 
-    def _reconsidered(
+    def _corrected(
         self, sensor: str, stamp_ns: int, points: FloatArray, whose: list[_Person | None]
     ) -> list[_Person | None]:
-        """The same, or, where other sensors have said for long that it is otherwise, what they say."""
+        """The assignment, or the one by the other sensors' sightings where that has been better for long."""
         present = [
             (person, other)
             for person in self._people
@@ -359,11 +358,11 @@ class Association:
         expected = np.stack([person.expected(other, stamp_ns) for person, other in present])
         distances = np.minimum(torso_distances(expected, points[columns]), 2.0 * GATE)
         now = distances[list(mine.values()), range(len(columns))].sum()
-        rows, chosen = self._least_total(distances)
+        rows, chosen = self._min_cost_assignment(distances)
         if now - distances[rows, chosen].sum() <= _MARGIN:
             self._contested.pop(sensor, None)
             return whose
-        if stamp_ns - self._contested.setdefault(sensor, stamp_ns) < _INSIST:
+        if stamp_ns - self._contested.setdefault(sensor, stamp_ns) < _CHANGE_NS:
             return whose
         del self._contested[sensor]
         changed = list(whose)
@@ -373,26 +372,26 @@ class Association:
             before, after = whose[index], changed[index]
             if before is not after:
                 self.counters["exchanged"] += 1
-                for person in (before, after):  # what was seen of them was of others
+                for person in (before, after):  # their sightings were of others
                     if person is not None:
                         person.sightings.pop(sensor, None)
                         person.bodies.pop(sensor, None)
         return changed
 
     def _merge(self, sensor: str, stamp_ns: int, whose: Sequence[_Person | None]) -> None:
-        """Make one of two whom no sensor sees both and who have been in one place for long."""
+        """Merge two people whom no sensor sees both and who have been in one place for long."""
         for one, other, by in self._pairs(sensor, stamp_ns, whose):
             older, newer = sorted((one, other), key=lambda person: person.number)
             pair = older.number, newer.number
             here = one.sightings[sensor][-1].points[None]
-            if torso_distances(here, other.expected(by, stamp_ns)[None])[0, 0] > _SAME:
+            if torso_distances(here, other.expected(by, stamp_ns)[None])[0, 0] > _MERGE_DISTANCE:
                 self._alike.pop(pair, None)
                 continue
             since, until = self._alike.get(pair, (stamp_ns, stamp_ns))
-            if stamp_ns - until > _INSIST:  # not looked at for long
+            if stamp_ns - until > _CHANGE_NS:  # not compared for long
                 since = stamp_ns
             self._alike[pair] = since, stamp_ns
-            if stamp_ns - since < _INSIST:
+            if stamp_ns - since < _CHANGE_NS:
                 continue
             for name, track in newer.sightings.items():
                 if name not in older.sightings or track[-1].stamp_ns > older.sightings[name][-1].stamp_ns:
@@ -408,10 +407,10 @@ class Association:
     def _pairs(
         self, sensor: str, stamp_ns: int, whose: Sequence[_Person | None]
     ) -> Iterator[tuple[_Person, _Person, str]]:
-        """Those in a frame, each with those of whom only another sensor tells, and that sensor."""
+        """The people in a frame, each with those whom only another sensor sees, and that sensor."""
         for one in whose:
             for other in self._people:
-                if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _INSIST:
+                if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _CHANGE_NS:
                     continue
                 by = other.by_others(sensor, stamp_ns)
                 # a sensor that sees both sees that they are two

@@ -1,11 +1,9 @@
-"""One skeleton from what several sensors see, by capture time.
+"""Fusion of several sensors' skeletons into one, by capture time.
 
-The fused skeleton is a function of the stamps alone: one comes out per frame of the reference sensor (or, while that
-is silent, of another), at that frame's capture time, from each sensor's newest frame captured up to then. A frame
-waits only while another sensor's is due, and then a few milliseconds; so the delay stays small, and what arrives a
-little earlier or later gives the same numbers.
-
-Over 500 lines: one class whose state every step of a frame needs; what can stand alone is in the modules beside it.
+The fused skeleton is a function of the stamps alone: one per frame of the reference sensor (or, while that is silent,
+of another), at that frame's capture time, from each sensor's newest frame captured up to then. A frame waits only while
+another sensor's is due, and then a few milliseconds; so the delay stays small, and the time of arrival does not change
+the numbers.
 """
 
 from __future__ import annotations
@@ -31,24 +29,24 @@ from body_tracking.fusion.weights import thesis_formula, thesis_text
 
 WORLD = "world"
 
-FASTEST = 8.0
-"""No joint moves faster than this along an axis, metres per second."""
+MAX_SPEED = 8.0
+"""Fastest motion of a joint along an axis, metres per second."""
 
 SMOOTHING = 0.1
 """Time constant of the velocities that carry older frames and the prediction forward, seconds."""
 
 ACCELERATION = 30.0
-"""Typical peak acceleration of a limb, m/s^2; what extrapolation and prediction cannot know."""
+"""Typical peak acceleration of a limb, m/s^2: the process noise of extrapolation and prediction."""
 
 _WIDTHS = ((0.15, 0.6), (0.05, 0.4))
-"""Lengths of the left-right axes of shoulders and hips that can be a person's, as a Kinect sees it, metres."""
+"""Plausible (least, greatest) lengths of the left-right axes of shoulders and hips, as a Kinect sees them, metres."""
 
 
 _DIAGONAL = np.arange(3)
 
 
 class FusionError(BodyTrackingError):
-    """The sensors or parameters given to the fusion make no sense."""
+    """Raised when the reference sensor is not among the sensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,7 @@ class FusionParameters:
     max_output_gap: float = field(
         default=0.065,
         metadata={
-            "doc": "let another sensor give the beat when the reference is silent for this long",
+            "doc": "publish at another sensor's frames when the reference is silent for this long",
             "unit": "s",
             "min": 0.01,
             "max": 5.0,
@@ -100,7 +98,7 @@ class FusionParameters:
     reacquire: float = field(
         default=0.3,
         metadata={
-            "doc": "believe a sensor again that insists on a rejected joint for this long",
+            "doc": "accept a rejected joint that a sensor has reported for this long",
             "unit": "s",
             "min": 0.0,
             "max": 10.0,
@@ -142,7 +140,7 @@ class _Frame:
 
 
 class _Sensor(Placement):
-    """The recent frames of one sensor and where and when it is."""
+    """Recent frames, pose and clock of one sensor."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,7 +150,7 @@ class _Sensor(Placement):
         self.frames: deque[_Frame] = deque(maxlen=8)
         self.rhythm = Rhythm()
         self.newest_ns: int | None = None  # in the reference's clock
-        self.ahead = False  # its clock is not what it is taken for: the reference's frames came from its past
+        self.ahead = False  # its clock relation is wrong: the reference's frames are from its past
 
 
 class Fusion:
@@ -161,7 +159,7 @@ class Fusion:
     Args:
         sensors: their names.
         parameters: see :class:`FusionParameters`.
-        reference: the sensor whose clock is the output's and that gives the beat; the first one when None.
+        reference: the sensor whose clock is the output's and at whose frames it is made; the first one when None.
         world: the frame of the output.
     """
 
@@ -179,7 +177,7 @@ class Fusion:
         self.world = world
         self.counters: Counter[str] = Counter()
         self._sensors = {name: _Sensor() for name in sensors}
-        # Frames that may be answered: capture time, whether not the reference's, and until when it may wait.
+        # Frames at whose time an output may be due: capture time, whether not the reference's, and deadline.
         self._pending: list[tuple[int, bool, int]] = []
         self._forget_output()
 
@@ -202,7 +200,7 @@ class Fusion:
         self.counters["resets"] += 1
 
     def forget(self) -> None:
-        """Forget all frames, because the next ones are of somebody else."""
+        """Forget all frames, because the next ones are of another person."""
         for sensor in self._sensors.values():
             sensor.clear()
         self._forget_output()
@@ -238,7 +236,7 @@ class Fusion:
         Returns:
             The fused skeletons that are complete now, mostly one or none.
         """
-        # What has waited long enough does not know this frame, whether or not somebody polled in between.
+        # The result does not depend on whether the caller polled in between.
         fused = self.poll(now_ns)
         source = self._sensors.get(sensor)
         if source is None:
@@ -248,7 +246,7 @@ class Fusion:
         return fused
 
     def _accepts(self, sensor: str, source: _Sensor, skeleton: Skeleton, now_ns: int) -> bool:
-        """Remember a frame, and note whether the output is to answer it; False when it is of no use."""
+        """Keep a frame, and queue an output at its time; False when the frame is unusable."""
         if source.frames and skeleton.stamp_ns <= source.frames[-1].stamp_ns:
             if not jumped_back(skeleton.stamp_ns, source.frames[-1].stamp_ns):
                 self.counters["late"] += 1
@@ -274,10 +272,10 @@ class Fusion:
         return True
 
     def _in_step(self, sensor: str, source: _Sensor, stamp: int, now_ns: int) -> bool:
-        """Whether a frame is of the time in which the reference sensor is, as far as that can be told.
+        """Whether a frame's stamp is consistent with the reference sensor's newest one.
 
-        The clock of another sensor may be misstated. What it says of a time to come is not waited for: where the
-        reference's frames have been older than the output for longer than a delay explains, the output starts again.
+        The clock relation of another sensor may be wrong, and the output far ahead: where the reference's frames have
+        been older than the output for longer than a delay explains, the output starts again.
         """
         source.newest_ns = stamp
         if sensor != self.reference:
@@ -308,7 +306,7 @@ class Fusion:
             share = 1.0 - math.exp(-step / SMOOTHING)
             change = (positions - last.positions) / step
             velocities = last.velocities + share * (change - last.velocities)
-            fast = ~(np.abs(change).max(axis=1) < FASTEST)  # and NaN; a label that jumps is faster than a limb
+            fast = ~(np.abs(change).max(axis=1) < MAX_SPEED)  # and NaN; a label that jumps is faster than a limb
             if fast.any():
                 velocities[fast] = 0.0
             since = last.since_ns
@@ -321,40 +319,36 @@ class Fusion:
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
         if step < self.parameters.silence:
-            source.rhythm.note(step)
+            source.rhythm.add(step)
 
     def poll(self, now_ns: int) -> list[Skeleton]:
-        """The fused skeletons that need wait no longer.
-
-        Args:
-            now_ns: as in :meth:`push`.
-        """
+        """The fused skeletons whose wait is over."""
         fused = []
         while self._pending:
             stamp, other, deadline = self._pending[0]
-            # The beat is the reference's; another's frame is answered only when that has been silent for a while.
-            if other and stamp - self._beat(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
+            # Another sensor's frame gives an output only when the reference has been silent for a while.
+            if other and stamp - self._last_output(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
                 del self._pending[0]
                 continue
             due = self._due(stamp)
             if now_ns < deadline and any(rhythm.worth_waiting for rhythm in due):
                 break
             for source in self._sensors.values():
-                source.rhythm.answered(came=source.rhythm not in due)
+                source.rhythm.record(arrived=source.rhythm not in due)
             del self._pending[0]
             skeleton = self._fuse(stamp)
             if skeleton is not None:
                 fused.append(skeleton)
         return fused
 
-    def _beat(self, stamp: int) -> int:
-        """When the last output was, or, at the start, when somebody was first seen."""
+    def _last_output(self, stamp: int) -> int:
+        """Time of the last output or, at the start, of the first frame."""
         if self._last_ns is not None:
             return self._last_ns
         return min((source.frames[0].since_ns for source in self._sensors.values() if source.frames), default=stamp)
 
     def _due(self, stamp: int) -> list[Rhythm]:
-        """Those of the calibrated sensors whose frame captured up to a time should be here and is not."""
+        """Of the calibrated sensors whose frame captured up to a time is due and has not arrived."""
         due = []
         for source in self._sensors.values():
             if not source.frames or source.pose(stamp) is None:
@@ -414,23 +408,23 @@ class Fusion:
         if thesis:
             weights = thesis_text(states) if self.parameters.method == "thesis_text" else thesis_formula(states)
             return self._combined(stamp, body, points, variance, weights, states)
-        # What moves between a sensor's capture and the output's is not known better than this.
+        # Process noise between a sensor's capture and the output's.
         variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
         angles = [frame.angle for frame in frames]
-        as_believed = self._sides.settle(stamp, names, angles, points, variance, states, self.counters)
-        weights = self._gated(stamp, names, points, variance, as_believed)
+        heading_agrees = self._sides.correct(stamp, names, angles, points, variance, states, self.counters)
+        weights = self._gated(stamp, names, points, variance, heading_agrees)
         if min(shares) < 1.0:
             weights *= np.array(shares)[:, None]
         fused = self._combined(stamp, body, points, variance, weights, states)
-        fused = self._sides.turn_gently(stamp, fused, self.counters)
+        fused = self._sides.limit_turn_rate(stamp, fused, self.counters)
         self._follow(stamp, fused.positions)
         return fused
 
     def _gated(
-        self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray, as_believed: BoolArray
+        self, stamp: int, names: list[str], points: FloatArray, variance: FloatArray, heading_agrees: BoolArray
     ) -> FloatArray:
-        """(k, 25) weights: the inverse variances, less for joints away from their prediction, none beyond the gate."""
-        # A joint that is nowhere has an infinite variance; one without a recent past has an infinite prediction error.
+        """(k, 25) weights: inverse variances, reduced by the residual to the prediction, 0 beyond the gate."""
+        # An unknown joint has an infinite variance; one without a recent past has an infinite prediction error.
         weights = 1.0 / variance
         elapsed = (stamp - self._known_ns) / NANOSECONDS
         spread = 0.03**2 + (0.5 * ACCELERATION * elapsed**2 + 0.5 * elapsed) ** 2
@@ -439,13 +433,13 @@ class Fusion:
         squared = np.einsum("kji,kji->kj", away, away) / (variance + spread)
         far = squared > self.parameters.gate**2  # False for NaN
         if far.any() or self._rejecting:
-            self._judge(stamp, names, far)
-        # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those with the
-        # believed heading are not gated: a prediction does not know yet that the body turned.
+            self._readmit(stamp, names, far)
+        # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those that agree
+        # with the accepted heading are not gated: the prediction lags behind a turn of the body.
         for half, (pair, (least, most)) in enumerate(zip(PAIRS, _WIDTHS, strict=True)):
             far[:, pair] |= far[:, pair[::-1]]
             width = np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1)
-            turned = np.flatnonzero(as_believed[:, half] & (least < width) & (width < most))
+            turned = np.flatnonzero(heading_agrees[:, half] & (least < width) & (width < most))
             far[turned[:, None], pair] = False
             squared[turned[:, None], pair] = 0.0
         weights /= 1.0 + squared / 4.0
@@ -453,8 +447,8 @@ class Fusion:
         self.counters["gated_joints"] += int(np.count_nonzero(far))
         return weights
 
-    def _judge(self, stamp: int, names: list[str], far: BoolArray) -> None:
-        """Believe, in place, a sensor again that has insisted on a rejected joint for long enough."""
+    def _readmit(self, stamp: int, names: list[str], far: BoolArray) -> None:
+        """Accept, in place, joints that a sensor has reported outside the gate for :attr:`reacquire`."""
         for index, name in enumerate(names):
             since = self._rejected_since[name]
             since[~far[index]] = np.nan
@@ -465,9 +459,9 @@ class Fusion:
     def _combined(
         self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
     ) -> Skeleton:
-        """The weighted mean, with the covariance that the sensors claim, or their disagreement if larger.
+        """The weighted mean (Schlagenhauf 2017, eq. 5.8, for any number of sensors).
 
-        The mean is that of Schlagenhauf 2017, eq. 5.8, for any number of sensors.
+        Its covariance is the stated one, or the sensors' disagreement if larger.
         """
         used = weights > 0.0
         if not used.all():
@@ -483,7 +477,7 @@ class Fusion:
         away = points - mean
         claimed = np.einsum("kj,kj,kj->j", share, share, variance)
         covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
-        # Only what they disagree beyond their claims: for two sensors the larger of both along their difference.
+        # Only the disagreement beyond the stated variance: for two sensors the larger of both along their difference.
         spread = np.einsum("jii->j", covariance)
         covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]
         covariance[:, _DIAGONAL, _DIAGONAL] += claimed[:, None]
@@ -492,7 +486,7 @@ class Fusion:
         return Skeleton(stamp, self.world, mean, states.max(axis=0), body, covariance)
 
     def _follow(self, stamp: int, positions: FloatArray) -> None:
-        """Keep position and smoothed velocity of the output for the next prediction."""
+        """Update position and smoothed velocity of the output for the next prediction."""
         known = np.isfinite(positions[:, 0])
         elapsed = (stamp - self._known_ns) / NANOSECONDS
         smoothing = (1.0 - np.exp(-elapsed / SMOOTHING))[:, None]

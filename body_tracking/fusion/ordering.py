@@ -1,9 +1,8 @@
 """Frames of several sensors in the order of their capture, though some sensors deliver later than others.
 
-A filter that takes each frame at its own time has to go back for one that comes after a newer one. That costs it all
-the newer ones once more, and what it said of these was said without the late one. So a frame waits while another
-sensor's older one is due, and goes on as soon as that is there; never longer than a few hundredths of a second, and not
-at all for a sensor that keeps others waiting in vain. Where sensors deliver alike, next to nothing waits.
+A late frame makes a filter repeat its newer updates, and estimates published meanwhile lack it. So a frame waits while
+another sensor's older one is due, for at most a few hundredths of a second, and not for a sensor whose due frames keep
+missing. Where sensors have similar delays, hardly any frame waits.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.fusion.rhythm import DUE_MARGIN, Rhythm
 
 SILENCE = 0.2
-"""A sensor of which nothing came for longer than this is not waited for, seconds."""
+"""No frame waits for a sensor silent for longer than this, seconds."""
 
 
 @dataclass(order=True, slots=True)
 class _Waiting:
-    """A frame that may have to wait, ordered by its capture."""
+    """A waiting frame, ordered by its capture."""
 
     stamp_ns: int
     number: int  # of its arrival
@@ -33,22 +32,20 @@ class _Waiting:
 
 
 class _Source:
-    """What is known of one sensor's frames."""
-
     def __init__(self) -> None:
         self.rhythm = Rhythm()
         self.newest_ns: int | None = None
 
 
 class Ordering:
-    """Puts frames in the order of their stamps, as far as waiting a little allows.
+    """Orders frames by their stamps, within a bounded waiting time.
 
     Args:
         sensors: their names.
-        wait: seconds that a frame waits at most; 0 passes every frame on as it comes.
+        wait: longest waiting time of a frame, seconds; 0 passes every frame on as it comes.
 
     Attributes:
-        counters: what happened since the construction, for diagnostics.
+        counters: event counts since the construction, for diagnostics.
     """
 
     def __init__(self, sensors: Sequence[str], wait: float) -> None:
@@ -56,7 +53,7 @@ class Ordering:
         self._wait_ns = round(wait * NANOSECONDS)
         self._sources = {sensor: _Source() for sensor in sensors}
         self._waiting: list[_Waiting] = []
-        self._of_before: list[tuple[str, Skeleton]] = []  # a jump of time
+        self._flushed: list[tuple[str, Skeleton]] = []  # before a jump of time
         self._arrived = 0
         self._left_ns: int | None = None
 
@@ -66,80 +63,69 @@ class Ordering:
         Args:
             sensor: one of those given.
             skeleton: in the clock that all of them share.
-            now_ns: when it arrived, in a clock that goes on.
+            now_ns: when it arrived, in a monotonic clock.
 
         Returns:
-            The frames that need wait no longer, in the order of their capture.
+            The frames whose wait is over, in the order of their capture.
         """
-        # What has waited long enough does not know this frame, whether or not somebody polled in between.
+        # The result does not depend on whether the caller polled in between.
         ready = self.poll(now_ns)
         self.hold(sensor, skeleton, now_ns)
         return ready + self.poll(now_ns)
 
     def hold(self, sensor: str, skeleton: Skeleton, now_ns: int) -> None:
-        """Take one frame that goes on with the next :meth:`poll` at the earliest: others are known to be there already.
-
-        What has waited long enough then lets those others go first, if they are older: it costs nobody any time.
-
-        Args:
-            sensor: as in :meth:`push`.
-            skeleton: as in :meth:`push`.
-            now_ns: as in :meth:`push`.
+        """Take one frame as :meth:`push` does, without polling: for frames that arrived together, so that an older one
+        of them goes before those whose wait is over.
         """
         source = self._sources[sensor]
         stamp_ns = skeleton.stamp_ns
         if jumped_back(stamp_ns, source.newest_ns):
-            self._of_before = self.flush()
+            self._flushed = self.flush()
             source = self._sources[sensor]
         if source.newest_ns is None or stamp_ns > source.newest_ns:
             if source.newest_ns is not None and (step := stamp_ns - source.newest_ns) < JUMP_BACK_NS:
-                source.rhythm.note(step / NANOSECONDS)
+                source.rhythm.add(step / NANOSECONDS)
             source.newest_ns = stamp_ns
         self._arrived += 1
         insort(self._waiting, _Waiting(stamp_ns, self._arrived, now_ns + self._wait_ns, sensor, skeleton))
 
     def poll(self, now_ns: int) -> list[tuple[str, Skeleton]]:
-        """The frames that need wait no longer, in the order of their capture.
-
-        Args:
-            now_ns: as in :meth:`push`.
-        """
-        ready, self._of_before = self._of_before, []
+        """The frames whose wait is over, in the order of their capture."""
+        ready, self._flushed = self._flushed, []
         while (deadline_ns := self.deadline_ns) is not None:
             first = self._waiting[0]
             due = self._due(first.stamp_ns)
             waited = now_ns >= deadline_ns
             if not waited and any(rhythm.worth_waiting for rhythm in due):
                 break
-            # a frame that comes after newer ones have left says nothing of whether it is worth waiting for its like
+            # a frame that comes after newer ones have left is no evidence of the sensors' delays
             if self._left_ns is None or first.stamp_ns >= self._left_ns:
                 self._left_ns = first.stamp_ns
                 for source in self._sources.values():
-                    source.rhythm.answered(came=source.rhythm not in due)
-            self.counters["in vain"] += waited and bool(due) and self._wait_ns > 0
+                    source.rhythm.record(arrived=source.rhythm not in due)
+            self.counters["expired waits"] += waited and bool(due) and self._wait_ns > 0
             del self._waiting[0]
             ready.append((first.sensor, first.skeleton))
         return ready
 
     def flush(self) -> list[tuple[str, Skeleton]]:
-        """All frames that wait, in the order of their capture; what comes next is of another time."""
-        ready = [*self._of_before, *((each.sensor, each.skeleton) for each in self._waiting)]
-        self._of_before = []
+        """All waiting frames, in the order of their capture, before a jump of time."""
+        ready = [*self._flushed, *((each.sensor, each.skeleton) for each in self._waiting)]
+        self._flushed = []
         self._waiting.clear()
         self._left_ns = None
-        for sensor in self._sources:
-            self._sources[sensor] = _Source()
+        self._sources = {sensor: _Source() for sensor in self._sources}
         return ready
 
     @property
     def deadline_ns(self) -> int | None:
-        """When :meth:`poll` should be called, in the clock of ``now_ns``; None while nothing waits."""
-        # an older frame that came later does not make those behind it wait longer
+        """When :meth:`poll` should be called, in the clock of ``now_ns``; None while no frame waits."""
+        # the minimum, so that an older frame that came later does not extend the wait of those behind it
         return min((each.deadline_ns for each in self._waiting), default=None)
 
     @property
     def expected_ns(self) -> int | None:
-        """The time before which no frame is to be expected any more; None while no sensor is known."""
+        """The capture time before which no further frame is expected; None before the first frame."""
         known = [
             (newest_ns, each.rhythm) for each in self._sources.values() if (newest_ns := each.newest_ns) is not None
         ]
@@ -154,7 +140,7 @@ class Ordering:
         return min([*next_ns, *(each.stamp_ns for each in self._waiting[:1])])
 
     def _due(self, stamp_ns: int) -> list[Rhythm]:
-        """Those of the sensors whose frame captured up to a time should be here and is not."""
+        """Of the sensors whose frame captured up to a time is due and has not arrived."""
         return [
             source.rhythm
             for source in self._sources.values()

@@ -1,6 +1,6 @@
-"""Which of the people whom sensors see are tracked: one, the same in all sensors, or each under a number of their own.
+"""Selection of the tracked people: one, the same in all sensors, or each under a number of their own.
 
-:mod:`body_tracking.fusion.association` says who is whom; here frames are placed for it, and its people get slots.
+Brings frames into world for :mod:`body_tracking.fusion.association`, and gives its people numbers.
 """
 
 from __future__ import annotations
@@ -16,28 +16,20 @@ from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import Association
 from body_tracking.fusion.placement import Placement
-from body_tracking.pipeline.people import (
-    ALL,
-    FIRST,
-    PeopleParameters,
-    SubjectSelector,
-)
+from body_tracking.pipeline.people import ALL, FIRST, PeopleParameters, SubjectSelector
 
 _PRESENT = round(0.2 * NANOSECONDS)
-"""Who was seen this long ago may be chosen, nanoseconds."""
+"""A person may be chosen when seen within this time, nanoseconds."""
 
 _PENDING = 5
-"""Frames of one who is alone that are kept until a look is due: the first and the last tell of the velocity."""
+"""Frames of a lone person that wait for the next association; the first and the last give the velocity."""
 
 _KEEP = 5 * NANOSECONDS
 """Poses and clocks are kept for frames that are late by no more than this, nanoseconds."""
 
 
 class Slots:
-    """A fixed number of numbers, 1 and up, for people who come and go.
-
-    Args:
-        count: how many.
+    """Assigns the numbers 1 to ``count`` to people who come and go.
 
     Attributes:
         of: the number of each person who has one.
@@ -48,13 +40,13 @@ class Slots:
         self._free = deque(range(1, count + 1))  # the one unused for longest first
 
     def update(self, people: Sequence[int]) -> tuple[list[int], int]:
-        """Give the numbers of those who are gone to those who are new.
+        """Give the numbers of people who are gone to new ones.
 
         Args:
-            people: everybody who is there, the longest known first.
+            people: all who are present, the longest known first.
 
         Returns:
-            The numbers that nobody has any more, or somebody else, and how many people there is none for.
+            The freed numbers, also where given to another person, and the count of people without a number.
         """
         gone = [person for person in self.of if person not in people]
         freed = [self.of.pop(person) for person in gone]
@@ -66,7 +58,7 @@ class Slots:
 
 
 class _Sensor(Placement):
-    """Where and when a sensor is, and its frames of one who is alone that the association has not been told of."""
+    """Pose and clock of a sensor, and its frames of a lone person that wait for the association."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -85,17 +77,14 @@ class _Sensor(Placement):
 class People:
     """Sorts the bodies of every sensor's frames by person.
 
-    With one subject, a sensor that is not calibrated yet, or whose clock is not what it is taken for, follows the
-    nearest to itself, for whoever only wants to know of its rhythm; with all, its frames are left out.
+    With one subject, a sensor that is not calibrated, or whose clock is wrong, selects the person nearest to itself, so
+    that the fusion learns its frame rate; with all, its frames are left out.
 
     Args:
         sensors: their names.
         parameters: whom to track.
         reference: the sensor whose clock is that of ``world``; the first one when None.
-        gone: called with the number of a person who is lost, before anybody else gets it; with one subject never.
-
-    Attributes:
-        counters: what happened since the construction, for diagnostics.
+        gone: callback with the number of a person who is lost, before it is given again; never with one subject.
     """
 
     def __init__(
@@ -125,14 +114,14 @@ class People:
 
     @property
     def tracked(self) -> tuple[int, ...]:
-        """The numbers under which somebody is tracked now."""
+        """The numbers in use."""
         if self.parameters.subject == ALL:
             return tuple(sorted(self._slots.of.values()))
         return () if self._chosen is None else (1,)
 
     @property
     def nearest(self) -> int | None:
-        """With all, the number of the one who would be tracked with ``nearest``."""
+        """With all, the number of the person whom ``nearest`` would choose."""
         return None if self._chosen is None else self._slots.of.get(self._chosen)
 
     def set_pose(self, pose: SensorPose) -> None:
@@ -146,7 +135,7 @@ class People:
             self._sensors[sensor].set_clock(valid_from_ns, clock)
 
     def reset(self) -> None:
-        """Forget everybody, because time jumped back; poses and clocks stay."""
+        """Forget all people, because time jumped back; poses and clocks stay."""
         for source in self._sensors.values():
             source.clear()
             source.restart()
@@ -155,7 +144,7 @@ class People:
         self._free_slots()
 
     def sensor_jumped_back(self, sensor: str) -> None:
-        """Forget what one sensor saw."""
+        """Forget one sensor's frames."""
         self._sensors[sensor].clear()
         self._association.forget_sensor(sensor)
 
@@ -184,22 +173,19 @@ class People:
             if alone is not None and self._number(alone) is not None:
                 source.pending.append((stamp_ns, pose, seen[0]))
                 return [(1 if one else self._slots.of[alone], seen[0])]
-        self._tell_pending()
+        self._record_pending()
         if source.used is not None and source.used is not pose:
             turned = pose.rotation @ source.used.rotation.T
             self._association.move_sensor(sensor, turned, pose.translation - turned @ source.used.translation)
         source.used = pose
         whose = self._association.assign(sensor, [_in_world(body, stamp_ns, pose) for body in seen])
         self._choose(stamp_ns)
-        found = []
-        for person, body in zip(whose, seen, strict=True):
-            number = None if person is None else self._number(person)
-            if number is not None:
-                found.append((number, body))
+        numbers = (None if person is None else self._number(person) for person in whose)
+        found = [(number, body) for number, body in zip(numbers, seen, strict=True) if number is not None]
         return sorted(found, key=lambda each: each[0])
 
     def _number(self, person: int) -> int | None:
-        """Under which somebody is tracked; None for who is not."""
+        """The number of a tracked person; None for others."""
         if self.parameters.subject == ALL:
             return self._slots.of.get(person)
         return 1 if person == self._chosen else None
@@ -228,7 +214,7 @@ class People:
         return stamp_ns, pose
 
     def _in_step(self, sensor: str, source: _Sensor, stamp_ns: int) -> bool:
-        """Whether a frame is of the time in which the reference sensor is, as far as that can be told."""
+        """Whether a frame's stamp is consistent with the reference sensor's newest one."""
         if sensor == self.reference:
             for other in self._sensors.values():
                 other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + JUMP_BACK_NS
@@ -239,18 +225,18 @@ class People:
         source.ahead &= stamp_ns > reference_ns + JUMP_BACK_NS
         return not source.ahead and not jumped_back(stamp_ns, reference_ns)
 
-    def _tell_pending(self) -> None:
-        """Tell the association what sensors saw of one who was alone."""
+    def _record_pending(self) -> None:
+        """Pass the lone person's waiting frames to the association."""
         for sensor, source in self._sensors.items():
             if source.pending:
                 ends = (source.pending[0], source.pending[-1])[2 - min(2, len(source.pending)) :]
                 seen = [(stamp_ns, _points(body, pose)) for stamp_ns, pose, body in ends]
-                self._association.note(sensor, seen, ends[-1][2].body)
+                self._association.record(sensor, seen, ends[-1][2].body)
                 source.used = ends[-1][1]
                 source.pending.clear()
 
     def _choose(self, stamp_ns: int) -> None:
-        """Give numbers to people, and choose the one."""
+        """Update the numbers, and choose a subject where there is none."""
         people = self._association.people
         if self.parameters.subject == ALL:
             self._free_slots()

@@ -16,7 +16,7 @@ from body_tracking.pipeline.people import ALL, PeopleParameters
 
 
 class PeopleFusion:
-    """A :class:`Fusion` of each person who is tracked; each gives what it would give if there were nobody else.
+    """A :class:`Fusion` per tracked person, each independent of the others.
 
     Args:
         sensors: their names.
@@ -56,7 +56,7 @@ class PeopleFusion:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What happened since the construction."""
+        """Event counts since the construction."""
         total: Counter[str] = Counter()
         for fusion in self._fusions:
             total.update(fusion.counters)

@@ -1,15 +1,16 @@
-"""Where a sensor stands and how its clock runs, as a calibration says it: each statement from its time on."""
+"""Pose and clock of a sensor over time, as the calibration publishes them."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import replace
 
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import MAX_STAMP_NS
 
 _MOST = 64
-"""Poses, and clocks, of one sensor that may wait for their time: a calibration announces one at a time."""
+"""Poses, and clocks, of one sensor that may wait to come into force."""
 
 
 class Placement:
@@ -20,13 +21,13 @@ class Placement:
         self._clocks: list[tuple[int, ClockModel]] = []  # likewise
 
     def set_pose(self, pose: SensorPose) -> None:
-        """Take a pose, in force from its ``valid_from_ns`` instead of what was said before of later times."""
+        """Add a pose, in force from its ``valid_from_ns``; it replaces earlier ones for later times."""
         del self._poses[bisect_right(self._poses, pose.valid_from_ns, key=_valid_from) :]
         self._poses.append(pose)
         del self._poses[:-_MOST]
 
     def set_clock(self, valid_from_ns: int, clock: ClockModel) -> None:
-        """Take a relation of the clocks, in force from a reference time, likewise."""
+        """Add a relation of the clocks, in force from a reference time, likewise."""
         del self._clocks[bisect_right(self._clocks, valid_from_ns, key=_first) :]
         self._clocks.append((valid_from_ns, clock))
         del self._clocks[:-_MOST]
@@ -42,7 +43,7 @@ class Placement:
         return found
 
     def stamp(self, sensor_ns: int) -> int | None:
-        """The same; None where that is no time of ROS, because the clock is not what it is said to be."""
+        """The same; None where the clock relation is wrong, so that the result is no ROS time."""
         found = self.to_reference(sensor_ns)
         return found if 0 <= found <= MAX_STAMP_NS else None
 
@@ -57,11 +58,10 @@ class Placement:
         del self._clocks[: max(0, bisect_right(self._clocks, now_ns, key=_first) - 1)]
 
     def restart(self) -> None:
-        """Let the newest pose and clock hold always, because time begins anew."""
+        """Put the newest pose and clock in force for all times, after a reset of time."""
         del self._poses[:-1], self._clocks[:-1]
         if self._poses:
-            pose = self._poses[0]
-            self._poses[0] = SensorPose(pose.sensor, pose.translation, pose.quat_xyzw)
+            self._poses[0] = replace(self._poses[0], valid_from_ns=0)
 
 
 def _valid_from(pose: SensorPose) -> int:

@@ -1,21 +1,21 @@
-"""When a sensor's next frame is due, and whether it is worth waiting for."""
+"""Prediction of a sensor's next frame, and whether to wait for it."""
 
 from __future__ import annotations
 
 from collections import deque
 
 DUE_MARGIN = 0.002
-"""A frame counts as due when it is expected up to this much after the frame that waits, seconds: stamps jitter."""
+"""A frame counts as due up to this long before its expected time, seconds: stamps jitter."""
 
 PATIENCE = 5
-"""A sensor whose due frame came too late for this many outputs in a row is not waited for until one comes in time."""
+"""After this many outputs in a row without its due frame, no output waits for a sensor until one comes in time."""
 
 _USUAL = 1.0 / 30.0
-"""Seconds between the frames of a sensor of which only one is known: the rate of a Kinect."""
+"""Initial frame period, seconds: a Kinect's."""
 
 
 class Rhythm:
-    """The rhythm of one sensor's frames.
+    """The frame period of one sensor.
 
     Attributes:
         period: seconds between frames, by the median: a lost frame does not make a sensor slower.
@@ -24,10 +24,10 @@ class Rhythm:
     def __init__(self) -> None:
         self._steps: deque[float] = deque(maxlen=7)
         self.period = _USUAL
-        self._in_vain = 0  # outputs in a row for which its frame was due and did not come in time
+        self._missed = 0  # outputs in a row without the due frame
 
-    def note(self, step: float) -> None:
-        """A frame was captured so many seconds after the one before."""
+    def add(self, step: float) -> None:
+        """Add the time between two frames, seconds."""
         self._steps.append(step)
         self.period = sorted(self._steps)[len(self._steps) // 2]
 
@@ -36,15 +36,15 @@ class Rhythm:
 
         Args:
             age: of the newest frame at that time, seconds; negative where that frame is newer.
-            silence: a sensor of which nothing came for longer than this is not expected to go on.
+            silence: no further frame is expected from a sensor silent for longer than this, seconds.
         """
         return 0.0 < age < silence and age > self.period - DUE_MARGIN
 
-    def answered(self, *, came: bool) -> None:
-        """What waited goes on, with this sensor's frame or without it."""
-        self._in_vain = 0 if came else self._in_vain + 1
+    def record(self, *, arrived: bool) -> None:
+        """Record whether an output went out with this sensor's due frame."""
+        self._missed = 0 if arrived else self._missed + 1
 
     @property
     def worth_waiting(self) -> bool:
-        """Whether a frame that is due can be hoped for."""
-        return self._in_vain < PATIENCE
+        """Whether recent due frames arrived in time."""
+        return self._missed < PATIENCE

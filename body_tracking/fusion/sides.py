@@ -21,78 +21,74 @@ from body_tracking.core.sides import (
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton
 
 _CLOSE = math.sqrt(0.5)
-"""Cosine between the headings that two sensors see above which they agree."""
+"""Two sensors' headings agree where their cosine exceeds this."""
 
-_SURE = math.cos(math.radians(30.0))
-"""Cosine of the angle to the believed line from which on an axis is as it is believed to be."""
+_AGREES = math.cos(math.radians(30.0))
+"""Cosine of the largest angle between a measured left-right axis and the accepted one that agrees with it."""
 
 HEADING_DRIFT = 1.6
 """Spectral density of a person's turning, as a random walk of the heading, rad2/s."""
 
 _START_VARIANCE = 1.0
-"""Of a heading that one frame of one sensor told, before that frame is taken, rad2."""
+"""Initial variance of a heading, before the update with the frame that it starts from, rad2."""
 
 HEADING_BIAS = 0.2
-"""Standard deviation of what a sensor's heading is wrong by for long, radians."""
+"""Standard deviation of a sensor's systematic heading error, radians."""
 
 MORE_FRONTAL = math.pi / 6
-"""A sensor is believed more on left and right when it sees the body this much more from the front, radians ..."""
+"""A sensor becomes the trusted one when it sees the body this much more from the front, radians ..."""
 
 TRUST_AFTER = round(1.0 * NANOSECONDS)
-"""... for this long, while it agrees with the one believed so far, nanoseconds."""
+"""... for this long, while it agrees with the trusted one, nanoseconds."""
 
 VIEW_KEPT = round(0.5 * NANOSECONDS)
-"""A sensor that was silent for longer may have exchanged left and right meanwhile, nanoseconds."""
+"""A sensor that was silent for longer may have swapped left and right meanwhile, nanoseconds."""
 
 HOLD = 10.0
-"""A reversal that all sensors see at once is not believed for this long, seconds ..."""
+"""A reversal that all sensors see at once is rejected for at most this long, seconds ..."""
 
-LEAST_HOLD = 1.0
-"""... or for this long where what it contradicts may be as wrong."""
+MIN_HOLD = 1.0
+"""... and for at least this long."""
 
 TURN_RATE = 8.0
-"""A person's shoulders turn no faster than this, radians per second (throwing athletes' trunks reach it)."""
+"""Fastest rotation of a person's shoulders, radians per second (throwing athletes' trunks reach it)."""
 
 TURN_ONCE = math.pi / 3
-"""Radians that they turn at most between two outputs, however long these are apart."""
+"""Largest rotation between two outputs, radians, however long these are apart."""
 
 JUMP = math.radians(20.0)
 """Radians beyond ``TURN_RATE`` by which an axis that one sensor sees must turn between two frames to be an outlier."""
 
 JUMP_WIDTH = 1.3
-"""Factor by which the axis must become longer or shorter as well: then one of its two joints is misplaced."""
+"""Factor by which an outlier's axis must also become longer or shorter: then one of its two joints is misplaced."""
 
 JUMP_HOLD = 0.3
 """Seconds after which a new heading and width is accepted."""
 
 
 class _Heading:
-    """A Kalman filter of the heading of half a body: a random walk, measured by each sensor as the direction of a line.
-
-    Args:
-        angle: at first, radians.
-    """
+    """A Kalman filter of the heading of half a body, radians: a random walk, measured as the direction of a line."""
 
     def __init__(self, angle: float) -> None:
         self.angle, self._variance = angle, _START_VARIANCE
 
     def predict(self, elapsed: float) -> None:
-        """Go on by a time, seconds."""
+        """Predict over some seconds."""
         self._variance += HEADING_DRIFT * max(elapsed, 0.0)
 
     def innovation(self, angle: float) -> float:
-        """From the state to a line, radians within a quarter turn: angles that differ by half a turn mean the same."""
+        """Innovation of a line's direction, radians within a quarter turn: it has no sense."""
         return math.remainder(angle - self.angle, math.pi)
 
     def update(self, angles: Sequence[float], weights: Sequence[float]) -> float:
-        """Take what sensors measure; what is far from the state has less weight.
+        """Update with the sensors' angles, radians, downweighting large innovations.
 
         Args:
             angles: radians.
             weights: inverse variances, 1/rad2; 0 where nothing was measured.
 
         Returns:
-            By how much the angle changed, radians.
+            Size of the correction, radians.
         """
         total = towards = 0.0
         for angle, weight in zip(angles, weights, strict=True):
@@ -111,7 +107,7 @@ class _Heading:
 
 
 class _View(NamedTuple):
-    """What a sensor last saw of a body: when, its headings, and 1, or -1 where left and right are exchanged."""
+    """A sensor's last frame of a body: stamp, headings, and 1, or -1 where it swaps left and right."""
 
     stamp: int
     headings: Sequence[float]
@@ -119,15 +115,15 @@ class _View(NamedTuple):
 
 
 class Sides:
-    """Decides whom to believe on left and right, and keeps the output from turning faster than a person can.
+    """Estimates a person's heading, corrects frames that contradict it, and limits the output's turn rate.
 
     Args:
-        hold: seconds for which a reversal that all sensors see at once is not believed at most.
+        hold: longest time for which a reversal that all sensors see at once is rejected, seconds.
     """
 
     def __init__(self, hold: float = HOLD) -> None:
         self._hold_ns = round(hold * NANOSECONDS)
-        self._least_ns = min(round(LEAST_HOLD * NANOSECONDS), self._hold_ns)
+        self._least_ns = min(round(MIN_HOLD * NANOSECONDS), self._hold_ns)
         self.reset()
 
     def reset(self) -> None:
@@ -135,7 +131,7 @@ class Sides:
         self.trusted: str | None = None
         self._trusted_ns = 0
         self._better_since: int | None = None
-        self._halves = [_Heading(math.nan), _Heading(math.nan)]  # taken for true
+        self._halves = [_Heading(math.nan), _Heading(math.nan)]
         self._headings_ns: int | None = None
         self._known_since = 0  # without having been reversed
         self._reversed_since: int | None = None
@@ -144,7 +140,7 @@ class Sides:
         self._seen: dict[tuple[str, int], tuple[float, float, int]] = {}
         self._output = [(math.nan, 0), (math.nan, 0)]  # heading of the output, and when
 
-    def settle(
+    def correct(
         self,
         stamp: int,
         names: Sequence[str],
@@ -154,9 +150,9 @@ class Sides:
         states: np.ndarray,
         counters: Counter[str],
     ) -> BoolArray:
-        """Repair or reject, in place, what a sensor sees turned around or with its sides swapped.
+        """Swap left and right, in place, in frames that show the body reversed, and reject joints of a turned half.
 
-        Where a sensor's left-right axis is opposite to the believed one, left and right are exchanged; where it is
+        Where a sensor's left-right axis is opposite to the accepted one, left and right are swapped; where it is
         across, only the joints of the midline are kept; upper and lower body each by their own axis.
 
         Args:
@@ -169,7 +165,7 @@ class Sides:
             counters: counts ``repaired``, ``turned``, ``jumped`` and ``reversals_accepted``.
 
         Returns:
-            (k, 2) whether what is left of a sensor's upper and lower body has the heading that is taken for true.
+            (k, 2) whether the corrected upper and lower body of each sensor agree with the accepted headings.
         """
         headings = [headings_of(each) for each in points]
         weights = [heading_weights(*each) for each in zip(points, variance, strict=True)]
@@ -178,23 +174,23 @@ class Sides:
                 weights[index][half] = 0.0
                 variance[index, HALVES[half]] = np.inf
                 counters["jumped"] += 1
-        believed = self.believed(stamp, names, angles, headings, weights, counters)
+        accepted = self.accepted_headings(stamp, names, angles, headings, weights, counters)
         for index, found in enumerate(headings):
-            halves = reversed_halves(found, believed)
+            halves = reversed_halves(found, accepted)
             swap_left_right(halves, points[index], variance[index], states[index])
             for _, opposite in halves:
                 counters["repaired" if opposite else "turned"] += 1
-        lines = [[abs(math.cos(a - b)) for a, b in zip(found, believed, strict=True)] for found in headings]
-        return np.array(lines) > _SURE
+        lines = [[abs(math.cos(a - b)) for a, b in zip(found, accepted, strict=True)] for found in headings]
+        return np.array(lines) > _AGREES
 
     def _jumped(self, stamp: int, name: str, headings: Sequence[float], points: FloatArray) -> list[int]:
-        """The halves of a body of which one sensor sees one end elsewhere at once: another heading, another width."""
+        """The halves whose axis changed heading and width from one frame to the next: one of its ends is an outlier."""
         jumped = []
         for half, (heading, pair) in enumerate(zip(headings, PAIRS, strict=True)):
             width = math.dist(*points[pair].tolist())
             before, width_before, before_ns = self._seen.get((name, half), (math.nan, math.nan, 0))
             elapsed = (stamp - before_ns) / NANOSECONDS
-            turn = abs(math.remainder(heading - before, math.pi))  # exchanged sides are another matter
+            turn = abs(math.remainder(heading - before, math.pi))  # swapped sides are no outlier
             other = max(width, width_before) > JUMP_WIDTH * min(width, width_before)
             if elapsed < JUMP_HOLD and other and turn > TURN_RATE * elapsed + JUMP:
                 jumped.append(half)
@@ -202,7 +198,7 @@ class Sides:
                 self._seen[name, half] = heading, width, stamp
         return jumped
 
-    def believed(
+    def accepted_headings(
         self,
         stamp: int,
         names: Sequence[str],
@@ -211,20 +207,19 @@ class Sides:
         weights: Sequence[Sequence[float]],
         counters: Counter[str],
     ) -> list[float]:
-        """The headings of both halves that are taken for true, radians.
+        """The estimated headings of both halves, radians.
 
-        Each is estimated by a Kalman filter of its own. A sensor measures the left-right axis as a line; its
-        sense is the one nearer to the state, whichever way the sensor sees the body. Which sense is the true one the
-        trusted sensor decides, for the whole body: at the start, and where it sees the body reversed for so long that
-        this is believed. Another sensor becomes the trusted one when it sees the body more from the front for a while
-        and agrees with it, or when the trusted one is missing.
+        Each half has its own Kalman filter. A sensor measures the left-right axis as a line without a sense. The
+        trusted sensor decides the sense for the whole body: at the start, and when it has seen the body reversed for
+        long enough. Another sensor becomes the trusted one when it sees the body more from the front for a while and
+        agrees with it, or when the trusted one is missing.
 
         Args:
             stamp: reference time, nanoseconds.
             names: k sensors.
             angles: k angles under which they see the body, radians.
-            headings: k times what :func:`headings_of` says of what they see.
-            weights: k times what :func:`heading_weights` says.
+            headings: of each, by :func:`headings_of`.
+            weights: of each, by :func:`heading_weights`.
             counters: counts ``reversals_accepted``.
         """
         known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
@@ -242,7 +237,7 @@ class Sides:
             for half in self._halves:
                 half.predict((stamp - self._headings_ns) / NANOSECONDS)
             senses = {index: self._sense(headings[index], weights[index]) for index in known}
-            if self._reversal_believed(stamp, leading, senses, angles[leading]):
+            if self._reversal_accepted(stamp, leading, senses, angles[leading]):
                 counters["reversals_accepted"] += 1
                 for half in self._halves:
                     half.angle += math.pi
@@ -252,11 +247,11 @@ class Sides:
             for number, half in enumerate(self._halves)
         ]
         upper, lower = self._halves
-        if math.cos(upper.angle - lower.angle) < 0.0:  # nobody's shoulders are turned round above the hips
+        if math.cos(upper.angle - lower.angle) < 0.0:  # anatomically impossible: the half that moved more is wrong
             (lower if moved[1] > moved[0] else upper).angle += math.pi
         expected = {index: self._expected(stamp, names[index], headings[index], weights[index]) for index in known}
         if expected[leading] * self._sense(headings[leading], weights[leading]) < -SAME_SENSE:
-            # what drew the estimate round is not the sensor that sees the body best: that one saw no reversal
+            # another sensor turned the estimate, while the one that sees the body best saw no reversal
             counters["senses_restored"] += 1
             for half in self._halves:
                 half.angle += math.pi
@@ -266,14 +261,14 @@ class Sides:
         return [half.angle for half in self._halves]
 
     def _start(self, stamp: int, headings: Sequence[float], weights: Sequence[float], angle: float) -> None:
-        """Take the headings that one sensor sees for true, and of two opposite ones that which is better known."""
+        """Start from one sensor's headings; of two opposite ones the one with the larger weight."""
         self._halves = [_Heading(heading) for heading in headings]
         if math.cos(headings[0] - headings[1]) < 0.0:
             self._halves[int(weights[0] > weights[1])].angle += math.pi
-        self._known_since, self._reversed_since = self._credited(stamp, angle), None
+        self._known_since, self._reversed_since = self._known_from(stamp, angle), None
 
     def _sense(self, headings: Sequence[float], weights: Sequence[float]) -> float:
-        """1 where a sensor sees a body as it is taken to stand, -1 where reversed; the mean of both halves."""
+        """1 where a sensor's headings equal the estimate, -1 where reversed; the weighted mean of both halves."""
         total = sum(weights)
         agreement = (
             weight * math.cos(heading - half.angle)
@@ -282,7 +277,7 @@ class Sides:
         return sum(agreement) / total if total else 0.0
 
     def _expected(self, stamp: int, name: str, headings: Sequence[float], weights: Sequence[float]) -> float:
-        """The sense in which a sensor should see the body: as in its last frame, unless it exchanged left and right."""
+        """The sense in which a sensor should see the body: as in its last frame, unless it swapped left and right."""
         view = self._views.get(name)
         total = sum(weights)
         if view is None or stamp - view.stamp > VIEW_KEPT or not total:
@@ -314,18 +309,16 @@ class Sides:
             return better
         return leading
 
-    def _reversal_believed(self, stamp: int, leading: int, senses: Mapping[int, float], angle: float) -> bool:
-        """Whether the body stands the other way round than it was taken to, since the trusted sensor sees it reversed.
+    def _reversal_accepted(self, stamp: int, leading: int, senses: Mapping[int, float], angle: float) -> bool:
+        """Whether the estimate was reversed, now that the trusted sensor sees the body reversed.
 
-        Nobody turns round in a thirtieth of a second: a sensor that says so errs now, or has erred before. Where
-        another one goes on as before, it errs now, for as long as that one does, unless most sensors are with it. Else
-        nobody knows whether it errs now or has until now. It does so for less time than it does not, so that the
-        reversal is believed when it has lasted as long as what it contradicts; and seldom so that it sees somebody's
-        back, so that who was seen to face it counts as one who was seen for long.
+        No person reverses between two frames, so the sensor errs now or has erred until now. While at least as many
+        sensors keep the old sense as see the reversal, it errs now. Otherwise the reversal is accepted when it has
+        lasted as long as the sense that it contradicts, because sensors err for less time than they do not. A body seen
+        from the front counts as seen for long: sensors seldom mistake a back for a front.
         """
         as_before = sum(sense > _CLOSE for sense in senses.values())
         with_it = sum(sense < -_CLOSE for index, sense in senses.items() if index != leading)
-        # of as many on either side those are right that nobody has seen turn
         if senses[leading] > -SAME_SENSE or as_before > with_it:
             self._reversed_since = None
             return False
@@ -334,18 +327,17 @@ class Sides:
             since = self._reversed_since = stamp
         if stamp - since <= min(max(since - self._known_since, self._least_ns), self._hold_ns):
             return False
-        self._known_since, self._reversed_since = self._credited(since, angle), None
+        self._known_since, self._reversed_since = self._known_from(since, angle), None
         return True
 
-    def _credited(self, stamp: int, angle: float) -> int:
-        """Since when a body counts as known that a sensor sees from a time on, under an angle."""
+    def _known_from(self, stamp: int, angle: float) -> int:
+        """Start of the time for which a sense counts as known, for a sensor that sees the body under an angle."""
         return stamp - self._hold_ns if angle < math.pi / 2 else stamp
 
-    def turn_gently(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
-        """Turn shoulders and hips, with arms and legs, no faster than a person can.
+    def limit_turn_rate(self, stamp: int, fused: Skeleton, counters: Counter[str]) -> Skeleton:
+        """Limit the turn rate of shoulders and hips, with arms and legs, to :data:`TURN_RATE`.
 
-        When the believed sensors change their mind at once about which way a body faces, the output follows them on
-        the way that a body would take, and never through a mirror.
+        When the accepted heading jumps, the output turns as a body would, and is never mirrored on the way.
 
         Args:
             stamp: reference time, nanoseconds.
@@ -377,7 +369,7 @@ def _turned(skeleton: Skeleton, half: int, angle: float) -> Skeleton:
     arms = positions[joints] - centre
     cosine, sine = math.cos(angle), math.sin(angle)
     moved = arms @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    # What was turned is as uncertain as it was moved.
+    # The displacement counts as uncertainty.
     covariances[joints] += np.einsum("ji,jk->jik", moved - arms, moved - arms)
     positions[joints] = centre + moved
     return Skeleton(

@@ -56,10 +56,7 @@ class FusionStage(Stage):
         reference, world = str(values["reference"]) or None, str(values["world_frame"])
         self.fusion = PeopleFusion(sensors, parameters, people_from(values), reference, world)
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
-        self.inputs = (
-            *calibration_inputs(len(sensors)),
-            *(skeleton_input(topic, values) for topic in self._sensors),
-        )
+        self.inputs = (*calibration_inputs(len(sensors)), *(skeleton_input(topic, values) for topic in self._sensors))
         self.outputs = (Port(graph.FUSED, Skeletons(), skeleton_qos(values), measured=True),)
 
     def change(self, values: Mapping[str, Value]) -> None:

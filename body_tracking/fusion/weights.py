@@ -1,4 +1,4 @@
-"""How much each sensor's word on a joint counts."""
+"""Weights of the sensors' joints, by tracking state."""
 
 from __future__ import annotations
 

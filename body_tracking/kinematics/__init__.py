@@ -1,4 +1,1 @@
-"""Bodies as geometry: joint angles and their conventions, how people move; later the body models.
-
-Knows ``skeleton.py``, ``measurement.py`` and numpy alone; filters, nodes and the offline replay use it.
-"""
+"""Kinematics: the body model, joint angles and their conventions, ranges of motion, segment lengths."""

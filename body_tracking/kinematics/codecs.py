@@ -11,11 +11,7 @@ from body_tracking.messages.codecs import Codec, Wire
 
 
 class Segments(Codec):
-    """The poses of the segments.
-
-    Args:
-        model: of the estimates.
-    """
+    """The poses of the segments of a model."""
 
     type_name = SEGMENTS
 

@@ -13,14 +13,14 @@ isb    Wu et al., J. Biomech. 38 (2005) 981, with its signs, left arms mirrored 
        the ulna. The model has no carrying angle, no clavicle turning about itself and no twist within the wrist.
 rep155 joints of the REP's kinematic model (package ``human_description``), those of the upper body: ``waist`` leans
        forward; ``r_head``, ``y_head``, ``p_head``; per side ``y_shoulder``, ``p_shoulder``, ``r_shoulder`` (about z, x,
-       z: singular hanging and straight up) and ``elbow``. Its trunk knows no lateral and no axial bend: head and arms
-       are told against the torso as that model has it, so that they point where the person's do.
+       z: singular hanging and straight up) and ``elbow``. Its trunk has no lateral and no axial bend: head and arms
+       are given against the torso as that model has it, so that they point where the person's do.
 dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematics.dh26``
 ====== ================================================================================================================
 
-Uncertainty is carried through by the analytic Jacobian. Near a singular pose it grows as 1 / sin, the angles are held
-continuous (``kinematics.euler``); beside one it grows to that of an angle that may be anything. An angle that nothing
-observes has the deviation of its prior. For any pose, :func:`segment_quaternions` has none of this.
+Uncertainty is propagated by the analytic Jacobian. Near a singular pose it grows as 1 / sin, up to that of a uniform
+angle, and the angles are held continuous (``kinematics.euler``). An unobserved angle has the standard deviation of its
+prior. :func:`segment_quaternions` has no singular pose.
 """
 
 from __future__ import annotations
@@ -43,26 +43,25 @@ from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
 
-ANYWHERE = np.pi / np.sqrt(3.0)
-"""Radians: the standard deviation of an angle that may be anything, near a singular pose."""
+UNIFORM_STDDEV = np.pi / np.sqrt(3.0)
+"""Radians: the standard deviation of a uniformly distributed angle, near a singular pose."""
 _ROUNDING = 1e-9
 _X, _Y, _Z = np.eye(3)
-_FULL = (-180.0, 180.0)
 
 
 class ConventionError(BodyTrackingError):
-    """Not a convention, or angles of another one."""
+    """Raised for an unknown convention, or for previous angles of another one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """One rotation told as three angles.
+    """One rotation as three angles.
 
     Attributes:
-        names: of the three angles; None for one that is not told (always zero in the model, or not in the convention).
+        names: of the three angles; None for an omitted one (always zero in the model, or not in the convention).
         parent, child: segments, or names of :class:`Frame`.
         angles: the sequence.
-        redundant: names of angles that are told as zero, because the convention has more than the rotation.
+        redundant: names of angles that are always zero, because the convention has more than the rotation.
     """
 
     names: tuple[str | None, str | None, str | None]
@@ -78,7 +77,7 @@ class Frame:
 
     Attributes:
         name: of the frame.
-        chain: number of the chain among those of the convention without frames.
+        chain: index of the chain among those of the convention without frames.
         count: how many of its angles, 1 or 2.
     """
 
@@ -88,12 +87,12 @@ class Frame:
 
 
 class Convention:
-    """Names of angles and how to get them.
+    """The angles of one convention for one model.
 
     Attributes:
         names: n, in the order of the output.
-        rows: (n,) where among all that can be computed each of them is: coordinates, then three angles of each chain.
-        stages: what is computed together: the chains' sequences, parents and children among the segments, and rows.
+        rows: (n,) row of each among all computed quantities: coordinates, then three angles of each chain.
+        stages: chains that are computed together: their sequences, parents and children among the segments, and rows.
     """
 
     def __init__(
@@ -104,7 +103,7 @@ class Convention:
         frames: Sequence[Frame] = (),
         later: Sequence[Chain] = (),
     ) -> None:
-        """Tables to arrays.
+        """Build the index arrays.
 
         Args:
             model: the body model.
@@ -121,7 +120,7 @@ class Convention:
             for segment in [model.segment_names.index(chains[frame.chain].parent)]
         ]
         segments = [*model.segment_names, *(frame.name for frame in frames)]
-        # rows of all that can be computed: coordinates, chains, later chains, one row of zeros
+        # rows of all computed quantities: coordinates, chains, later chains, one row of zeros
         coordinates = model.coordinate_names[6:]
         rows = {name: number for number, name in enumerate(coordinates)}
         self._scalar: IntArray = model.scalar_q
@@ -146,7 +145,6 @@ class Convention:
                 self.stages.append((EulerSequences([c.angles for c in stage]), parents, children, slice(start, stop)))
                 start = stop
         self._size = zero + 1
-        # where the previous angles of the output belong among all rows
         self._identity = np.zeros((self._size, count))
         self._identity[:count] = np.eye(count)
 
@@ -194,15 +192,15 @@ class Convention:
             names=self.names,
             position=values[self.rows],
             velocity=_times(rate_gradient, estimate.velocity[joint]),
-            position_stddev=np.where(lost_angle, np.inf, np.minimum(stddev, ANYWHERE)),
-            # what says nothing of an angle says nothing of its rate
+            position_stddev=np.where(lost_angle, np.inf, np.minimum(stddev, UNIFORM_STDDEV)),
+            # an unobserved angle has an unobserved rate
             velocity_stddev=np.where(lost_angle, np.inf, velocity_stddev),
         )
 
     def _extend(
         self, rotations: FloatArray, turning: FloatArray, values: FloatArray, gradients: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Rotations and their derivatives with those of the frames behind."""
+        """Rotations and their derivatives, with those of the frames appended."""
         sequences, _, _, rows = self.stages[0]
         more_rotations, more_turning = [], []
         for parent, chain, count in self._frames:
@@ -219,7 +217,7 @@ class Convention:
 
 
 def _finite(covariance: FloatArray) -> tuple[FloatArray, IntArray | None]:
-    """The covariance without what is infinite in it, and the numbers of those coordinates; None if there are none."""
+    """The covariance with 0 for coordinates of infinite variance, and their indices; None if there are none."""
     variances = covariance.diagonal()
     if np.isfinite(variances.sum()):
         return covariance, None
@@ -230,7 +228,7 @@ def _finite(covariance: FloatArray) -> tuple[FloatArray, IntArray | None]:
 
 
 def _stddev(gradient: FloatArray, covariance: FloatArray, unknown: IntArray | None) -> FloatArray:
-    """(n,) standard deviations; infinite where an unknown coordinate has a part."""
+    """(n,) standard deviations; infinite where an unknown coordinate contributes."""
     variance = ((gradient @ covariance) * gradient).sum(axis=-1)
     stddev: FloatArray = np.sqrt(np.maximum(variance, 0.0))
     if unknown is not None:
@@ -239,7 +237,7 @@ def _stddev(gradient: FloatArray, covariance: FloatArray, unknown: IntArray | No
 
 
 def _times(gradient: FloatArray, velocity: FloatArray) -> FloatArray:
-    """(n,) rates; NaN where a velocity that nothing estimates has a part."""
+    """(n,) rates; NaN where an unknown velocity contributes."""
     rates: FloatArray = gradient @ velocity
     if np.isnan(rates).any():
         unknown = np.isnan(velocity)
@@ -256,7 +254,7 @@ _ELBOW_USUAL = (RANGES["elbow_flexion"], (-90.0, 90.0), RANGES["forearm_pronatio
 
 
 def model_names(model: UpperBody) -> tuple[str, ...]:
-    """The model's 26 joint angles in the order of its tangent, the shoulders' as they are told."""
+    """The model's 26 joint angles in the order of its tangent, the shoulders' by their clinical names."""
     split = {"x": "flexion", "y": "abduction", "z": "rotation"}
     words = [name.split("_") for name in model.coordinate_names[6:]]
     return tuple("_".join([w[0], split[w[1]], w[2]] if w[0] == "shoulder" else w) for w in words)
@@ -284,8 +282,8 @@ def _model(model: UpperBody) -> Convention:
 
 
 def _isb(model: UpperBody) -> Convention:
-    # ISB: X forward, Y up, Z to the right; for the left side everything is mirrored at the sagittal plane, which turns
-    # the sense of rotations about X and Y
+    # ISB: X forward, Y up, Z to the right; the left side is mirrored at the sagittal plane, which reverses rotations
+    # about X and Y
     up, right = _Z, -_Y
     chains = [
         Chain(
@@ -380,7 +378,7 @@ def convention(name: str, model: UpperBody) -> Convention:
     Raises:
         ConventionError: there is none of this name.
     """
-    from body_tracking.kinematics.dh26 import dh26  # it is built of what is defined here
+    from body_tracking.kinematics.dh26 import dh26  # imports this module
 
     builders = dict(zip(CONVENTIONS, (_model, _isb, _rep155, dh26), strict=True))
     if name not in builders:
@@ -395,8 +393,8 @@ def angles_of(estimate: ModelEstimate, model: UpperBody, name: str, previous: Jo
         estimate: of the model at one instant.
         model: the model.
         name: one of :data:`CONVENTIONS`.
-        previous: the angles of the instant before, in the same convention: the new ones continue them, in full turns,
-            and where a singular pose leaves a choice. None starts anew.
+        previous: the angles of the instant before, in the same convention: the new ones continue them in full turns
+            and at singular poses. None at the start.
 
     Raises:
         ConventionError: no such convention, or previous angles of another one.
@@ -406,7 +404,7 @@ def angles_of(estimate: ModelEstimate, model: UpperBody, name: str, previous: Jo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentQuaternions:
-    """Orientations of the segments, which have no singular pose.
+    """Orientations of the segments, without singular poses.
 
     Attributes:
         stamp_ns: capture time, nanoseconds.

@@ -1,16 +1,16 @@
 """The 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2, for the posture of ``upper_body``.
 
-Her tables turn each joint about axes that are fixed by the T-pose with palms down, where all angles are zero (see
-``kinematics.schlagenhauf26``, whose signs these are). Put into her model these angles give, against the pelvis, the
-directions of all bones that hers has. Three things of hers and ours differ:
+The joints' axes are those of the T-pose with palms down, where all angles are zero (signs as in
+``kinematics.schlagenhauf26``). In her model these angles give the directions of all its bones against the pelvis. Her
+model differs from ours in three points:
 
-- Her clavicles have a third angle, theta9 and theta12, about their own axis, which their shoulder's three angles make
-  redundant. It is told as zero; the shoulder is told against the clavicle without it.
-- theta16 and theta23, "pronation", turn about the upper arm's axis, as theta15 and theta22 do: redundant, told as zero.
-- Her forearm does not turn about itself behind the elbow. The wrist's two angles are told against the forearm without
-  our pronation: they give the direction of the hand, and nothing tells how it is turned about itself.
+- Her clavicles have a third angle, theta9 and theta12, about their own axis, which is redundant with the shoulder's
+  three angles. It is set to zero; the shoulder's angles are against the clavicle without it.
+- theta16 and theta23, "pronation", turn about the upper arm's axis, as theta15 and theta22 do: redundant, set to zero.
+- Her forearm does not turn about itself. The wrist's two angles are against the forearm without our pronation: they
+  give the direction of the hand, not its rotation about itself.
 
-An angle that is told as zero by choice has an infinite standard deviation: nothing observes it.
+An angle that is set to zero has an infinite standard deviation, because it is unobservable.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def _three(first: int) -> tuple[str, str, str]:
 def dh26(model: UpperBody) -> Convention:
     """The convention; her axes x (left), y (backward), z (up) are our y, -x, z.
 
-    What an angle does follows from tables 3.1 and 3.2. The names in table 3.4 do not fit them in the torso: theta1
-    turns it, theta2 flexes it, theta3 bends it to the side; theta4 bends, theta5 turns, theta6 flexes.
+    Tables 3.1 and 3.2 decide: the names in table 3.4 contradict them in the torso, where theta1 is axial, theta2
+    flexion, theta3 lateral; theta4 lateral, theta5 axial, theta6 flexion.
     """
     left, back, up = _Y, -_X, _Z
     chains = [

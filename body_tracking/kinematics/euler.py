@@ -1,6 +1,6 @@
-"""Rotations as three successive angles, held together near the poses where three angles fail.
+"""Rotations as three successive angles, continuous through singular poses.
 
-A rotation is told as ``R = R(e1, t1) R(e2, t2) R(e3, t3)``: intrinsic, about three of a frame's axes, one after the
+``R = R(e1, t1) R(e2, t2) R(e3, t3)``: intrinsic, about three of a frame's axes, one after the
 other. Every such sequence has a singular pose in which the first and the last axis coincide: for ``e3`` along ``e1``
 (proper Euler angles) where the middle angle is 0 or 180 deg, for three different axes (Cardan angles) where it is 90 or
 -90 deg. There only the sum or the difference of the outer angles is determined.
@@ -8,7 +8,7 @@ other. Every such sequence has a singular pose in which the first and the last a
 Both kinds are one: turning a Cardan sequence by a quarter about its second axis makes it an Euler sequence, whose
 middle angle is a quarter turn less. All below is the Euler sequence x y x of ``pre @ R @ post``, with angles
 (a, b, c): ``t1 = a``, ``t2 = b + offset``, ``t3 = sign c``. Its first column, (cos b, sin a sin b, -cos a sin b),
-is the direction of the last axis, whose distance ``|sin b|`` from the first one says how well a is determined.
+is the direction of the last axis; its distance ``|sin b|`` from the first one determines the accuracy of a.
 
 Near the singular pose, where that distance is within the uncertainty of the rotation, the first angle is held at its
 previous value (at 0 where there is none), and the other two are those that come nearest to the rotation; the departure
@@ -29,29 +29,29 @@ _TURN = 2.0 * np.pi
 HELD, FREE = 2.5, 5.0
 """Standard deviations from the singular pose: within the first the split is held, from the second on it is free.
 
-The first is where the standard deviation of the outer angles stops to be infinite; noise alone exceeds it in one frame
-of twenty. Between the two the first angle turns by a share of what the rotation says.
+The outer angles have an infinite standard deviation within the first, which noise alone exceeds in one frame of twenty.
+Between the two the first angle changes by a share of the measured change.
 """
-LEAST_HOLD = np.radians(0.1)
-"""Radians: a rotation is never taken for better known than that, so that rounding errors decide no angle."""
-GREATEST_HOLD = np.radians(4.0)
-"""Radians: nor for worse: 20 deg away from a singular pose even a rotation that nothing observes has its own angles."""
+MIN_HOLD = np.radians(0.1)
+"""Radians: lower bound of a rotation's standard deviation, so that rounding errors decide no angle."""
+MAX_HOLD = np.radians(4.0)
+"""Radians: upper bound, so that 20 deg away from a singular pose even an unobserved rotation has its own angles."""
 MARGIN = np.radians(60.0)
 """Radians by which an angle may leave its usual range for the sake of continuity, before it jumps back.
 
-Turning the long way round through the singular poses ends, without a jump, in angles that no reader would understand
-(arms hanging as -180, 180, 180 deg). An arm that swings back through hanging needs 60 deg (extension).
+A continuous path through singular poses can end in angles such as -180, 180, 180 deg for hanging arms. An arm that
+swings back through hanging needs 60 deg (extension).
 """
 
 
 @dataclass(frozen=True, slots=True)
 class EulerAngles:
-    """How one rotation is told as three angles.
+    """A sequence of three angles for one rotation.
 
     Attributes:
-        axes: the three axes, each along an axis of the frame, the second square to both others.
-        usual: degrees, (least, greatest) of the three angles: of all angles that tell a rotation, those are taken.
-        turn: (3, 3) the rotation is turned by this first: ``R @ turn`` is told. None for the identity.
+        axes: the three axes, each along an axis of the frame, the second perpendicular to both others.
+        usual: degrees, (least, greatest) of the three angles, to choose among equivalent triples.
+        turn: (3, 3) ``R @ turn`` is decomposed instead of R. None for the identity.
     """
 
     axes: tuple[FloatArray, FloatArray, FloatArray]
@@ -61,7 +61,7 @@ class EulerAngles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """Angles of n rotations, and what they change by.
+    """Angles of n rotations and their derivatives.
 
     Attributes:
         angles: (n, 3) radians.
@@ -112,7 +112,7 @@ class EulerSequences:
         y, z = r[:, 1, 0], r[:, 2, 0]
         distance = np.sqrt(y * y + z * z)
         tilt = (self._tilt * variances).sum(axis=-1)
-        doubt = np.sqrt(np.minimum(np.maximum(tilt, LEAST_HOLD**2), GREATEST_HOLD**2))
+        doubt = np.sqrt(np.minimum(np.maximum(tilt, MIN_HOLD**2), MAX_HOLD**2))
         x = np.minimum(np.maximum((distance / doubt - HELD) / (FREE - HELD), 0.0), 1.0)
         hold = 1.0 - x * x * (3.0 - 2.0 * x)
 
@@ -132,8 +132,7 @@ class EulerSequences:
         np.cos(b, out=cb)
         np.sin(b, out=sb)
         c = np.arctan2(
-            sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2],
-            row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2],
+            sb * r[:, 0, 1] + cb * row_z[..., 1] - row_y[..., 2], row_y[..., 1] + sb * r[:, 0, 2] + cb * row_z[..., 2]
         )
         angles[..., 1] = b + self._offset
         angles[..., 2] = self._sign * c

@@ -1,14 +1,14 @@
 """Inverse kinematics of ``upper_body``: from the points of one frame to a configuration.
 
-A closed form finds the pose from the directions between the points, whatever it is; damped least squares (Levenberg
-1944, Marquardt 1963) then fit the points by their noise, with the ranges of motion as priors. The filter starts from it
-and comes back to it after a loss; offline it is a method of its own, frame by frame.
+A closed form gives a start from the directions between the points; damped least squares (Levenberg 1944, Marquardt
+1963) then fit the points by their noise, with the ranges of motion as priors. The filter starts from this fit, and
+restarts from it after a loss.
 
-Least squares find the nearest minimum, and an arm has others. Half a turn of the forearm, or of the upper arm with the
-elbow bent the other way, and flexion and deviation of the wrist reversed put every point where it was but the thumb,
-which then lies as far on the other side of the hand; both half turns together, the wrist as it was, move none at all
-(``Ranges.nearest_branch``). Between these poses the ranges of motion stand: a hand that is bent cannot turn about
-itself without leaving them. So the arm is tried all the way round (:meth:`InverseKinematics.turned_about`).
+Least squares converge to the nearest minimum, and an arm has others. Half a turn of the forearm, or of the upper arm
+with the elbow bent the other way, and flexion and deviation of the wrist reversed leave every point but the thumb,
+which is reflected to the other side of the hand; both half turns together leave all points
+(``Ranges.nearest_branch``). The ranges of motion separate these minima, because a bent hand cannot turn about itself
+within them. So a full turn of the arm is searched (:meth:`InverseKinematics.turned_about`).
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from body_tracking.kinematics.upper_body import UpperBody
 _J = Joint
 _TINY = 1e-9
 _STRAIGHT = 0.15
-"""Sine of the elbow's flexion below which the forearm does not show how the upper arm is turned about itself."""
+"""Sine of the elbow's flexion below which the forearm does not determine the upper arm's rotation about itself."""
 _LIMIT_STDDEV = np.radians(4.0)
-"""How softly the ranges of motion push back."""
+"""Standard deviation of the soft limits of the ranges of motion."""
 _TURNED = np.radians(60.0)
-"""A hand turned about itself by more than this against another is in another pose; half a turn lies between the two."""
+"""Rotation of a hand about itself from which two fits are different minima, which are half a turn apart."""
 _NEARLY_STRAIGHT = 0.5
-"""Sine of the elbow's flexion up to which the upper arm is turned about itself, too: beyond, a turn by an eighth of a
-circle takes the wrist of a forearm of 0.25 m away by 0.09 m, more than any sensor's noise."""
+"""Sine of the elbow's flexion up to which rotations of the upper arm are searched, too: beyond, an eighth of a turn
+moves the wrist of a forearm of 0.25 m by 0.09 m, more than any sensor's noise."""
 _TURNS = np.radians(np.arange(0.0, 360.0, 45.0))
 _PRONATIONS = 13
-"""A step of 15 degrees moves a thumb's point by 7 mm, less than it takes to get from one valley to the next."""
+"""Steps of 15 degrees move a thumb's point by 7 mm, less than the distance between minima."""
 _TWIST_STDDEV = np.radians(TWIST_SHARING_STDDEV)
 _HUBER = 2.5
 """Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
@@ -108,7 +108,7 @@ class InverseKinematics:
             (35,) configuration.
 
         Raises:
-            ModelError: SpineBase, SpineMid and SpineShoulder show no trunk at all.
+            ModelError: SpineBase, SpineMid and SpineShoulder determine no trunk.
         """
         point = {joint: positions[number] for joint, number in self._point.items()}
         base, mid, top = (point[joint] for joint in (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER))

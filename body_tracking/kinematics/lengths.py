@@ -1,18 +1,18 @@
-"""How long a person's segments are, from the distances between the points of many frames.
+"""Estimation of a person's segment lengths from the distances between the points of many frames.
 
-Independent of the pose that a filter or a fit believes in: a wrong pose spoils no length here. :class:`SegmentLengths`
-gathers what sensors show; :class:`SkeletonLengths` is for who has filtered skeletons and asks after every frame.
+Independent of the estimated pose. :class:`SegmentLengths` estimates from sensors' frames, :class:`SkeletonLengths` from
+filtered skeletons, after every frame.
 
-What a sensor shows of one bone differs from pose to pose by a tenth and more, for seconds, and these errors are by far
-the greatest; averaging frames as if each were new would soon be sure of a wrong length. Therefore
+A sensor's error of a length depends on the pose, is a tenth of the length and more, and lasts for seconds. Frames are
+therefore not independent:
 
-- frames are gathered into blocks of a second (longer where there are few); the mean squared distances in a block, less
-  what white noise adds to them, tell its lengths. Frames far from the block's median do not count;
-- over the blocks a mean is taken that single strange poses do not move (Huber 1964), each weighed by how much the
-  sensors' points are worth by the measurement model: a body seen from the side is not seen well;
-- its variance is that of the blocks: the part that two interleaved halves of a block do not share is white and
-  averages out from block to block, the rest persists from pose to pose and averages out that much more slowly;
-- and all is weighed against how people differ in their proportions, left hardly from right.
+- Frames are gathered into blocks of a second (longer where there are few). A block's lengths follow from its mean
+  squared distances less the variance of the white noise. Frames far from the block's median are outliers.
+- Huber's estimate of location (Huber 1964) combines the blocks, weighted by the inverse variance of their points by the
+  measurement model.
+- Its variance has two parts. The difference between two interleaved halves of a block is white and averages out from
+  block to block; the rest of the blocks' spread is correlated over time and averages out more slowly.
+- The prior is the distribution of people's proportions, with a high correlation between left and right.
 """
 
 from __future__ import annotations
@@ -27,47 +27,47 @@ from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntA
 from body_tracking.kinematics.upper_body import LENGTHS, UpperBody
 
 _BLOCK_NS = NANOSECONDS
-_FEWEST_FRAMES = 4
-"""Frames from which on a block counts: two for each of its halves."""
-_LONGEST_NS = 4 * _BLOCK_NS
-"""What a block waits for these."""
-_FAR = 4.0
-"""Standard deviations from the median of a block from which a frame does not count in it."""
+_MIN_FRAMES = 4
+"""Least frames of a block: two for each of its halves."""
+_MAX_BLOCK_NS = 4 * _BLOCK_NS
+"""Longest block, where frames are few."""
+_OUTLIER = 4.0
+"""Standard deviations from the block's median beyond which a frame is an outlier."""
 _HUBER = 1.345
 """Huber's constant of 95 % efficiency."""
 _EFFICIENCY = 0.95
 _ITERATIONS = 8
-_NORMAL = 1.4826
-"""Standard deviation of normal deviates over the median of their sizes."""
-_OWN_WEIGHT = 3.0
-"""Blocks that what is stated of the slow errors is worth against their observed spread."""
-_SUREST = 1e-5
-"""Metres: standard deviation that no length falls below, so that covariances stay invertible."""
-_SHORTEST = 0.005
-"""Metres: nothing is shorter."""
+_MAD_TO_STDDEV = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+_PRIOR_BLOCKS = 3.0
+"""Weight of the stated variance of slow errors against the observed spread, in blocks."""
+_MIN_STDDEV = 1e-5
+"""Metres: least standard deviation of a length, so that covariances stay invertible."""
+_MIN_LENGTH = 0.005
+"""Metres."""
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
-"""Standard deviations by which lengths differ from the average: all alike, each kind, left from right."""
-_SHORTEST_SCALE = 0.08
-"""Metres: shorter lengths differ as if they were as long as this, because sensors place these points so."""
-_LEAST_SIZE, _GREATEST_SIZE = 0.5, 1.4
-"""Of a person against one of average stature."""
+"""Relative standard deviations of lengths between people: common to all, per kind, per side."""
+_MIN_SCALE = 0.08
+"""Metres: shorter lengths have the standard deviation of this one, because of how sensors place their points."""
+_MIN_SIZE, _MAX_SIZE = 0.5, 1.4
+"""Bounds of a person's size relative to the average."""
 
 _MODEL: Final = UpperBody()
 _DEFAULT: Final = _MODEL.default_lengths()
 
 
 def proportions() -> FloatArray:
-    """(21, 21) square metres: how people differ in their lengths; left and right of one person hardly do."""
+    """(21, 21) square metres: covariance of lengths between people, with left and right of one person correlated."""
     kinds = [name.removesuffix("_left").removesuffix("_right") for name in LENGTHS]
     same = np.array([[a == b for b in kinds] for a in kinds])
     relative = _STATURE_SHARE**2 + _PROPORTION_SHARE**2 * same + _SIDE_SHARE**2 * np.eye(len(LENGTHS))
-    scale = np.maximum(_DEFAULT, _SHORTEST_SCALE)
+    scale = np.maximum(_DEFAULT, _MIN_SCALE)
     result: FloatArray = relative * np.outer(scale, scale)
     return result
 
 
 def _ends() -> dict[str, tuple[Joint, Joint]]:
-    """The two points between which each length shows; the model's hand tip and thumb hang on the wrist."""
+    """The two points whose distance measures each length; the model's hand tip and thumb are attached to the wrist."""
     found = {
         "lower_trunk": (Joint.SPINE_BASE, Joint.SPINE_MID),
         "upper_trunk": (Joint.SPINE_MID, Joint.SPINE_SHOULDER),
@@ -96,8 +96,8 @@ _POINT: Final = {Joint(joint): number for number, joint in enumerate(_MODEL.join
 _SIDES: Final = ("left", "right")
 
 
-def _products() -> tuple[tuple[str, ...], IntArray]:
-    """Names (k,) and points (4, k) a, b, c, d of the scalar products (b - a) . (d - c) that tell all lengths."""
+def _scalar_products() -> tuple[tuple[str, ...], IntArray]:
+    """Names (k,) and points (4, k) a, b, c, d of the scalar products (b - a) . (d - c) that determine lengths."""
     rows: dict[str, tuple[Joint, Joint, Joint, Joint]] = {}
     for name, (a, b) in _ENDS.items():
         if not name.startswith(("thumb_out", "hip_drop")):
@@ -114,12 +114,12 @@ def _products() -> tuple[tuple[str, ...], IntArray]:
     return tuple(rows), np.array([[_POINT[joint] for joint in row] for row in rows.values()], dtype=np.intp).T
 
 
-_PRODUCTS, _FACTORS = _products()
+_PRODUCTS, _FACTORS = _scalar_products()
 _COLUMN: Final = {name: number for number, name in enumerate(_PRODUCTS)}
 
 
 def _noise() -> FloatArray:
-    """(k, 19) by how much white noise of unit variance of each point raises each product."""
+    """(k, 19) bias of each product by white noise of unit variance of each point."""
     first, second = np.zeros((2, len(_PRODUCTS), len(_POINT)))
     rows = np.arange(len(_PRODUCTS))
     a, b, c, d = _FACTORS
@@ -131,7 +131,7 @@ def _noise() -> FloatArray:
     return result
 
 
-_RAISED: Final = _noise()
+_NOISE_GAIN: Final = _noise()
 _SHARES: Final = np.array(
     [[float(joint in _ENDS[name]) for joint in _POINT] for name in LENGTHS]  # (21, 19)
 )
@@ -145,11 +145,11 @@ _OTHER_SIDE: Final = np.array(
 )
 _NO_NOISE: Final = np.zeros(len(_POINT))
 _UNSEEN: Final = (INFERRED_FACTOR * BASE_STDDEV[_MODEL.joints]) ** 2
-"""(19,) square metres: what a point that was not seen in a frame counts for in the worth of its block."""
+"""(19,) square metres: variance of an unseen point in the weight of its block."""
 _FOLLOW_TIME = 1.0
-"""Seconds in which lengths that are told after every frame follow what the blocks say."""
+"""Seconds: time constant with which the published lengths follow the estimate."""
 _SKELETONS_MEMORY = 60
-"""Blocks: who takes the place of another person, unnoticed, has their own lengths after half of it."""
+"""Blocks: after an unnoticed change of person the lengths are the new person's after half of it."""
 
 
 def _lengths_of(products: FloatArray) -> FloatArray:
@@ -157,7 +157,7 @@ def _lengths_of(products: FloatArray) -> FloatArray:
     of = {name: products[..., column] for name, column in _COLUMN.items()}
 
     def root(square: FloatArray) -> FloatArray:
-        result: FloatArray = np.sqrt(np.maximum(square, _SHORTEST**2))
+        result: FloatArray = np.sqrt(np.maximum(square, _MIN_LENGTH**2))
         return result
 
     across = root(of["hips"])
@@ -166,10 +166,10 @@ def _lengths_of(products: FloatArray) -> FloatArray:
     for side in _SIDES:
         tip = root(of[f"hand_tip_{side}"])
         hand = root(of[f"hand_{side}"])
-        along = np.maximum(of[f"thumb_tip_{side}"] / tip, _SHORTEST)
-        width = np.maximum(of[f"hip_across_{side}"] / across, _SHORTEST)
+        along = np.maximum(of[f"thumb_tip_{side}"] / tip, _MIN_LENGTH)
+        width = np.maximum(of[f"hip_across_{side}"] / across, _MIN_LENGTH)
         found[f"hand_{side}"] = hand
-        found[f"hand_tip_{side}"] = np.maximum(tip - hand, _SHORTEST)
+        found[f"hand_tip_{side}"] = np.maximum(tip - hand, _MIN_LENGTH)
         found[f"thumb_along_{side}"] = along
         found[f"thumb_out_{side}"] = root(of[f"thumb_along_{side}"] - along**2)
         found[f"hip_width_{side}"] = width
@@ -179,7 +179,7 @@ def _lengths_of(products: FloatArray) -> FloatArray:
 
 
 _Frame = tuple[int, FloatArray, BoolArray, FloatArray]
-"""Stamp, points (19, 3), which of them count (19,), their variance by the measurement model (19,)."""
+"""Stamp, points (19, 3), mask of the used ones (19,), their variance by the measurement model (19,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,10 +188,10 @@ class _Block:
 
     Attributes:
         stamp_ns: of its first frame.
-        products: (k,) square metres, less what white noise adds; NaN where not seen.
+        products: (k,) square metres, without the bias by white noise; NaN where not seen.
         lengths: (21,) metres.
-        white: (21,) square metres: variance of the lengths by what its two interleaved halves do not share.
-        slow: (21,) square metres: variance of the lengths by slow errors, as it was stated.
+        white: (21,) square metres: variance of the lengths by the difference of two interleaved halves.
+        slow: (21,) square metres: stated variance of the lengths by slow errors.
         model: (19,) square metres: variance of the points by the measurement model.
     """
 
@@ -205,12 +205,12 @@ class _Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LengthEstimate:
-    """Lengths and what is known of them.
+    """Estimated lengths.
 
     Attributes:
         lengths: (21,) metres.
         covariance: (21, 21) square metres.
-        seen: (21,) which of them the points showed; the others are what these and the average person make likely.
+        seen: (21,) which of them were measured; the others follow from these and the prior.
     """
 
     lengths: FloatArray
@@ -220,11 +220,11 @@ class LengthEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentLengths:
-    """What was seen of a person's lengths so far; never written into.
+    """Measurements of a person's lengths; immutable.
 
     Attributes:
         persistence: seconds, the time constant of the autocorrelation of errors in a length.
-        memory: blocks that are kept; older ones are forgotten.
+        memory: number of the newest blocks that are kept.
         blocks: the finished blocks.
     """
 
@@ -233,7 +233,7 @@ class SegmentLengths:
     blocks: tuple[_Block, ...] = ()
     _gathered: dict[str, tuple[_Frame, ...]] = field(default_factory=dict)
 
-    def seen(
+    def with_frame(
         self,
         sensor: str,
         stamp_ns: int,
@@ -244,47 +244,42 @@ class SegmentLengths:
         slow: float = 0.0,
         stretch: float = 0.0,
     ) -> SegmentLengths:
-        """With one more frame; ``blocks`` is another one whenever a block is complete. Arrays are kept, not copied.
+        """With one more frame; ``blocks`` is a new object whenever a block is complete. Arrays are kept, not copied.
 
         Args:
-            sensor: whose frame it is.
-            stamp_ns: when it was captured.
+            sensor: name of the sensor.
+            stamp_ns: capture time.
             points: (19, 3) metres, the points of the model, in any frame.
-            tracked: (19,) which of them count.
+            tracked: (19,) which of them to use.
             white: (19,) square metres per axis, variance of their white noise.
-            model: (19,) square metres per axis, their variance by the measurement model, which blocks are weighed by.
-            slow: share of that which is known to be errors that last for seconds.
-            stretch: share of their length that upper arms and forearms are wrong by, beside that (standard deviation).
+            model: (19,) square metres per axis, their variance by the measurement model, for the weights of blocks.
+            slow: share of ``model`` that is due to errors that last for seconds.
+            stretch: additional relative standard deviation of the lengths of upper arms and forearms.
         """
         frames = self._gathered.get(sensor, ())
         blocks = self.blocks
-        longest = _BLOCK_NS if len(frames) >= _FEWEST_FRAMES else _LONGEST_NS
+        longest = _BLOCK_NS if len(frames) >= _MIN_FRAMES else _MAX_BLOCK_NS
         if frames and not 0 <= stamp_ns - frames[0][0] < longest:
-            if len(frames) >= _FEWEST_FRAMES:
+            if len(frames) >= _MIN_FRAMES:
                 blocks = (*blocks, _block(frames, white, slow, stretch))[-self.memory :]
             frames = ()
         frames = (*frames, (stamp_ns, points, tracked, model))
         return SegmentLengths(self.persistence, self.memory, blocks, {**self._gathered, sensor: frames})
 
-    def begun(self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0) -> SegmentLengths:
-        """With the frames of a sensor's unfinished block as one more block, for who cannot wait for it.
-
-        Args:
-            sensor: whose block it is.
-            white: see :meth:`seen`.
-            slow: see :meth:`seen`.
-            stretch: see :meth:`seen`.
-        """
+    def with_unfinished_block(
+        self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0
+    ) -> SegmentLengths:
+        """With the frames of a sensor's unfinished block as one more block; arguments as of :meth:`with_frame`."""
         frames = self._gathered.get(sensor, ())
         if not frames:
             return self
-        # the first few, again and again: what they differ by among themselves is all that is known of their noise
-        frames *= -(-_FEWEST_FRAMES // len(frames))
+        # too few frames are repeated: both halves of a block need two
+        frames *= -(-_MIN_FRAMES // len(frames))
         blocks = (*self.blocks, _block(frames, white, slow, stretch))[-self.memory :]
         return SegmentLengths(self.persistence, self.memory, blocks, self._gathered)
 
     def estimate(self) -> LengthEstimate:
-        """All that is known; an average person where nothing was seen."""
+        """The lengths by all blocks and the prior."""
         prior = proportions()
         if not self.blocks:
             return LengthEstimate(_DEFAULT, prior, np.zeros(len(LENGTHS), dtype=np.bool_))
@@ -293,28 +288,28 @@ class SegmentLengths:
         seen = np.isfinite(lengths)
         count = np.maximum(seen.sum(axis=0), 1)
         model = np.stack([block.model for block in self.blocks])
-        worth, total = _worth(1.0 / (model @ _SHARES.T), seen)
+        weights, total = _weights(1.0 / (model @ _SHARES.T), seen)
         white = np.stack([block.white for block in self.blocks])
         whiteness = np.nansum(white, axis=0) / count
-        stated = (worth * [block.slow for block in self.blocks]).sum(axis=0) / count
-        centre, off = _location(lengths, worth, np.sqrt(whiteness + stated))
-        worth_of_products, _ = _worth(1.0 / (model @ _INVOLVED.T), np.isfinite(products))
-        middle = _lengths_of(_location(products, worth_of_products, np.zeros(products.shape[1]))[0])
+        stated = (weights * [block.slow for block in self.blocks]).sum(axis=0) / count
+        centre, off = _location(lengths, weights, np.sqrt(whiteness + stated))
+        product_weights, _ = _weights(1.0 / (model @ _INVOLVED.T), np.isfinite(products))
+        middle = _lengths_of(_location(products, product_weights, np.zeros(products.shape[1]))[0])
         known = np.isfinite(centre) & np.isfinite(middle)
         if not known.any():
             return LengthEstimate(_DEFAULT, prior, known)
-        # variance of a block that is worth as much as one on average
-        spread = (worth * off**2).sum(axis=0) / np.maximum(count - 1, 1)
+        # variance of a block of average weight
+        spread = (weights * off**2).sum(axis=0) / np.maximum(count - 1, 1)
         excess = np.maximum(spread - whiteness, 0.0)
-        slow = (_OWN_WEIGHT * stated + (count - 1.0) * excess) / (_OWN_WEIGHT + count - 1.0)
-        # the variance of a mean of blocks whose errors are as alike as they are close in time
+        slow = (_PRIOR_BLOCKS * stated + (count - 1.0) * excess) / (_PRIOR_BLOCKS + count - 1.0)
+        # the variance of a mean of blocks whose errors are correlated over time
         stamps = np.array([block.stamp_ns for block in self.blocks]) / NANOSECONDS
         alike = np.exp(-np.abs(stamps[:, None] - stamps) / self.persistence)
-        roots = np.sqrt(worth)
+        roots = np.sqrt(weights)
         from_slow = slow * ((alike @ roots) * roots).sum(axis=0)
-        from_white = (worth**2 * np.where(seen, whiteness, 0.0)).sum(axis=0)
-        variance = (from_white + from_slow) / np.maximum(total, 1e-12) ** 2 / _EFFICIENCY + _SUREST**2
-        size = np.clip(np.median(middle[known] / _DEFAULT[known]), _LEAST_SIZE, _GREATEST_SIZE)
+        from_white = (weights**2 * np.where(seen, whiteness, 0.0)).sum(axis=0)
+        variance = (from_white + from_slow) / np.maximum(total, 1e-12) ** 2 / _EFFICIENCY + _MIN_STDDEV**2
+        size = np.clip(np.median(middle[known] / _DEFAULT[known]), _MIN_SIZE, _MAX_SIZE)
         mean = size * _DEFAULT
         rows = np.flatnonzero(known)
         gain = np.linalg.solve(prior[np.ix_(rows, rows)] + np.diag(variance[rows]), prior[rows]).T
@@ -323,14 +318,14 @@ class SegmentLengths:
 
 
 class SkeletonLengths:
-    """The lengths that the filtered skeletons of one person show, from the first frame on and after every one.
+    """The lengths of one person by filtered skeletons, from the first frame on.
 
-    Before a first block is complete, the frames so far are one. Every block can move a length by centimetres, and a
-    pose that is fitted with it by degrees: the lengths go there gradually. The points count as free of white noise,
-    which a filter has taken away, and no slow errors are stated: what was seen outweighs the average person.
+    Until the first block is complete, the frames so far are one. The lengths follow the estimate gradually, because a
+    block can change one by centimetres, and a pose that is fitted with it by degrees. Points count as free of white
+    noise, which the filter has removed, and of slow errors, so that measurements outweigh the prior.
 
     Attributes:
-        lengths: (21,) metres; those that were never seen are the other side's, or in proportion to the others.
+        lengths: (21,) metres; unseen ones are the other side's, or in proportion to the others.
         stddev: (21,) metres; infinity where never seen.
     """
 
@@ -346,27 +341,27 @@ class SkeletonLengths:
         self.stddev: FloatArray = np.full(len(LENGTHS), np.inf)
 
     def update(self, stamp_ns: int, points: FloatArray, variance: FloatArray) -> None:
-        """Take one frame.
+        """Update with one frame.
 
         Args:
-            stamp_ns: when it was captured.
+            stamp_ns: capture time.
             points: (19, 3) metres, the points of the model, in any frame; NaN where not known.
             variance: (19,) square metres per axis, of the points; infinity where not known.
         """
         known: BoolArray = np.isfinite(points).all(axis=1) & np.isfinite(variance)
         model = np.where(known, variance, _UNSEEN)
         before = self._seen.blocks
-        self._seen = self._seen.seen("", stamp_ns, points, known, _NO_NOISE, model)
+        self._seen = self._seen.with_frame("", stamp_ns, points, known, _NO_NOISE, model)
         if self._seen.blocks is not before:
-            self._take(self._seen.estimate())
+            self._use(self._seen.estimate())
         elif not before:
-            self._take(self._seen.begun("", _NO_NOISE).estimate())
+            self._use(self._seen.with_unfinished_block("", _NO_NOISE).estimate())
         elapsed = abs(stamp_ns - self._stamp_ns) / NANOSECONDS
         self._frames, self._stamp_ns = self._frames + 1, stamp_ns
         share = max(1.0 / self._frames, 1.0 - float(np.exp(-elapsed / _FOLLOW_TIME)))
         self.lengths = self.lengths + share * (self._target - self.lengths)
 
-    def _take(self, estimate: LengthEstimate) -> None:
+    def _use(self, estimate: LengthEstimate) -> None:
         seen = estimate.seen
         from_other = ~seen & seen[_OTHER_SIDE]
         self._target = np.where(from_other, estimate.lengths[_OTHER_SIDE], estimate.lengths)
@@ -374,7 +369,7 @@ class SkeletonLengths:
 
 
 def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: float) -> _Block:
-    """What some frames say; see :meth:`SegmentLengths.seen` for the rest."""
+    """The block of some frames; see :meth:`SegmentLengths.with_frame` for the other arguments."""
     stamps, positions, counted, variances = zip(*frames, strict=True)
     points = np.where(np.stack(counted)[:, :, None], np.stack(positions), np.nan)
     model = np.mean(variances, axis=0)
@@ -382,14 +377,16 @@ def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: 
     products = ((points[:, b] - points[:, a]) * (points[:, d] - points[:, c])).sum(axis=-1)
     with np.errstate(invalid="ignore"):
         middle = _nanmedian(products)
-        scale = np.maximum(_NORMAL * _nanmedian(np.abs(products - middle)), _SUREST**2)  # rounding is no outlier
-        products = np.where(np.abs(products - middle) <= _FAR * scale, products, np.nan)
-    raised = _RAISED @ white
-    whole, even, odd = (_lengths_of(_nanmean(part) - raised) for part in (products, products[::2], products[1::2]))
+        scale = np.maximum(
+            _MAD_TO_STDDEV * _nanmedian(np.abs(products - middle)), _MIN_STDDEV**2
+        )  # rounding is no outlier
+        products = np.where(np.abs(products - middle) <= _OUTLIER * scale, products, np.nan)
+    noise = _NOISE_GAIN @ white
+    whole, even, odd = (_lengths_of(_nanmean(part) - noise) for part in (products, products[::2], products[1::2]))
     seen = np.isfinite(even) & np.isfinite(odd)
     return _Block(
         stamps[0],
-        _nanmean(products) - raised,
+        _nanmean(products) - noise,
         np.where(seen, whole, np.nan),
         np.where(seen, 0.25 * (even - odd) ** 2, np.nan),
         slow * (_SHARES @ model) + _LIMB * (stretch * _DEFAULT) ** 2,
@@ -398,7 +395,7 @@ def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: 
 
 
 def _nanmean(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, where at most one value is there."""
+    """Over the first dimension; NaN, without a warning, for fewer than two values."""
     there = np.isfinite(values)
     count = there.sum(axis=0)
     total = np.where(there, values, 0.0).sum(axis=0)
@@ -406,7 +403,7 @@ def _nanmean(values: FloatArray) -> FloatArray:
 
 
 def _nanmedian(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, where no value is there."""
+    """Over the first dimension; NaN, without a warning, where there is no value."""
     ordered = np.sort(values, axis=0)  # NaN comes last
     count = np.isfinite(values).sum(axis=0)
     columns = np.arange(values.shape[1])
@@ -415,34 +412,34 @@ def _nanmedian(values: FloatArray) -> FloatArray:
     return result
 
 
-def _worth(worth: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _weights(weights: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Weights (n, m), 1 on average and 0 where not seen, and their sums (m,)."""
-    worth = np.where(seen, worth, 0.0)
-    total = worth.sum(axis=0)
+    weights = np.where(seen, weights, 0.0)
+    total = weights.sum(axis=0)
     count = seen.sum(axis=0)
-    return worth * count / np.where(count > 0, total, 1.0), count.astype(float)
+    return weights * count / np.where(count > 0, total, 1.0), count.astype(float)
 
 
-def _location(values: FloatArray, worth: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Huber's estimate of location (m,) of values (n, m), NaN where missing, and how far (n, m) these are from it.
+def _location(values: FloatArray, weights: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Huber's estimate of location (m,) of values (n, m), NaN where missing, and the residuals (n, m).
 
-    What is missing is not far, and nothing farther than some times the scale.
+    Residuals of missing values are 0, and the others are clipped at :data:`_OUTLIER` times the scale.
 
     Args:
         values: one row per block.
-        worth: (n, m) inverse variances, 1 on average.
-        least: (m,) scale that a value of average worth has at least.
+        weights: (n, m) inverse variances, 1 on average.
+        least: (m,) lower bound of the scale of a value of average weight.
     """
     there = np.isfinite(values)
     filled = np.where(there, values, 0.0)
-    root = np.sqrt(worth)
+    root = np.sqrt(weights)
     centre = _nanmedian(values)
     distance = np.where(there, root * np.abs(filled - centre), np.nan)
-    scale = np.maximum(np.maximum(_NORMAL * _nanmedian(distance), least), 1e-12)
+    scale = np.maximum(np.maximum(_MAD_TO_STDDEV * _nanmedian(distance), least), 1e-12)
     for _ in range(_ITERATIONS):
         far = root * np.abs(filled - centre)
-        weight = worth * np.minimum(1.0, _HUBER * scale / np.maximum(far, 1e-15))
+        weight = weights * np.minimum(1.0, _HUBER * scale / np.maximum(far, 1e-15))
         total = weight.sum(axis=0)
         centre = np.where(total > 0.0, (weight * filled).sum(axis=0) / np.where(total > 0.0, total, 1.0), np.nan)
-    bound = _FAR * scale / np.where(there, np.maximum(root, 1e-12), 1.0)
+    bound = _OUTLIER * scale / np.where(there, np.maximum(root, 1e-12), 1.0)
     return centre, np.where(there, np.clip(filled - centre, -bound, bound), 0.0)

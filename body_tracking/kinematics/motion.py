@@ -1,8 +1,7 @@
-"""How people move: the one place for what is assumed of it.
+"""Model of human movement: white acceleration of a joint, of a spectral density ``q`` per axis (m2/s3).
 
-A joint's acceleration is taken for white noise of a spectral density ``q`` per axis (m2/s3). A movement whose
-acceleration has the standard deviation ``a`` and stays correlated for ``tau`` seconds looks, to anything slower than
-``tau``, like ``q = 2 a^2 tau``.
+An acceleration of the standard deviation ``a`` that is correlated over ``tau`` seconds is, at time scales above
+``tau``, equivalent to ``q = 2 a^2 tau``.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ ACCELERATION_DENSITIES: tuple[float, float, float] = (0.5, 2.0, 6.0)
 """m2/s3 for the three classes.
 
 Trunk 1 m/s2 over 0.25 s, elbows and knees 3 m/s2 over 0.11 s, hands 5 m/s2 over 0.12 s per axis: brisk gestures and
-walking. A hand that is flung at 50 m/s2 leaves the prediction of the next frame by 28 mm, which no gate rejects.
+walking. A hand with 50 m/s2 has an innovation of 28 mm in the next frame, which no gate rejects.
 """
 
 

@@ -30,16 +30,16 @@ The signed angles are cut at +-180 deg, where no joint of a person can be (such 
 the other shoulder); within a person's range of motion they are continuous, but for the singularities below.
 
 Uncertainty: first order in the joint covariances, joints independent of each other. Where an angle is the length of a
-deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which the first order does
-not see. A plane of elevation with the arm at the side and the rotation of a straight or vertical arm turn about an axis
-that the positions do not show: the standard deviation grows like 1/sin, and is infinity where the deflection that gives
-the direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own standard deviations, which
+deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which is of second order. A
+plane of elevation with the arm at the side and the rotation of a straight or vertical arm are about an axis that the
+positions do not determine: the standard deviation grows like 1/sin, and is infinity where the deflection that gives the
+direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own standard deviations, which
 noise alone exceeds once in a thousand frames.
 
-Velocities are the Jacobian times the joint velocities. A skeleton brings no covariance of its velocities; the stated
-deviation rests on a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman
-filter in its steady state is (2 q^2 p)^(1/3) with p its position variance, and (3 q^2 p)^(1/3) after a long prediction
-without measurements; so the second is taken, with the densities of human movement in ``kinematics.motion``.
+Velocities are the Jacobian times the joint velocities. A skeleton has no covariance of its velocities; the stated
+deviation is a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman filter in
+its steady state is (2 q^2 p)^(1/3) with p its position variance, and (3 q^2 p)^(1/3) after a long prediction without
+measurements; the bound is the second, with the densities of human movement in ``kinematics.motion``.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
         velocities every velocity is NaN.
     """
     n = _N_ANGLES
-    with np.errstate(all="ignore"):  # NaN and infinity are values here: they say that something is not known
+    with np.errstate(all="ignore"):  # NaN and infinity mark unknown values
         positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
         angles, jacobian, sine, singular = _angles_and_jacobian(positions)
         unknown = np.isnan(angles)

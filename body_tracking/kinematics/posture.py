@@ -1,16 +1,16 @@
-"""How people hold themselves: what is known of a pose before anything is measured.
+"""Prior distribution of a person's pose.
 
-Points cannot tell how a bend divides between pelvis, lumbar and thoracic joints: the base of the spine and the hips lie
-on one line, and the middle of the spine is seen through clothes. Posture tells it. An upright person is upright in all
-of these joints, and who bends forward does so in all of them, in proportion to their variances.
+Points do not determine how a bend divides between pelvis, lumbar and thoracic joints: the base of the spine and the
+hips lie on one line, and the middle of the spine is seen through clothes. The prior divides it: all of these joints are
+upright in an upright person, and a forward bend is shared in proportion to their variances.
 
-Zero is the neutral standing pose of ``upper_body``. The deviations are of moving people, and are rounded: publications
-give their order of magnitude, and those marked * were then adjusted (by at most a factor of 1.5) on the three shipped
-recordings, which are simulated. So no figure over these recordings is evidence for them; people nobody tuned on are.
+Zero is the neutral standing pose of ``upper_body``. The standard deviations are of moving people, and are rounded:
+publications give their order of magnitude, and those marked * were then adjusted (by at most a factor of 1.5) on the
+three shipped recordings, which are simulated. Figures over these recordings are therefore no evidence for them.
 
 - pelvic tilt*, lumbar and thoracic flexion*: between standing people pelvic tilt has a deviation of 7 deg (Mac-Thiong
-  et al., Eur. Spine J. 20 Suppl. 5 (2011) 572, 709 people); who bends forward bends the lumbar spine twice as much
-  as the hips at first, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
+  et al., Eur. Spine J. 20 Suppl. 5 (2011) 572, 709 people); a forward bend is at first twice as large in the lumbar
+  spine as in the hips, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
 - the others: a share of the range to one side in :mod:`body_tracking.kinematics.ranges`, whose sources stand there; a
   third for lateral bending* and the neck, half for axial rotation, a quarter for the clavicle
 """
@@ -42,7 +42,7 @@ STDDEV: dict[str, float] = {
 """Degrees about zero."""
 
 TILT_STDDEV = (10.0, 6.0)
-"""Degrees by which the pelvis leans forward or back, and to a side, against gravity."""
+"""Degrees: tilt of the pelvis against gravity, forward and sideways."""
 
 _VERTICAL = 1e-9
 """Horizontal part of the left-right axis of a pelvis that lies on its side."""
@@ -50,10 +50,10 @@ _VERTICAL = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tilt:
-    """How far the pelvis leans.
+    """Tilt of the pelvis against gravity.
 
     Attributes:
-        values: (2,) sines of the lean forward and to the left.
+        values: (2,) sines of the tilt forward and to the left.
         gradients: (2, 32) by the tangent.
     """
 
@@ -63,7 +63,7 @@ class Tilt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """What the prior is about at one configuration: 26 coordinates, the twist's sharing, and the pelvis's tilt.
+    """The prior's residuals at one configuration: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
 
     Attributes:
         coordinates: (26,) radians, of ``SoftCoordinates``.
@@ -77,23 +77,22 @@ class Rows:
 
 
 class PosturePrior:
-    """The mean and the deviation of each coordinate of ``upper_body`` after the base.
+    """Mean and standard deviation of each coordinate of ``upper_body`` after the base.
 
-    What posture does not tell, arms but for the clavicles, has the centre of its range of motion and a deviation of a
-    third of half of it.
+    Coordinates that are not in :data:`STDDEV` have the centre of their range of motion, and a sixth of its width.
 
     Attributes:
         mean, stddev: (26,) radians, of ``SoftCoordinates``.
-        postural: (26,) which of them posture tells.
+        postural: (26,) which of them are in :data:`STDDEV`.
         tilt_stddev: (2,) radians, of :class:`Tilt`.
     """
 
     def __init__(self, model: UpperBody, ranges: Ranges) -> None:
         names = [name.removesuffix("_left").removesuffix("_right") for name in model.coordinate_names[6:]]
         self.postural: BoolArray = np.array([name in STDDEV for name in names])
-        told = np.radians([STDDEV.get(name, 0.0) for name in names])
+        postural = np.radians([STDDEV.get(name, 0.0) for name in names])
         self.mean: FloatArray = np.where(self.postural, 0.0, ranges.centre)
-        self.stddev: FloatArray = np.where(self.postural, told, ranges.stddev)
+        self.stddev: FloatArray = np.where(self.postural, postural, ranges.stddev)
         self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
         self._ranges = ranges
 
@@ -114,31 +113,27 @@ class PosturePrior:
 
     @staticmethod
     def tilt_of(rotation: FloatArray) -> FloatArray:
-        """(..., 2) sines of the lean of a pelvis forward and to the left, of its rotations (..., 3, 3)."""
-        ways = _ways(rotation)
-        values: FloatArray = (ways @ rotation[..., :, 2:])[..., 0]
+        """(..., 2) sines of the tilt of a pelvis forward and to the left, of its rotations (..., 3, 3)."""
+        axes = _horizontal_axes(rotation)
+        values: FloatArray = (axes @ rotation[..., :, 2:])[..., 0]
         return values
 
     @staticmethod
     def tilt(lines: Linearisation) -> Tilt:
-        """The lean of the pelvis at one configuration, with its derivative.
-
-        Args:
-            lines: of the model there.
-        """
+        """The tilt of the pelvis at one configuration, with its derivative."""
         rotation, turning = lines.posture.rotations[0], lines.rotation_jacobian[0]
-        ways = _ways(rotation)
-        forward, left = ways @ rotation[:, 2]
-        gradients: FloatArray = ways @ so3.skew(-rotation[:, 2]) @ turning
-        # both ways turn with the heading
+        axes = _horizontal_axes(rotation)
+        forward, left = axes @ rotation[:, 2]
+        gradients: FloatArray = axes @ so3.skew(-rotation[:, 2]) @ turning
+        # both axes turn with the heading
         size = max(float(np.hypot(rotation[0, 1], rotation[1, 1])), _VERTICAL)
-        heading = (-ways[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
+        heading = (-axes[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
         gradients += np.outer([left, -forward], heading)
         return Tilt(np.array([forward, left]), gradients)
 
 
-def _ways(rotation: FloatArray) -> FloatArray:
-    """(..., 2, 3) horizontal unit vectors: where a pelvis of rotation (..., 3, 3) faces, and to its left."""
+def _horizontal_axes(rotation: FloatArray) -> FloatArray:
+    """(..., 2, 3) horizontal unit vectors forward and to the left of a pelvis of rotation (..., 3, 3)."""
     x, y = rotation[..., 0, 1], rotation[..., 1, 1]
     size = np.maximum(np.hypot(x, y), _VERTICAL)
     x, y, zero = x / size, y / size, np.zeros_like(x)

@@ -1,8 +1,8 @@
-"""Ranges of motion: soft limits of the angles of ``upper_body``, and what is known of an angle that nothing observes.
+"""Ranges of motion: soft limits of the angles of ``upper_body``, and the prior of an unobserved angle.
 
-A range is no wall: people differ, and the frames of a sensor's skeleton are not those of a goniometer. Limits push back
-softly where an estimate leaves them. And an angle of which only its range is known is taken for a normal one about the
-range's centre, with the limits at three standard deviations: people are seldom near their limits.
+The limits are soft, because people differ, and the frames of a sensor's skeleton are not those of a goniometer. The
+prior of an angle is normal about the centre of its range, with the limits at three standard deviations: people are
+seldom near their limits.
 
 Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
 motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
@@ -40,17 +40,17 @@ RANGES: dict[str, tuple[float, float]] = {
 """Degrees: (least, greatest) of each joint angle, of either side; a Kinect's hand point makes the wrist's wider."""
 
 SHOULDER_SWING = 130.0
-"""Degrees by which an upper arm may point away from the centre of its reach."""
+"""Degrees: largest angle between an upper arm and the centre of its reach."""
 SHOULDER_TWIST = 110.0
-"""Degrees by which it may be turned about itself against the shortest way there, to either side."""
+"""Degrees: largest rotation of an upper arm about itself, against the shortest rotation from the centre."""
 RANGE_DEVIATIONS = 3.0
 """Standard deviations from the centre of a range to its limits."""
 TWIST_SHARING_STDDEV = 30.0
-"""Degrees by which the lumbar part of a twist departs from its share by the ranges. Weak: nothing separates the two."""
+"""Degrees: deviation of the lumbar part of a twist from its share by the ranges. Weak: only the sum is observed."""
 
 _REACH = {"left": np.array([np.sin(np.pi / 4), np.cos(np.pi / 4), 0.0])}
 _REACH["right"] = _REACH["left"] * [1.0, -1.0, 1.0]
-"""Where the centre of the reach is, in the clavicle's frame: horizontally, half forward and half to the side."""
+"""Centre of the reach in the clavicle's frame: horizontal, 45 degrees between forward and sideways."""
 
 
 _HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
@@ -59,7 +59,7 @@ _HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """Where configuration and tangent hold the angles of one arm."""
+    """Indices of one arm's angles in configuration and tangent."""
 
     elbow_q: int
     elbow_v: int
@@ -69,7 +69,7 @@ class _Arm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftCoordinates:
-    """The quantities that ranges are about, at one configuration.
+    """The bounded quantities at one configuration.
 
     Attributes:
         values: (..., 26) radians: the tangent's coordinates after the base; for a shoulder the rotation vector from the
@@ -86,9 +86,9 @@ class Ranges:
 
     Attributes:
         low, high: (26,) radians, of :class:`SoftCoordinates`.
-        centre, stddev: (26,) radians: what is known of a coordinate by its range.
-        coordinates: the slice of the tangent vector that they are about.
-        twist: (26,) how far lumbar and thoracic axial rotation depart from sharing a twist by their ranges.
+        centre, stddev: (26,) radians: prior of each coordinate by its range.
+        coordinates: their slice of the tangent vector.
+        twist: (26,) coefficients of the difference from sharing a twist between lumbar and thoracic joints by range.
     """
 
     def __init__(self, model: UpperBody) -> None:
@@ -164,8 +164,8 @@ class Ranges:
         """
         return self.excess_of(self.values(q))
 
-    def surely_within(self, q: FloatArray, margin: float) -> bool:
-        """Whether a configuration (nq,) is quickly seen to leave no range by more than a margin, radians."""
+    def certainly_within(self, q: FloatArray, margin: float) -> bool:
+        """Sufficient condition that a configuration (nq,) leaves no range by more than a margin, radians."""
         angles = q[self._model.scalar_q]
         outside = np.abs(angles - self._scalar_middle) > self._scalar_reach + margin
         if outside.any():
@@ -201,10 +201,10 @@ class Ranges:
         return clipped
 
     def nearest_branch(self, q: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """The same posture told by angles that leave the ranges less.
+        """The same posture by angles that leave the ranges less.
 
         An upper arm turned by half a turn about itself, the elbow bent the other way and the forearm turned by half a
-        turn put everything where it was. A fit to points can come out in either branch; the ranges tell them apart.
+        turn are the same posture. A fit to points can converge to either branch; the ranges distinguish them.
 
         Args:
             q: (nq,) one configuration.

@@ -1,9 +1,9 @@
 """The thesis's upper body: 26 angles, Denavit-Hartenberg tables, a fixed base (Schlagenhauf 2017, chapter 3).
 
-Tables 3.1 and 3.2 to the letter, with what is odd in them: the names of the torso's angles in table 3.4 do not fit
-their axes, and theta15 and theta16 (right: theta22 and theta23) turn about the same axis, so that "elbow pronation" is
-humeral rotation once more. At theta = 0, the T-pose, the angles turn about these axes of the base frame (x to the
-subject's left, y backward, z up):
+Exactly tables 3.1 and 3.2, with two oddities: the names of the torso's angles in table 3.4 do not fit their axes, and
+theta15 and theta16 (right: theta22 and theta23) have the same axis, so that "elbow pronation" is a second humeral
+rotation. At theta = 0, the T-pose, the angles turn about these axes of the base frame (x to the subject's left, y
+backward, z up):
 
 =========================  ===========================================================================================
 theta1, theta2, theta3     lower trunk about SpineBase: +z (turns left), +x (leans forward), +y (leans left)

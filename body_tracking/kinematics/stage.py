@@ -38,10 +38,10 @@ ANGLES = (
 
 
 _AWAY_S = 1.0
-"""Of somebody who is away from the frames for this long, seconds, nothing is kept with several people."""
+"""With several people, a person's state is reset after an absence of this long, seconds."""
 _UNPAIRED = 1000
-"""States and covariances of a person that may wait for each other: as many as reliable topics keep, because a message
-that was lost and is sent again comes late."""
+"""Largest number of a person's states and covariances that wait for each other: the depth of reliable topics, because
+a resent message comes late."""
 
 
 def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[str, AngleStream]:
@@ -53,7 +53,7 @@ def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[
         people: whom to track.
 
     Raises:
-        ConventionError: another one.
+        ConventionError: unknown convention.
     """
     if people.subject != ALL:
         return {body: AngleStream(convention)}
@@ -83,7 +83,7 @@ class AnglesStage(Stage):
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
-        # which input the filter publishes: settled, and at the last look
+        # which input the filter publishes: confirmed, and at the last check
         self._published = self._seen = ""
         self._unpaired = 0
         # of each person, state and covariance by stamp, in the order of arrival
@@ -110,7 +110,7 @@ class AnglesStage(Stage):
         asked = str(values["convention"])
         known = self._published if values["input"] == graph.AUTO else str(values["input"])
         convention, source = graph.angles_for(asked, known or graph.SKELETON_INPUT)
-        # Not before it is known what to take: angles of another convention than all later ones could come.
+        # No input before the source is known: the first angles could be of another convention than the later ones.
         self.source = source if known or asked == graph.POSITIONAL else ""
         people = people_from(values)
         self._several = people.subject == ALL
@@ -140,15 +140,12 @@ class AnglesStage(Stage):
         return graph.model_topics(next(iter(self.streams)), self._several).covariance
 
     def look(self, published: Callable[[str], bool]) -> bool:
-        """Follow the filter to what it publishes, once that is the same at two looks: topics are found one by one.
+        """Subscribe to what the filter publishes, once two checks agree: topics are discovered one by one.
 
-        While no filter is there, as when it is started again, nothing changes.
+        Nothing changes while there is no filter, as during its restart.
         """
-        before, self._seen = self._seen, ""
-        for source, topic in ((graph.MODEL_INPUT, self._covariance), (graph.SKELETON_INPUT, graph.FILTERED)):
-            if published(topic):
-                self._seen = source
-                break
+        before, inputs = self._seen, ((graph.MODEL_INPUT, self._covariance), (graph.SKELETON_INPUT, graph.FILTERED))
+        self._seen = next((source for source, topic in inputs if published(topic)), "")
         if self._seen != before or self._seen in ("", self._published):
             return False
         self._published = self._seen
@@ -167,7 +164,7 @@ class AnglesStage(Stage):
         return [output for body, each in angles if each is not None for output in _published(body, each)]
 
     def _pair(self, body: str, stamp_ns: int, part: str, value: Any) -> Iterable[Output]:
-        """Compute once both are there; what came before and is not complete will never be."""
+        """Compute once state and covariance are there; older unpaired ones are dropped."""
         waiting, stream = self._waiting[body], self.streams[body]
         found = waiting.setdefault(stamp_ns, {})
         found[part] = value
@@ -189,7 +186,7 @@ class AnglesStage(Stage):
             waiting.clear()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """The convention, and what fits say of themselves."""
+        """The convention, and the counters of the fits."""
         fits: Counter[str] = Counter()
         for stream in self.streams.values():
             fits.update(stream.fit.counters)

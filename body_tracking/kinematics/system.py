@@ -31,7 +31,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     from body_tracking.pipeline.roles import role_of
 
     role = role_of(options)
-    # What nobody asked for is left to joint_angles, which follows the filter while that changes.
+    # Options that were not given are left to joint_angles, which follows the filter while that changes.
     angles: dict[str, Value] = asked(options, input="angles_input", subject="subject", people="people")
     if options["convention"] not in ("", graph.AUTO) or graph.convention_of(role.angles_input) != role.convention:
         angles["convention"] = role.convention

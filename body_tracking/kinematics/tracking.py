@@ -1,7 +1,7 @@
-"""A body model that follows a person frame by frame, where no filter of its own estimates it.
+"""The body model frame by frame, for filters that do not estimate it.
 
-:class:`SkeletonFit` fits ``upper_body`` to filtered joint positions; :class:`AngleStream` makes joint angles of what a
-node receives, in any convention; :class:`LengthChanges` tells when a person's lengths are news.
+:class:`SkeletonFit` fits ``upper_body`` to filtered joint positions; :class:`AngleStream` computes joint angles in any
+convention; :class:`LengthChanges` decides when to publish segment lengths.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ def angle_names(name: str) -> tuple[str, ...]:
     """The angles of one of ``ALL_CONVENTIONS``, in order.
 
     Raises:
-        ConventionError: another one.
+        ConventionError: unknown convention.
     """
     return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
 
 
 _GAP_NS = NANOSECONDS // 2
-"""After longer than this the last pose is no better a start than none."""
-_POOR = 4.0
-"""Cost per measured coordinate, where 0.5 is expected, from which the fit is tried once more from the beginning."""
+"""Age from which the last pose is not used as a start."""
+_POOR_FIT = 4.0
+"""Cost per measured coordinate, where 0.5 is expected, from which the fit is repeated without a start."""
 _STEPS, _TOLERANCE = 4, 2e-3
-"""Of a fit that starts from the frame before: at most so many steps, until one is smaller than this, rad and m."""
-_GREATEST_RATE = 10.0
-"""rad/s and m/s: standard deviation of a rate of which nothing is known."""
+"""Largest number of steps of a fit that starts from the frame before, and the step size that ends it, rad and m."""
+_MAX_RATE = 10.0
+"""rad/s and m/s: prior standard deviation of a rate."""
 _TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
 
 
 class SkeletonFit:
     """Inverse kinematics of one frame after the other, each started from the one before.
 
-    The velocity is the one whose points move as the skeleton says (least squares); the deviations of the points'
-    velocities are the bounds of :mod:`body_tracking.kinematics.positional`.
+    The velocity is the least squares fit to the skeleton's velocities, whose standard deviations are the bounds of
+    :mod:`body_tracking.kinematics.positional`.
 
     Attributes:
         model: the body.
         lengths: the person's, from the frames so far.
-        counters: what happened since the construction, for diagnostics.
+        counters: event counts since the construction, for diagnostics.
     """
 
     def __init__(self, model: UpperBody | None = None) -> None:
@@ -82,8 +82,8 @@ class SkeletonFit:
             skeleton: in a frame with z up, with covariances; usually ``/filtered/skeleton``.
 
         Returns:
-            The estimate; the covariance knows of no tie between coordinates and rates, and without velocities in the
-            skeleton the rates are NaN with an infinite variance. None where no trunk is seen.
+            The estimate, without covariance between coordinates and rates; without velocities in the skeleton the rates
+            are NaN with an infinite variance. None where no trunk is seen.
         """
         if self._last is not None and not 0 <= skeleton.stamp_ns - self._last.stamp_ns <= _GAP_NS:
             self._last = None
@@ -114,7 +114,7 @@ class SkeletonFit:
         return self._last
 
     def _variance(self, skeleton: Skeleton) -> FloatArray:
-        """(19,) square metres per axis; infinity where the skeleton states none that makes sense."""
+        """(19,) square metres per axis; infinity where the skeleton has no positive one."""
         if skeleton.covariances is None:
             return np.full(len(self.model.joints), np.inf)
         diagonal = skeleton.covariances[self.model.joints].diagonal(axis1=1, axis2=2)
@@ -131,7 +131,7 @@ class SkeletonFit:
             moved = np.where(np.isfinite(self._last.velocity), elapsed * self._last.velocity, 0.0)
             start = self.model.integrate(self._last.q, moved)
             fit = self._inverse.solve(positions, stddev, lengths, start, max_iterations=_STEPS, tolerance=_TOLERANCE)
-            if fit.cost > _POOR * 3.0 * np.count_nonzero(measured):
+            if fit.cost > _POOR_FIT * 3.0 * np.count_nonzero(measured):
                 self.counters["poor fits"] += 1
                 anew = self._inverse.solve(positions, stddev, lengths)
                 fit = anew if anew.cost < fit.cost else fit
@@ -153,7 +153,7 @@ class SkeletonFit:
         jacobian = self.model.linearise(q, self.lengths.lengths).jacobian.reshape(-1, nv)
         weighted = jacobian * weights[:, None]
         information = weighted.T @ jacobian
-        information[np.arange(nv), np.arange(nv)] += _GREATEST_RATE**-2
+        information[np.arange(nv), np.arange(nv)] += _MAX_RATE**-2
         covariance = np.linalg.inv(information).astype(np.float64)
         velocity = covariance @ (weighted.T @ np.where(known[:, None], velocities, 0.0).reshape(-1))
         return velocity, covariance
@@ -164,14 +164,10 @@ class AngleStream:
 
     Args:
         convention: one of ``ALL_CONVENTIONS``.
-        forget_after: seconds without the person after which the next frame is of somebody else.
-
-    Attributes:
-        model: the body.
-        fit: what follows skeletons.
+        forget_after: seconds without the person after which the next frame is of another one.
 
     Raises:
-        ConventionError: another one.
+        ConventionError: unknown convention.
     """
 
     def __init__(self, convention: str, forget_after: float = math.inf) -> None:
@@ -192,7 +188,7 @@ class AngleStream:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
         if self.convention == POSITIONAL:
             return positional_angles(skeleton)
-        self._forget_who_is_gone(skeleton.stamp_ns)
+        self._reset_after_gap(skeleton.stamp_ns)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)
 
@@ -202,22 +198,22 @@ class AngleStream:
         Raises:
             ConventionError: the convention is made of positions.
         """
-        self._forget_who_is_gone(estimate.stamp_ns)
+        self._reset_after_gap(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)
         self._previous = angles
         return angles
 
-    def _forget_who_is_gone(self, stamp_ns: int) -> None:
+    def _reset_after_gap(self, stamp_ns: int) -> None:
         if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:
             self.reset()
 
 
 class LengthChanges:
-    """Tells when the lengths of a person's segments are news: at first, when they change, and where they settle.
+    """Decides when to publish segment lengths: at first, when they change, and when they settle.
 
     Args:
-        tolerance: metres by which a length must differ from what was told last.
-        period: seconds between two pieces of news.
+        tolerance: least difference of a length from the published one, metres.
+        period: least time between two publications, seconds.
     """
 
     def __init__(self, tolerance: float = 0.002, period: float = 1.0) -> None:
@@ -227,28 +223,28 @@ class LengthChanges:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._told: FloatArray | None = None
-        self._told_ns = 0
+        self._published: FloatArray | None = None
+        self._published_ns = 0
         self._before: FloatArray | None = None
 
-    def news(self, stamp_ns: int, lengths: FloatArray) -> bool:
-        """Whether to tell these (n,) lengths, metres, of this capture time; if so, they count as told."""
+    def due(self, stamp_ns: int, lengths: FloatArray) -> bool:
+        """Whether to publish these (n,) lengths, metres, of this capture time; if so, they count as published."""
         settled = self._before is not None and np.array_equal(self._before, lengths)
         self._before = lengths
-        if self._told is not None:
-            if 0 <= stamp_ns - self._told_ns < self._period_ns:
+        if self._published is not None:
+            if 0 <= stamp_ns - self._published_ns < self._period_ns:
                 return False
-            change = float(np.abs(lengths - self._told).max())
+            change = float(np.abs(lengths - self._published).max())
             if change <= self._tolerance and not (settled and change > 0.0):
                 return False
-        self._told, self._told_ns = lengths, stamp_ns
+        self._published, self._published_ns = lengths, stamp_ns
         return True
 
 
 def state_estimate(
     model: UpperBody, stamp_ns: int, frame_id: str, q: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> ModelEstimate:
-    """An estimate of the pose alone, as angles need it: of lengths nothing is known.
+    """An estimate of the pose, with default lengths of infinite standard deviation.
 
     Args:
         model: the body.

@@ -1,6 +1,6 @@
-"""Smooth functions of time that motions are made of: minimum-jerk moves and slow waves.
+"""Smooth functions of time for synthetic motion: minimum-jerk moves and slow waves.
 
-Both are closed functions that can be asked at any instants; all chance comes from a generator that the caller seeds.
+Both are closed functions of time; the caller seeds the random generator.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from body_tracking.core.skeleton import FloatArray
 
 WAVE_BAND = (0.05, 0.8)
-"""Hertz: the slowest and the fastest of the waves of a person."""
+"""Hertz: lowest and highest frequency of a person's waves."""
 _WAVES = 3
 
 
@@ -22,7 +22,7 @@ def minimum_jerk(share: FloatArray) -> FloatArray:
 
 
 def eased(time: FloatArray, way: float, ramp: float) -> FloatArray:
-    """From 0 to ``way`` at a rate of 1, taken up from rest and given back within ``ramp`` seconds each.
+    """From 0 to ``way`` at a rate of 1, with ramps of ``ramp`` seconds from and to rest.
 
     The rate is minimum-jerk in the ramps, so that the third derivative is continuous. It takes ``way + ramp`` seconds.
     """

@@ -33,7 +33,7 @@ from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 
 _EYE3 = np.eye(3)
 _X, _Y, _Z = _EYE3
-# of a point x, [x]x beside the identity: (3, 6), row by row
+# of a point x, [x]x and the identity: (3, 6), row by row
 _ARM = np.concatenate([so3.SKEW.reshape(3, 3, 3), np.zeros((3, 3, 3))], axis=-1).reshape(3, 18)
 _BESIDE = np.concatenate([np.zeros((3, 3)), _EYE3], axis=-1).reshape(18)
 _CROSS = -so3.SKEW
@@ -59,7 +59,7 @@ _AXES: tuple[tuple[tuple[str, FloatArray], ...] | None, ...] = (
 )
 
 SHOULDER_AXES: Final = {"left": (-_Y, _X, -_Z), "right": (-_Y, -_X, _Z)}
-"""Axes of flexion, abduction and inward rotation, intrinsic in this order, where the ball joint is told as angles."""
+"""Axes of flexion, abduction and inward rotation, intrinsic in this order, for the ball joint as angles."""
 
 UNOBSERVED: tuple[str, ...] = (
     "lumbar_axial",
@@ -366,7 +366,7 @@ class UpperBody:
         return Linearisation(posture, jacobian, by_lengths, turning)
 
     def turning(self, q: FloatArray, segment: int) -> tuple[FloatArray, FloatArray]:
-        """Of one segment alone what :meth:`linearise` says, in half the time.
+        """:meth:`linearise` for one segment, in half the time.
 
         Args:
             q: (..., 35) configurations.
@@ -388,10 +388,10 @@ class UpperBody:
         return np.asarray(3 + np.flatnonzero(self._turns[self.segment_names.index(segment)]), dtype=np.intp)
 
     def curvature(self, lines: Linearisation, covariance: FloatArray) -> FloatArray:
-        """Where the points are on average, beside where they are at the mean of the configuration.
+        """Expectation of the points minus their positions at the mean of the configuration, to second order.
 
-        A point that swings about a joint stays behind its tangent: to second order by half the sum over all pairs of
-        coordinates of their covariance and the point's second derivative, axis x (derivative by the later one).
+        Half the sum over all pairs of coordinates of their covariance and the point's second derivative, axis x
+        (derivative by the later one).
 
         Args:
             lines: the linearisation at the mean, of one configuration.

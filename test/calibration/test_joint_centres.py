@@ -1,4 +1,4 @@
-"""Laws of the offsets of joints that a T-pose tells, on people of whom these are known."""
+"""Laws of the joint offsets estimated from a T-pose, on people with known offsets."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from body_tracking.calibration.joint_centres import (
     POSE_STDDEV,
     JointCentres,
     body_axes,
-    kept,
+    posed,
+    retained,
     t_pose_offsets,
-    turned,
 )
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
@@ -44,9 +44,9 @@ def some_offsets(seed: int = 0) -> FloatArray:
 
 
 def seen(positions: FloatArray, local: FloatArray) -> FloatArray:
-    """(25, 3) with joints beside where they are."""
+    """(25, 3) with joints displaced by offsets."""
     result = positions.copy()
-    result[LEARNT] += turned(positions, local[:, None])[:, 0]
+    result[LEARNT] += posed(positions, local[:, None])[:, 0]
     return result
 
 
@@ -70,7 +70,7 @@ def held(centres: JointCentres, positions: FloatArray, *, start: float = 0.0, se
     rng = np.random.default_rng(1)
     stamps = round(start * NANOSECONDS) + FRAME_NS * np.arange(round(seconds * 30))
     for stamp_ns in stamps.tolist():
-        centres.see(skeleton(positions + rng.normal(scale=0.002, size=positions.shape), stamp_ns))
+        centres.update(skeleton(positions + rng.normal(scale=0.002, size=positions.shape), stamp_ns))
     return int(stamps[-1]) + FRAME_NS
 
 
@@ -81,7 +81,7 @@ def without(positions: FloatArray, *joints: Joint) -> FloatArray:
 
 def test_offsets_turn_as_the_frames_of_the_segments_do() -> None:
     frames = segment_frames(POSES)[:, LEARNT]
-    axes = np.stack([turned(each, EYE) for each in POSES])
+    axes = np.stack([posed(each, EYE) for each in POSES])
     of_thorax = LEARNT != Joint.SPINE_BASE  # a pelvis has its own frame there
     assert_allclose(axes.swapaxes(-1, -2)[:, of_thorax], frames[:, of_thorax], atol=1e-9)
 
@@ -92,14 +92,14 @@ def test_offsets_turn_with_the_body(turn: tuple[float, float, float], pose: int)
     rotation = Rotation.from_rotvec(turn).as_matrix()
     moved = POSES[pose] @ rotation.T + [1.0, 2.0, 3.0]
     local = some_offsets()[:, None]
-    assert_allclose(turned(moved, local), turned(POSES[pose], local) @ rotation.T, atol=1e-9)
+    assert_allclose(posed(moved, local), posed(POSES[pose], local) @ rotation.T, atol=1e-9)
 
 
 def test_a_bone_that_is_not_seen_turns_nothing_and_without_a_thorax_nothing_is_told() -> None:
-    hidden = turned(without(POSES[3], Joint.HAND_LEFT), EYE)
-    assert_allclose(hidden[5], turned(POSES[3], EYE)[5])
+    hidden = posed(without(POSES[3], Joint.HAND_LEFT), EYE)
+    assert_allclose(hidden[5], posed(POSES[3], EYE)[5])
     assert np.isfinite(hidden).all()
-    assert np.isnan(turned(without(POSES[3], Joint.SPINE_MID), EYE)).all()
+    assert np.isnan(posed(without(POSES[3], Joint.SPINE_MID), EYE)).all()
 
 
 def drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -140,7 +140,7 @@ def test_what_is_known_of_offsets_is_as_good_as_stated() -> None:
         found = t_pose_offsets(points, transient)
         distances.append(found.distance)
         expected = found.dimension
-        local = turned(points, EYE) @ offsets[:, :, None]
+        local = posed(points, EYE) @ offsets[:, :, None]
         off = (found.local - local[:, :, 0]).reshape(-1)
         errors.append(off @ np.linalg.solve(found.covariance, off))
     # chi-square in the mean; the body's axes are those of joints that are off, which the equations do not know
@@ -156,8 +156,8 @@ def test_left_and_right_are_treated_alike() -> None:
     other = own[MIRROR] * flip
     transient = 0.3 * BASE_STDDEV[LEARNT] ** 2
     one, two = t_pose_offsets(own, transient), t_pose_offsets(other, transient)
-    shift_one = (one.local[:, None] @ turned(own, EYE))[:, 0]
-    shift_two = (two.local[:, None] @ turned(other, EYE))[:, 0]
+    shift_one = (one.local[:, None] @ posed(own, EYE))[:, 0]
+    shift_two = (two.local[:, None] @ posed(other, EYE))[:, 0]
     exchanged = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6]
     assert_allclose(shift_two, shift_one[exchanged] * flip, atol=1e-9)
     assert one.distance == pytest.approx(two.distance)
@@ -187,7 +187,7 @@ def test_offsets_come_into_force_without_a_jump_and_stay() -> None:
     shifts = []
     for number in range(150):
         frame = skeleton(positions, number * FRAME_NS)
-        centres.see(frame)
+        centres.update(frame)
         shifts.append(corrected(centres, frame) - positions)
     shift = np.linalg.norm(shifts, axis=-1)
     assert not shift[:20].any()
@@ -231,7 +231,7 @@ ODD = (
     T_POSE
     + 0.3 * np.isin(np.arange(N_JOINTS), (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT))[:, None] * body_axes(T_POSE)[:, 2]
 )
-"""What looks like a T-pose, and is nobody's."""
+"""Resembles a T-pose, and is impossible for a person."""
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
         wave = 0.08 * np.sin(number / 5.0) * body_axes(T_POSE)[:, 2]
         moving = T_POSE.copy()
         moving[[Joint.WRIST_LEFT, Joint.ELBOW_LEFT]] += wave
-        centres.see(skeleton(moving, number * FRAME_NS))
+        centres.update(skeleton(moving, number * FRAME_NS))
     assert centres.offsets is None
     held(centres, T_POSE, start=10.0, seconds=0.6)
     held(centres, POSES[5], start=10.6, seconds=1.0)
@@ -267,7 +267,7 @@ def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
     held(centres, T_POSE, start=21.0, seconds=0.5)
     assert centres.offsets is None
     for number in range(90):  # nor do skeletons that state no covariances
-        centres.see(skeleton(T_POSE, 30 * NANOSECONDS + number * FRAME_NS, stated=False))
+        centres.update(skeleton(T_POSE, 30 * NANOSECONDS + number * FRAME_NS, stated=False))
     assert centres.offsets is None
     held(centres, T_POSE, start=40.0)
     assert centres.offsets is not None
@@ -290,9 +290,9 @@ def test_broken_numbers_and_stamps_do_no_harm() -> None:
         broken = T_POSE.copy()
         broken[number % N_JOINTS] = (np.nan, np.inf, 1e30)[number % 3]
         frame = skeleton(broken, (number - 2 * (number % 5)) * FRAME_NS)
-        centres.see(frame)
+        centres.update(frame)
         corrected(centres, frame)
-    centres.see(replace(skeleton(T_POSE, 70 * FRAME_NS), covariances=np.full((N_JOINTS, 3, 3), np.nan)))
+    centres.update(replace(skeleton(T_POSE, 70 * FRAME_NS), covariances=np.full((N_JOINTS, 3, 3), np.nan)))
     held(centres, seen(T_POSE, some_offsets()), start=100.0)
     assert centres.offsets is not None
     assert np.isfinite(centres.offsets.local).all()
@@ -301,14 +301,14 @@ def test_broken_numbers_and_stamps_do_no_harm() -> None:
     assert np.isfinite(centres.offsets.local).all()
 
 
-def test_sensors_are_told_apart_and_what_they_saw_is_put_together() -> None:
+def test_evidence_of_several_sensors_is_combined() -> None:
     local = some_offsets(4)
     both, one = JointCentres({}), JointCentres({})
     for number in range(60):
         frame = skeleton(seen(T_POSE, local), number * FRAME_NS)
-        one.see(frame, "kinect1")
-        both.see(frame, "kinect1")
-        both.see(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
+        one.update(frame, "kinect1")
+        both.update(frame, "kinect1")
+        both.update(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
     assert both.offsets is not None
     assert one.offsets is not None
     # two that saw the same know it better
@@ -324,7 +324,7 @@ def test_one_pose_is_one_however_many_see_it_and_another_is_another() -> None:
         for number in range(150):
             stamp_ns = start * NANOSECONDS + number * FRAME_NS
             for sensor, positions in (("kinect1", T_POSE), ("kinect2", T_POSE), ("kinect3", aside)):
-                centres.see(skeleton(positions, stamp_ns), sensor)
+                centres.update(skeleton(positions, stamp_ns), sensor)
         assert counters == {"t_poses": 1 + (start > 0), "t_poses_refused": 0}
 
 
@@ -332,7 +332,7 @@ def test_a_lost_frame_hardly_changes_when_a_pose_is_learnt_from() -> None:
     def learnt_at(lost: int) -> int:
         centres = JointCentres({})
         numbers = (number for number in range(120) if number != lost)
-        return next(n for n in numbers if centres.see(skeleton(T_POSE, 5 * NANOSECONDS + n * FRAME_NS)))
+        return next(n for n in numbers if centres.update(skeleton(T_POSE, 5 * NANOSECONDS + n * FRAME_NS)))
 
     whole = learnt_at(-1)
     assert all(abs(learnt_at(lost) - whole) <= 1 for lost in range(1, whole + 1))
@@ -343,7 +343,7 @@ def test_a_short_second_pose_is_seen_too_and_a_slow_camera_does() -> None:
     centres = JointCentres(counters)
     for start, pose, seconds in ((0.0, T_POSE, 1.0), (1.0, POSES[5], 9.0), (10.0, T_POSE, 1.0)):
         for number in range(round(8 * seconds)):
-            centres.see(skeleton(pose, round((start + number / 8.0) * NANOSECONDS)))
+            centres.update(skeleton(pose, round((start + number / 8.0) * NANOSECONDS)))
     assert counters["t_poses"] == 2
 
 
@@ -362,28 +362,28 @@ def test_what_remains_is_less_across_the_arms_and_a_covariance() -> None:
         elbow = centres.remaining(same, pose, stamp_ns)[Joint.ELBOW_LEFT]
         assert upper @ elbow @ upper == pytest.approx(9e-4, rel=0.01)
         gone = 1.0 - np.linalg.eigvalsh(elbow)[0] / 9e-4
-        share = kept(pose)[LEARNT.tolist().index(Joint.ELBOW_LEFT)] ** 2
+        share = retained(pose)[LEARNT.tolist().index(Joint.ELBOW_LEFT)] ** 2
         assert 0.35 * share <= gone <= 0.65 * share + 1e-9
         legs = [joint for joint in Joint if joint.name.startswith(("KNEE", "ANKLE"))]
         assert_allclose(left[legs], given_ones[legs])
 
 
 def test_less_is_kept_of_offsets_the_farther_bones_point_from_where_they_did() -> None:
-    shares = np.array([kept(turned_arms(degrees)) for degrees in (0.0, 20.0, 45.0, 80.0)])
+    shares = np.array([retained(turned_arms(degrees)) for degrees in (0.0, 20.0, 45.0, 80.0)])
     assert (shares[:, :4] == 1.0).all()  # trunk and shoulders
     assert (shares[0] > 0.99).all()
     assert (np.diff(shares[:, 4:7], axis=0) < -0.01).all()
     assert (np.diff(shares[:, 8:], axis=0) < -0.01).all()
     assert shares.min() > 0.78
     rotation = Rotation.from_rotvec([0.3, 1.0, -0.5]).as_matrix()
-    assert_allclose(kept(turned_arms(45.0) @ rotation.T), shares[2])
+    assert_allclose(retained(turned_arms(45.0) @ rotation.T), shares[2])
     hidden = without(turned_arms(45.0), Joint.WRIST_LEFT)
-    assert kept(hidden)[5] == kept(hidden)[4] == pytest.approx(shares[2, 4], rel=1e-3)
+    assert retained(hidden)[5] == retained(hidden)[4] == pytest.approx(shares[2, 4], rel=1e-3)
 
 
 def test_nothing_is_kept_from_a_bent_elbow_on() -> None:
     bends = (0.0, 15.0, 45.0, 67.0, 90.0, 130.0)
-    shares = np.array([kept(bent_elbows(degrees)) for degrees in bends])
+    shares = np.array([retained(bent_elbows(degrees)) for degrees in bends])
     assert (shares[:, :4] == 1.0).all()
     assert (shares[:, 7] == 1.0).all()
     arms = shares[:, [4, 5, 6, 8, 9, 10]]
@@ -429,7 +429,7 @@ def test_people_who_hold_no_t_pose_are_taken_for_none_who_do(shared_data: Path) 
         for frame in CsvRecording(path):
             for each in frame.skeletons:
                 stated = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
-                centres.see(replace(each, covariances=stated), frame.sensor)
+                centres.update(replace(each, covariances=stated), frame.sensor)
                 frames += 1
         assert counters == {"t_poses": 0, "t_poses_refused": 0}, path.name
     assert frames > 3000

@@ -114,7 +114,7 @@ def test_what_is_published_never_jumps(shared_data: Path) -> None:
     for (before_ns, before), (after_ns, after) in pairwise(poses):
         elapsed = (after_ns - before_ns) / NANOSECONDS
         if elapsed > 1.0:
-            continue  # nobody was tracked: the recording has gaps between its tasks
+            continue  # no person was tracked: the recording has gaps between its tasks
         turn = Rotation.from_matrix(after.rotation @ before.rotation.T).magnitude()
         assert turn <= parameters.slew_rotation * elapsed + 1e-6
         shift = float(np.linalg.norm(after.apply(person) - before.apply(person)))
@@ -196,7 +196,7 @@ def _walked(seconds: float) -> OnlineCalibration:
 
 
 def saved_after(seconds: float = 20.0, turned: float = 0.0) -> CalibrationResult:
-    """What so many seconds of the walk told; with kinect2 turned since, degrees about the vertical."""
+    """Calibration from some seconds of the walk; with kinect2 turned since, degrees about the vertical."""
     saved = _walked(seconds).result()
     pose = saved.poses["kinect2"]
     rotation = Rotation.from_euler("z", turned, degrees=True) * Rotation.from_quat(pose.quat_xyzw)
@@ -286,7 +286,7 @@ def test_the_times_of_receipt_tell_the_clock_of_somebody_who_does_not_move() -> 
 
 
 def test_neither_a_still_pose_nor_motion_that_tells_the_clock_is_needed() -> None:
-    """Noise hides both; half a minute of a walk still says where the sensor stands, if roughly."""
+    """Noise hides both; half a minute of a walk still determines the pose roughly."""
     calibration, _ = run(stream(20.0, still=-5.0, noise=0.12))
     assert calibration.status()[2]["kinect2 clock_from"] == "receipt"
     assert yaw_error(calibration.result()) < 6.0
@@ -299,7 +299,7 @@ def test_stamps_since_an_epoch_are_as_good_as_small_ones() -> None:
 
 
 def test_an_update_holds_only_after_it_was_made() -> None:
-    """Live and offline get the same numbers only if nobody has to use an update before it can have arrived."""
+    """Live and offline agree only if every update arrives before it comes into force."""
     calibration = OnlineCalibration(("kinect1", "kinect2"))
     assert calibration.current_update().valid_from_ns == 0
     for sensor, skeleton, received in stream(15.0):
@@ -312,7 +312,7 @@ def test_one_sensor_only_still_gives_the_world_and_one_that_sees_nobody_stays_un
     calibration = OnlineCalibration(("kinect1",))
     assert calibration.current_update().result.poses.keys() == {"kinect1"}
     for sensor, skeleton, received in stream(5.0):
-        assert calibration.push(sensor, skeleton, received) == []  # kinect2 is nobody
+        assert calibration.push(sensor, skeleton, received) == []  # kinect2 is unknown
     assert calibration.status()[0] == 0
     calibration, _ = run(each for each in stream(10.0) if each[0] == "kinect1")
     assert "kinect2" not in calibration.result().poses
@@ -325,7 +325,7 @@ def test_a_saved_calibration_holds_until_a_better_one() -> None:
     first = saved_after()
     held = run((), saved=first)[0].current_update().result
     assert_allclose(held.poses["kinect2"].translation, first.poses["kinect2"].translation)
-    _, updates = run(stream(4.0), saved=first)  # standing still tells less than what was loaded
+    _, updates = run(stream(4.0), saved=first)  # standing still is less accurate than the loaded one
     for update in updates:
         assert_allclose(update.result.poses["kinect2"].translation, first.poses["kinect2"].translation, atol=1e-9)
 
@@ -348,7 +348,7 @@ def test_a_saved_clock_of_another_session_is_not_believed() -> None:
 
 
 def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_from_either_side() -> None:
-    """And, as quartz drifts, for no longer than it may be believed."""
+    """And, as quartz drifts, for a limited time."""
     views = around(np.radians([45.0, -80.0]).tolist())
     recording = simulate(Setup("torso_twist", views, seconds=20.0, seed=4, standard=True))
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
@@ -375,7 +375,7 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
     kept, kept_stddev = off(true)
     assert abs(kept) < 0.003
     assert kept_stddev < 0.004
-    # It was saved two days ago, or after a recording too short to tell the drift: no better than times of receipt.
+    # Saved two days ago, or after a recording too short for the drift: no better than times of receipt.
     for ago, drift_stddev_ppm in ((2 * 86_400, 5.0), (300, float("inf"))):
         then_ns = true.anchor_ns - ago * NANOSECONDS
         assert off(true.carried_to(then_ns), drift_stddev_ppm) == pytest.approx((error, stddev), abs=1e-3)
@@ -383,7 +383,7 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
 
 @pytest.mark.parametrize("offset", some([0.53, 0.46, 0.5, 0.545]))
 def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) -> None:
-    """Even by less than the times of receipt can tell."""
+    """Even by less than the accuracy of the times of receipt."""
     saved = saved_after(30.0)
     saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
     calibration, _ = run(stream(float(draws(25, 40)), offset=offset), saved=saved)

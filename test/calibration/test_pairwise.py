@@ -1,4 +1,4 @@
-"""The pose estimate survives what Kinect skeletons do, and says how sure it is."""
+"""The pose estimate is robust against the errors of Kinect skeletons, with a consistent covariance."""
 
 from __future__ import annotations
 
@@ -101,9 +101,7 @@ def test_moving_one_sensors_coordinates_moves_the_answer_along() -> None:
     turn, shift = Rotation.from_euler("yxz", [25, 8, -5], degrees=True).as_matrix(), np.array([0.5, -0.2, 0.3])
     plain = estimate(pairs, ROTATION, TRANSLATION)
     moved = estimate(
-        replace(pairs, sensor=pairs.sensor @ turn.T + shift),
-        ROTATION @ turn.T,
-        TRANSLATION - ROTATION @ turn.T @ shift,
+        replace(pairs, sensor=pairs.sensor @ turn.T + shift), ROTATION @ turn.T, TRANSLATION - ROTATION @ turn.T @ shift
     )
     assert_allclose(moved.rotation, plain.rotation @ turn.T, atol=1e-9)
     assert_allclose(moved.translation, plain.translation - plain.rotation @ turn.T @ shift, atol=1e-9)
@@ -137,7 +135,7 @@ def test_memory_is_bounded_and_spread_over_places() -> None:
     coverage = Coverage(per_place=5, capacity=60)
     body = walk(np.zeros(1))[0]
     nothing = np.zeros((25, 3))
-    for index in range(1000):  # somebody who stands
+    for index in range(1000):  # a standing person
         coverage.add(index * 0.1, body, body, nothing, np.ones(25))
     assert len(coverage) == 5
     assert coverage.oldest == pytest.approx(99.5)

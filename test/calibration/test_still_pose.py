@@ -16,7 +16,7 @@ TIMES = np.arange(FRAMES) / 30.0
 
 
 def seen(motion: str, time: float) -> FloatArray:
-    """(25, 3) metres of somebody 2 m in front of a sensor at a height of 0.9 m."""
+    """(25, 3) metres of a person 2 m in front of a sensor at a height of 0.9 m."""
     pose = performed(motion, np.array([time]))[0] * ABOUT_FACE + [2.0, 0.0, -0.9]
     return np.asarray(pose @ OPTICAL_FROM_LEVEL.T)
 
@@ -53,7 +53,7 @@ def test_the_averages_are_registered_on_what_both_track() -> None:
     states = np.full((FRAMES, 25), 2)
     theirs = (repeated() - [1.0, 0.2, 0.3]) @ rotation
     inferred = states.copy()
-    theirs[:, 7] += 0.5  # wrong, and the sensor says so
+    theirs[:, 7] += 0.5  # wrong, and stated as inferred
     inferred[:, 7] = 1
     found, moved, residual = still_pose_registration((repeated(), states), (theirs, inferred))
     assert_allclose(found, rotation, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Of two poses half a turn apart the right one is found, whoever sees the body turned around, and for how long."""
+"""Of two poses half a turn apart the right one is found, whichever sensor sees the body reversed, and for how long."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from walkers import about_y, performed
 
 ROTATION, TRANSLATION = about_y(-45.0), np.array([1.5, 0.1, 0.6])
 TO_OPTICAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-"""Level axes of somebody who faces a sensor into the sensor's optical ones."""
+"""From the level axes of a person who faces a sensor to its optical axes."""
 
 
 def pairs_of(motion: str, turned: float, seed: int = 0) -> Pairs:

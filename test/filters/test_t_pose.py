@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from body_tracking.calibration.joint_centres import LEARNT, turned
+from body_tracking.calibration.joint_centres import LEARNT, posed
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import FloatArray, Joint, Skeleton
 from body_tracking.filters import SkeletonFilter, make_filter, smoother
@@ -47,14 +47,14 @@ def skeletons() -> tuple[Skeleton, ...]:
             local[place] = [0.02, 0.0, 0.03]
     t_pose = reaching()[20]
     # in the frames of the segments, of what is so in the T-pose
-    axes = turned(t_pose, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())
+    axes = posed(t_pose, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())
     local = np.einsum("jab,jb->ja", axes, local)
     rng = np.random.default_rng(0)
     covariances = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
     result = []
     for number, true in enumerate(reaching()):
         positions = true + rng.normal(scale=0.001, size=true.shape)
-        positions[LEARNT] += turned(true, local[:, None])[:, 0]
+        positions[LEARNT] += posed(true, local[:, None])[:, 0]
         each = frame(number / RATE + 1.0, positions)
         result.append(Skeleton(each.stamp_ns, "world", positions, TRACKED, covariances=covariances))
     return tuple(result)

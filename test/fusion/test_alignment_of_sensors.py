@@ -60,7 +60,7 @@ def test_a_known_pose_and_clock_give_back_the_truth_at_its_time(mirrored_from: i
     assert made.counters["repaired"] == 60 - mirrored_from
 
 
-def test_a_body_that_one_sensor_sees_across_keeps_its_midline_only() -> None:
+def test_a_body_seen_with_its_axis_across_keeps_its_midline_only() -> None:
     made = alignment()
     for number in range(30):
         time = number * FRAME
@@ -80,7 +80,7 @@ def test_a_body_that_one_sensor_sees_across_keeps_its_midline_only() -> None:
     assert made.counters["turned_joints"] == lateral.sum()
 
 
-def test_a_pose_holds_from_its_time_on_and_before_nothing_is_said() -> None:
+def test_a_pose_holds_from_its_time_on_and_not_before() -> None:
     made = alignment("kinect1")
     made.set_pose(replace(POSES["kinect2"], valid_from_ns=NANOSECONDS))
     assert made.push("kinect2", seen("kinect2", 0.9)) is None
@@ -99,7 +99,7 @@ def test_a_clock_that_jumps_back_starts_anew_and_poses_hold() -> None:
 
 
 @pytest.mark.parametrize("off", [-5.0, 5.0])
-def test_a_sensor_that_counts_from_another_beginning_is_left_out_until_its_clock_is_known(off: float) -> None:
+def test_a_sensor_with_a_wrong_clock_is_left_out_until_it_is_calibrated(off: float) -> None:
     made = alignment()
     taken = []
     for number in range(60):
@@ -115,7 +115,7 @@ def test_a_sensor_that_counts_from_another_beginning_is_left_out_until_its_clock
     assert taken == [True] * 20 + [off > 0.0] + [False] * 19 + [True] * 20
 
 
-def test_a_late_frame_goes_on_as_it_is_and_strangers_are_counted_or_refused() -> None:
+def test_late_frames_pass_and_unknown_sensors_are_counted_or_rejected() -> None:
     made = alignment()
     pushed(made, "kinect1", seen("kinect1", 1.0))
     aligned = pushed(made, "kinect1", seen("kinect1", 0.95))

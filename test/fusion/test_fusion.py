@@ -1,4 +1,4 @@
-"""One skeleton from several sensors: by stamp, weighted, and not fooled by one of them."""
+"""One skeleton from several sensors: by stamp, weighted, and robust against one of them."""
 
 from __future__ import annotations
 
@@ -81,24 +81,24 @@ def changed(given_frames: list[Frame], sensor: str, change: Callable[[Skeleton],
 
 
 def lowered(by: float) -> Callable[[Skeleton], Skeleton]:
-    """Everything so many metres lower: the optical y axis points down."""
+    """Shift all joints down, metres: the optical y axis points down."""
     return lambda seen: replace(seen, positions=seen.positions + [0.0, by, 0.0])
 
 
 # --- what it is
 
 
-def test_without_errors_the_truth_comes_out_once_per_reference_frame() -> None:
+def test_noiseless_frames_give_the_truth_once_per_reference_frame() -> None:
     fused = run(fusion(), frames(8.0))
     assert len(fused) == 240
     assert np.diff([each.stamp_ns for each in fused]).min() > 0
     assert {each.frame_id for each in fused} == {"world"}
-    # What extrapolation over half a frame cannot know of the hands of a waving person.
+    # The extrapolation error of a waving person's hands over half a frame.
     assert errors(fused)[30:].mean() < 0.002
     assert errors(fused)[30:].max() < 0.03
 
 
-def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
+def test_two_noisy_sensors_have_smaller_error_and_covariance_than_one() -> None:
     alone = run(fusion(["kinect1"]), of_one(8.0, 0.02))
     together = run(fusion(), frames(8.0, 0.02))
     one, both = errors(alone)[30:90], errors(together)[30:90]
@@ -118,12 +118,9 @@ def test_two_noisy_sensors_are_better_than_one_and_say_so() -> None:
     )
 
 
-def test_disagreement_makes_uncertain() -> None:
+def test_disagreement_increases_the_covariance() -> None:
     trunk = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
-    agreed, apart = (
-        run(fusion(), frames(3.0)),
-        run(fusion(), changed(frames(3.0), "kinect2", lowered(0.16))),
-    )
+    agreed, apart = (run(fusion(), frames(3.0)), run(fusion(), changed(frames(3.0), "kinect2", lowered(0.16))))
     for near, far in zip(agreed[10:], apart[10:], strict=True):
         assert near.covariances is not None
         assert far.covariances is not None
@@ -133,7 +130,7 @@ def test_disagreement_makes_uncertain() -> None:
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=draws(6, 15), deadline=None)
-def test_arrival_a_few_milliseconds_earlier_or_later_changes_nothing(seed: int) -> None:
+def test_output_is_independent_of_small_changes_of_arrival(seed: int) -> None:
     rng = np.random.default_rng(seed)
     orderly = frames(4.0, 0.01, phase=0.004)
     shaken = sorted(
@@ -191,9 +188,9 @@ def test_the_thesis_methods_take_its_weights() -> None:
 # --- when sensors fail
 
 
-def test_a_sensor_that_falls_silent_is_dropped_within_a_tenth_of_a_second_and_taken_back() -> None:
+def test_a_silent_sensor_is_dropped_within_a_tenth_of_a_second_and_faded_in_again() -> None:
     def paused(seen: Skeleton) -> Skeleton | None:
-        # While it is heard it lies by 10 cm, so that one sees when it counts.
+        # Its frames are 10 cm off, which shows when they have weight.
         return None if 2.0 < seen.stamp - OFFSET < 4.0 else lowered(0.1)(seen)
 
     fused = run(fusion(fade_in=0.5), changed(frames(8.0), "kinect2", paused))
@@ -208,7 +205,7 @@ def test_a_sensor_that_falls_silent_is_dropped_within_a_tenth_of_a_second_and_ta
     assert np.abs(np.diff(wrong[(stamps > 4.0) & (stamps < 4.6)])).max() < 0.012
 
 
-def test_the_others_go_on_while_the_reference_is_silent() -> None:
+def test_output_continues_while_the_reference_is_silent() -> None:
     def gone(seen: Skeleton) -> Skeleton | None:
         return None if 2.0 < seen.stamp < 4.0 else seen
 
@@ -221,10 +218,8 @@ def test_the_others_go_on_while_the_reference_is_silent() -> None:
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", [0.3, 1.2, 3.0])
-def test_one_sensor_that_reverses_for_a_while_is_not_followed_and_not_held_against_the_other(
-    sensor: str, seconds: float
-) -> None:
-    """Whichever is believed: nobody turns round between two frames, and the other sensor does not say so."""
+def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds: float) -> None:
+    """Whichever is the trusted one: the other sensor sees no reversal."""
 
     def reverse(skeleton: Skeleton) -> Skeleton:
         stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
@@ -236,8 +231,8 @@ def test_one_sensor_that_reverses_for_a_while_is_not_followed_and_not_held_again
 
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
-def test_nor_is_one_that_turns_the_body_at_once_by_more_than_anybody_can(sensor: str) -> None:
-    """Seen from the side a body whose sides are exchanged is turned by less than half a turn, too."""
+def test_an_impossible_turn_in_one_sensor_is_rejected(sensor: str) -> None:
+    """In a side view, swapped sides can turn the body by less than half a turn."""
 
     def turn(skeleton: Skeleton) -> Skeleton:
         stamp = skeleton.stamp - (OFFSET if sensor == "kinect2" else 0.0)
@@ -253,7 +248,7 @@ def test_nor_is_one_that_turns_the_body_at_once_by_more_than_anybody_can(sensor:
 
 
 def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
-    """A sensor whose axis lies across the believed one loses its say on left and right, not the rest."""
+    """Of a sensor whose axis is across the accepted one, only the joints of left and right are rejected."""
 
     def twisted(seen: Skeleton) -> Skeleton:
         centre = seen.positions[Joint.SPINE_SHOULDER]
@@ -265,22 +260,22 @@ def test_a_body_seen_from_the_side_does_not_flatten_the_shoulders() -> None:
     assert width[60:].min() > 0.75 * np.median(width[:60])
 
 
-def test_both_sensors_reversing_at_once_is_held_and_then_followed_without_a_mirror() -> None:
+def test_a_common_reversal_is_held_and_then_followed_by_turning() -> None:
     def turned(seen: Skeleton) -> Skeleton:
         return seen.mirrored() if seen.stamp > 3.0 else seen
 
     made = fusion(["kinect1"])
     fused = run(made, changed(of_one(16.0), "kinect1", turned))
-    assert errors(fused)[[each.stamp < 3.0 + HOLD for each in fused]].max() < 0.1  # nobody turns round at once
+    assert errors(fused)[[each.stamp < 3.0 + HOLD for each in fused]].max() < 0.1
     axes = np.stack([left_right_axes(each.positions)[0] for each in fused])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     assert np.einsum("ni,ni->n", axes[1:], axes[:-1]).min() > 0.4  # never through a mirror
     assert made.counters["reversals_accepted"] > 0
-    # In the end the sensor is believed: it may have been wrong before.
+    # In the end the reversal is accepted.
     assert errors(fused)[-1].max() > 0.2
 
 
-def test_outliers_of_one_joint_are_gated_and_a_new_place_is_accepted_in_the_end() -> None:
+def test_outliers_of_a_joint_are_gated_and_a_lasting_change_is_accepted() -> None:
     def wild(seen: Skeleton) -> Skeleton:
         positions = seen.positions.copy()
         clock = seen.stamp
@@ -312,7 +307,7 @@ def test_late_repeated_and_backward_stamps() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_joints_that_are_nowhere_are_left_out() -> None:
+def test_joints_that_are_not_valid_are_left_out() -> None:
     def damaged(seen: Skeleton) -> Skeleton:
         positions, states = seen.positions.copy(), seen.states.copy()
         positions[Joint.HAND_LEFT] = np.nan

@@ -30,7 +30,7 @@ def known(ordering: Ordering, offsets: dict[str, int], rounds: int = 4) -> int:
     return rounds * PERIOD
 
 
-def test_it_says_before_when_no_frame_is_to_be_expected() -> None:
+def test_expected_time_is_a_lower_bound_of_the_next_frame() -> None:
     ordering = Ordering(["kinect1", "kinect2"], 0.04)
     assert ordering.expected_ns is None
     known(ordering, {"kinect1": 0, "kinect2": 12 * MS})
@@ -54,7 +54,7 @@ def test_it_says_before_when_no_frame_is_to_be_expected() -> None:
     jitter=st.integers(0, 4),
     seed=st.integers(0, 1000),
 )
-def test_frames_of_sensors_that_deliver_steadily_leave_in_order_and_each_once(
+def test_frames_of_steady_sensors_leave_once_and_in_order(
     delays: list[int], phases: list[int], jitter: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_frames_of_sensors_that_deliver_steadily_leave_in_order_and_each_once(
             left.append((skeleton.stamp_ns, now_ns))
     left += [(skeleton.stamp_ns, 0) for _, skeleton in ordering.flush()]
     assert sorted(stamp for stamp, _ in left) == sorted(stamp for _, stamp, _ in events)
-    # in the beginning nothing tells that a sensor is there at all
+    # before its first frame a sensor is unknown
     settled = [stamp for stamp, _ in left if stamp > (33 + 32) * MS]
     assert settled == sorted(settled)
 
@@ -86,21 +86,21 @@ def test_a_frame_waits_for_an_older_one_and_no_longer() -> None:
     assert ordering.deadline_ns is None
 
 
-def test_of_frames_that_are_here_together_the_oldest_goes_first_however_long_another_one_waited() -> None:
+def test_of_frames_that_arrived_together_the_oldest_goes_first() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     now = known(ordering, {"a": 10 * MS, "b": 0})
     assert ordering.push("a", frame(now + 10 * MS), now + 10 * MS) == []
-    # nobody looked for longer than it may wait
+    # no poll for longer than the wait
     later = now + 60 * MS
     ordering.hold("a", frame(now + 10 * MS + PERIOD), later)
     ordering.hold("b", frame(now), later)
     ordering.hold("b", frame(now + PERIOD), later)
     assert stamps(ordering.poll(later)) == [now, now + 10 * MS, now + PERIOD, now + 10 * MS + PERIOD]
     assert ordering.deadline_ns is None
-    assert ordering.counters["in vain"] == 0
+    assert ordering.counters["expired waits"] == 0
 
 
-def test_what_is_held_when_time_jumps_back_goes_first() -> None:
+def test_waiting_frames_go_first_after_a_jump_back() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     now = known(ordering, {"a": 10 * MS, "b": 0}) + 5 * NANOSECONDS
     for stamp_ns in (now, now + PERIOD, 0, PERIOD):
@@ -112,26 +112,26 @@ def test_what_is_held_when_time_jumps_back_goes_first() -> None:
     assert sorted(left[2:]) == [0, 5 * MS, PERIOD, now + 5 * MS]
 
 
-def test_a_frame_that_waited_long_enough_goes_on_alone() -> None:
+def test_a_frame_leaves_alone_at_its_deadline() -> None:
     polled, pushed = Ordering(("a", "b"), 0.02), Ordering(("a", "b"), 0.02)
     for ordering in (polled, pushed):
         now = known(ordering, {"a": 10 * MS, "b": 0})
         ordering.push("a", frame(now + 10 * MS), now + 10 * MS)
     assert stamps(polled.poll(now + 30 * MS)) == [now + 10 * MS]
     assert stamps(polled.push("b", frame(now), now + 31 * MS)) == [now]
-    # whether somebody polled in between makes no difference to what goes first
+    # polls in between do not change the order
     assert stamps(pushed.push("b", frame(now), now + 31 * MS)) == [now + 10 * MS, now]
-    assert polled.counters == pushed.counters == {"in vain": 1}
+    assert polled.counters == pushed.counters == {"expired waits": 1}
 
 
-def test_without_waiting_every_frame_goes_on_as_it_comes() -> None:
+def test_with_zero_wait_frames_pass_at_once() -> None:
     ordering = Ordering(("a", "b"), 0.0)
     now = known(ordering, {"a": 10 * MS, "b": 0})
     assert stamps(ordering.push("a", frame(now + 10 * MS), now + 10 * MS)) == [now + 10 * MS]
     assert stamps(ordering.push("b", frame(now), now + 12 * MS)) == [now]
 
 
-def test_sensors_that_deliver_alike_do_not_wait_for_each_other() -> None:
+def test_sensors_of_equal_delay_do_not_wait_for_each_other() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     for k in range(50):
         for sensor, phase in (("a", 0), ("b", 16 * MS)):
@@ -139,7 +139,7 @@ def test_sensors_that_deliver_alike_do_not_wait_for_each_other() -> None:
             assert stamps(ordering.push(sensor, frame(stamp), stamp + 30 * MS)) == [stamp]
 
 
-def test_a_sensor_that_vanished_is_soon_not_waited_for() -> None:
+def test_no_frame_waits_for_a_vanished_sensor() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     now = known(ordering, {"a": 10 * MS, "b": 0})
     waited = 0
@@ -151,7 +151,7 @@ def test_a_sensor_that_vanished_is_soon_not_waited_for() -> None:
     assert 1 <= waited <= PATIENCE
 
 
-def test_a_jump_back_in_time_lets_go_of_what_waits() -> None:
+def test_a_jump_back_in_time_flushes_waiting_frames() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     now = known(ordering, {"a": 10 * MS, "b": 0}) + 5 * NANOSECONDS
     for sensor in ("b", "a"):
@@ -161,7 +161,7 @@ def test_a_jump_back_in_time_lets_go_of_what_waits() -> None:
     assert ordering.deadline_ns is None
 
 
-def test_a_sensor_that_is_always_too_late_is_soon_not_waited_for() -> None:
+def test_no_frame_waits_for_a_sensor_that_is_always_late() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     events = sorted(
         (k * PERIOD + delay, k * PERIOD, name) for name, delay in (("a", 0), ("b", 70 * MS)) for k in range(40)
@@ -175,7 +175,7 @@ def test_a_sensor_that_is_always_too_late_is_soon_not_waited_for() -> None:
     assert 1 <= waited <= PATIENCE
 
 
-def test_an_older_frame_makes_those_behind_it_wait_no_longer() -> None:
+def test_an_older_frame_does_not_extend_the_wait_of_newer_ones() -> None:
     ordering = Ordering(("a", "b", "c"), 0.02)
     now = known(ordering, {"a": 20 * MS, "b": 10 * MS, "c": 0})
     assert ordering.push("a", frame(now + 20 * MS), now + 20 * MS) == []
@@ -184,7 +184,7 @@ def test_an_older_frame_makes_those_behind_it_wait_no_longer() -> None:
     assert stamps(ordering.poll(now + 40 * MS)) == [now + 10 * MS, now + 20 * MS]
 
 
-def test_a_slow_sensor_holds_nobody_up_between_its_frames() -> None:
+def test_no_frame_waits_for_a_slow_sensor_between_its_frames() -> None:
     ordering = Ordering(("a", "b"), 0.02)
     waits = []
     for k in range(120):

@@ -104,7 +104,7 @@ def test_slots_are_taken_in_turn() -> None:
     assert slots.of == {8: 2, 9: 1}
 
 
-def test_a_sensor_that_is_not_calibrated_or_whose_clock_is_another_is_nobodys_witness() -> None:
+def test_frames_without_pose_or_clock_are_not_associated() -> None:
     for several in (False, True):
         people = People(SENSORS, PeopleParameters(ALL if several else NEAREST))
         people.set_pose(POSES["kinect1"])
@@ -121,7 +121,7 @@ def test_a_sensor_that_is_not_calibrated_or_whose_clock_is_another_is_nobodys_wi
         assert people.counters["uncalibrated"] == 3 and people.counters["other_clock"] == 1
 
 
-def test_one_who_is_alone_goes_through_whatever_happens_and_is_known_when_somebody_comes() -> None:
+def test_a_lone_person_keeps_the_number_when_another_one_comes() -> None:
     people = made(NEAREST)
     for step in range(90):
         x = 1.5 + 0.02 * step

@@ -1,4 +1,4 @@
-"""The thesis's weights: what its text says, and what its formula gives (DESIGN 4.2)."""
+"""The thesis's weights: by its text and by its formula (DESIGN 4.2)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_two_sensors(states: tuple[int, int], text: tuple[float, float], formula
 
 
 @given(STATES)
-def test_weights_sum_to_one_where_anybody_sees_the_joint(states: np.ndarray) -> None:
+def test_weights_sum_to_one_where_any_sensor_has_the_joint(states: np.ndarray) -> None:
     for weigh in (thesis_text, thesis_formula):
         weights = weigh(states)
         assert (weights >= 0.0).all()

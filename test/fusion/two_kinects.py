@@ -1,4 +1,4 @@
-"""Two sensors that see somebody walk, and where and when they are."""
+"""Two sensors that see a person walk, with their poses and clocks."""
 
 from __future__ import annotations
 

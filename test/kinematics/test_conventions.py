@@ -14,8 +14,8 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.conventions import (
-    ANYWHERE,
     CONVENTIONS,
+    UNIFORM_STDDEV,
     ConventionError,
     angles_of,
     segment_quaternions,
@@ -73,7 +73,7 @@ def arms(flexion: float, abduction: float, rotation: float = 0.0, elbow: float =
     return q
 
 
-def told(angles: JointAngles) -> dict[str, float]:
+def by_name(angles: JointAngles) -> dict[str, float]:
     return dict(zip(angles.names, angles.position.tolist(), strict=True))
 
 
@@ -206,7 +206,7 @@ def test_the_angles_rebuild_the_rotations(name: str) -> None:
     for q in (*poses(100), *(arms(*pose, rotation=20.0, elbow=50.0) for pose in singular)):
         angles = angles_of(estimate(q), MODEL, name)
         assert np.isfinite(angles.position).all()
-        REBUILT[name](q, told(angles))
+        REBUILT[name](q, by_name(angles))
 
 
 OWN = ((0, 0, 0, 0), (0, 90, 0, 0), (90, 0, 0, 0), (170, 0, 0, 0), (0, 170, 0, 0), (-40, 0, 0, 90), (0, 30, 50, 90))
@@ -235,7 +235,7 @@ HERS = tuple(f"theta{number}" for number in (13, 14, 15, 16, 17, 20, 24))
 )
 def test_textbook_poses(convention: str, keys: tuple[str, ...], pose: tuple[int, ...], values: tuple[int, ...]) -> None:
     """Degrees of both arms; all other angles are zero but the ISB's pronation, which is 90 with thumbs forward."""
-    for label, angle in told(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
+    for label, angle in by_name(angles_of(estimate(arms(*pose)), MODEL, convention)).items():
         key = label[2:] if label[2:] in keys else label.removesuffix("_left").removesuffix("_right")
         known = dict(zip(keys, values, strict=True))
         rest = 90.0 if key == "elbow_pronation" else 0.0
@@ -292,7 +292,7 @@ OUTER = {
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
-def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> None:
+def test_the_standard_deviation_grows_towards_a_singular_pose(name: str) -> None:
     """Outer angles: growing towards the singular pose, until they may be anything; the middle one stays what it is."""
     stddev, before = 0.5 * DEGREE, 0.0
     flexion, abduction = SINGULAR[name]
@@ -303,7 +303,7 @@ def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> N
         first, middle, last = (angles.names.index(key) for key in OUTER[name])
         deviations = angles.position_stddev
         assert deviations[middle] < 5.0 * stddev
-        assert max(deviations[first], deviations[last]) <= ANYWHERE and np.isfinite(angles.velocity_stddev[first])
+        assert max(deviations[first], deviations[last]) <= UNIFORM_STDDEV and np.isfinite(angles.velocity_stddev[first])
         assert deviations[first] > before or away == 0.0
         assert (deviations[first] > 30.0 * stddev) == (away < 2.0)
         before = deviations[first]
@@ -311,7 +311,7 @@ def test_the_standard_deviation_says_where_the_split_is_singular(name: str) -> N
 
 def _path(kind: str, offset: float) -> list[FloatArray]:
     """An arm that swings through a pose and a little past it, degrees per step at most 3."""
-    steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # nobody's arm goes far behind straight up
+    steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # an arm does not go far behind straight up
     if kind == "hanging":
         return [arms(t, offset) for t in steps]
     if kind == "t_pose":
@@ -339,7 +339,7 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
             assert step.max() < 15.0, [(n, s) for n, s in zip(angles.names, step, strict=True) if s > 5]
         if name == "model":
             for side, _ in SIDES:
-                a = told(angles)
+                a = by_name(angles)
                 t = [a[f"shoulder_{k}_{side}"] for k in ("flexion", "abduction", "rotation")]
                 built = np.linalg.multi_dot([turn(axis, x) for axis, x in zip(SHOULDER_AXES[side], t, strict=True)])
                 r = rotations_of(q)
@@ -349,8 +349,8 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
-def test_rates_of_held_angles_are_those_of_the_angles_that_are_told(name: str) -> None:
-    """One degree beside the singular pose, known to 3 deg: the first angle stands, the last takes the whole turn."""
+def test_rates_of_held_angles_are_the_derivatives_of_the_held_angles(name: str) -> None:
+    """One degree from the singular pose, known to 3 deg: the first angle is held, the last takes the whole turn."""
     q = arms(SINGULAR[name][0] + 0.6, SINGULAR[name][1] - 0.8)
     rng = np.random.default_rng(5)
     velocity = np.concatenate([np.zeros(6), rng.normal(size=NV - 6)])
@@ -383,7 +383,7 @@ def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
     assert spread[columns].max() < 60.0
 
 
-def test_an_angle_that_nothing_observes_has_the_deviation_of_its_prior() -> None:
+def test_an_unobserved_angle_has_the_deviation_of_its_prior() -> None:
     """What is known of it is handed out; infinity is left to what has no estimate at all (DESIGN, 4)."""
     prior = PosturePrior(MODEL, RANGES)
     covariance = np.diag(np.append(np.zeros(6), prior.stddev**2).tolist() + [0.0] * NV)
@@ -394,7 +394,7 @@ def test_an_angle_that_nothing_observes_has_the_deviation_of_its_prior() -> None
     assert np.isfinite(angles.position_stddev).all()
 
 
-def test_infinite_variances_and_missing_velocities_stay_where_they_belong() -> None:
+def test_infinite_variances_and_missing_velocities_affect_their_angles_only() -> None:
     number = MODEL.coordinate_names.index("lumbar_axial")
     covariance = 1e-6 * np.eye(2 * NV)
     covariance[number, number] = np.inf
@@ -411,7 +411,7 @@ def test_infinite_variances_and_missing_velocities_stay_where_they_belong() -> N
     np.testing.assert_array_equal(np.isnan(angles.velocity), np.isinf(angles.position_stddev))
 
 
-def test_wrong_names_are_refused() -> None:
+def test_unknown_conventions_and_other_previous_angles_raise() -> None:
     now = estimate(MODEL.neutral())
     with pytest.raises(ConventionError, match="'euler': not one of model, isb, rep155, dh26"):
         angles_of(now, MODEL, "euler")
@@ -437,7 +437,7 @@ def test_segment_quaternions_are_the_models_rotations() -> None:
             np.testing.assert_allclose(so3.quat_to_matrix(result.relative[segment]), expected, rtol=0, atol=1e-12)
 
 
-def test_segment_quaternions_state_their_scatter_even_in_the_t_pose() -> None:
+def test_segment_quaternion_deviations_match_their_scatter_in_the_t_pose() -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(NV, NV))
     covariance = np.zeros((2 * NV, 2 * NV))

@@ -1,4 +1,4 @@
-"""Inverse kinematics finds the pose again that points were made of, and says how well it knows it."""
+"""Inverse kinematics recovers the pose of given points, with a consistent covariance."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unkn
 
 
 def test_the_covariance_is_that_of_many_noisy_fits() -> None:
-    """Of the fitted points, which are what noise reaches; the ranges of motion tell the rest."""
+    """Of the fitted points, which the noise affects; the ranges of motion determine the rest."""
     rng = np.random.default_rng(5)
     _, lengths, points = people(1, 6)
     for length, point in zip(lengths, points, strict=True):
@@ -148,7 +148,7 @@ def test_the_covariance_is_that_of_many_noisy_fits() -> None:
 
 
 def test_limits_push_back_softly() -> None:
-    """An elbow seen 40 degrees beyond straight: good points are believed, poor ones are not."""
+    """An elbow seen 40 degrees beyond straight: accurate points outweigh the range, poor ones do not."""
     column = NAMES.index("elbow_flexion_left")
     tangent = np.zeros(MODEL.nv)
     tangent[column] = np.radians(-40.0)
@@ -265,7 +265,7 @@ def test_elbow_branch_flips_only_with_a_visible_hand() -> None:
         seen = np.where(of(Joint.THUMB_LEFT)[:, None], np.nan, point)
         for other in INVERSE.turned_about(one, seen, stddev, length):
             assert_allclose(other[:7], one[:7])
-            # what stays goes through quaternions and back: rounding, and nothing that anybody would call a turn
+            # unchanged rotations go through quaternions and back: rounding only
             moved = np.abs(MODEL.difference(one, other)) > 1e-9
             assert INVERSE.is_turned(one, other)
             assert not any(moved[k] for k, name in enumerate(NAMES) if not name.endswith("_right"))

@@ -1,4 +1,4 @@
-"""Segment lengths from distances between points: exact, robust, and as sure as errors that last for seconds allow."""
+"""Segment lengths from distances between points: exact, robust, and with a covariance for correlated errors."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ BASE = BASE_STDDEV[POINTS] ** 2
 ARM = [LENGTHS.index(name) for name in ("upper_arm_left", "forearm_left", "hand_left")]
 
 
-def somebody(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def moving_person(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (n,), points (n, 19, 3) and lengths (21,)."""
     rng = np.random.default_rng(seed)
     truth = truth_of(RandomPerson.draw(rng), RandomMotion(rng, seconds), capture_times(seconds, rng, rate))
     return truth.times, truth.positions, truth.lengths
 
 
-def learnt(
+def gathered(
     times: FloatArray,
     points: FloatArray,
     white: float = 0.0,
@@ -44,24 +44,26 @@ def learnt(
     model: FloatArray | None = None,
     slow: float = 0.0,
 ) -> SegmentLengths:
-    """What frames of one sensor tell; ``white`` is a standard deviation, ``model`` (n, 19)."""
+    """The measurements of one sensor's frames; ``white`` is a standard deviation, ``model`` (n, 19)."""
     seen = SegmentLengths()
     for k, (time, frame) in enumerate(zip(times, points, strict=True)):
         variance = BASE if model is None else model[k]
-        seen = seen.seen("", round(time * NANOSECONDS), frame, tracked, np.full(len(POINTS), white**2), variance, slow)
+        seen = seen.with_frame(
+            "", round(time * NANOSECONDS), frame, tracked, np.full(len(POINTS), white**2), variance, slow
+        )
     return seen
 
 
 def estimated(*args: FloatArray, **kwargs: float) -> LengthEstimate:
-    return learnt(*args, **kwargs).estimate()  # type: ignore[arg-type]
+    return gathered(*args, **kwargs).estimate()  # type: ignore[arg-type]
 
 
 def stddev(estimate: LengthEstimate) -> FloatArray:
     return np.sqrt(estimate.covariance.diagonal())
 
 
-def lasting(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
-    """(n, size) deviates of unit variance that last (Ornstein-Uhlenbeck)."""
+def correlated_noise(times: FloatArray, rng: np.random.Generator, persistence: float, size: int) -> FloatArray:
+    """(n, size) samples of unit variance of an Ornstein-Uhlenbeck process."""
     kept = np.exp(-np.diff(times) / persistence)
     found = np.empty((len(times), size))
     found[0] = rng.normal(size=size)
@@ -70,17 +72,17 @@ def lasting(times: FloatArray, rng: np.random.Generator, persistence: float, siz
     return found
 
 
-def test_of_perfect_points_the_lengths_are_exact() -> None:
+def test_lengths_of_noiseless_points_are_exact() -> None:
     for seed in range(5):
-        times, points, lengths = somebody(seed, 4.0)
+        times, points, lengths = moving_person(seed, 4.0)
         assert_allclose(estimated(times, points).lengths, lengths, rtol=0.0, atol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
+def test_lengths_are_invariant_under_rigid_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    times, points, _ = somebody(3, 4.0, rate=10.0)
+    times, points, _ = moving_person(3, 4.0, rate=10.0)
     points = points + rng.normal(scale=0.01, size=points.shape)
     turned = Rotation.random(random_state=rng).apply(points.reshape(-1, 3)).reshape(points.shape) + rng.normal(size=3)
     one, two = estimated(times, points, 0.01), estimated(times, turned, 0.01)
@@ -88,8 +90,8 @@ def test_where_the_person_is_and_faces_does_not_matter(seed: int) -> None:
     assert_allclose(one.covariance, two.covariance, rtol=0.0, atol=1e-9)
 
 
-def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
-    for seen in (SegmentLengths(), learnt(*somebody(0, 4.0)[:2], tracked=~EVERY)):
+def test_without_measurements_the_estimate_is_the_prior() -> None:
+    for seen in (SegmentLengths(), gathered(*moving_person(0, 4.0)[:2], tracked=~EVERY)):
         estimate = seen.estimate()
         assert_allclose(estimate.lengths, MODEL.default_lengths())
         assert_allclose(estimate.covariance, proportions())
@@ -98,8 +100,8 @@ def test_nothing_seen_is_an_average_person_whose_sides_are_alike() -> None:
         assert between < 0.1 * estimate.covariance[left, left]
 
 
-def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
-    times, points, lengths = somebody(4, 10.0)
+def test_an_unseen_arm_has_the_lengths_of_the_other_one() -> None:
+    times, points, lengths = moving_person(4, 10.0)
     hidden = np.isin(POINTS, [Joint[f"{name}_LEFT"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")])
     estimate = estimated(times, points, tracked=~hidden)
     assert (np.abs(estimate.lengths - lengths)[ARM] < 3.0 * stddev(estimate)[ARM]).all()
@@ -110,10 +112,10 @@ def test_an_arm_that_is_not_seen_is_as_long_as_the_other_one() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.02, 0.04])
-def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
+def test_white_noise_biases_no_length_and_is_in_the_covariance(noise: float) -> None:
     off, normalised = [], []
     for seed in range(12):
-        times, points, lengths = somebody(seed, 12.0)
+        times, points, lengths = moving_person(seed, 12.0)
         rng = np.random.default_rng(seed)
         estimate = estimated(times, points + rng.normal(scale=noise, size=points.shape), noise)
         off.append(estimate.lengths - lengths)
@@ -122,20 +124,20 @@ def test_white_noise_lengthens_nothing_and_is_known(noise: float) -> None:
     assert 0.3 < np.square(normalised).mean() < 2.0
 
 
-def test_the_more_frames_the_surer_as_long_as_the_noise_is_white() -> None:
-    times, points, _ = somebody(5, 32.0)
+def test_stddev_falls_with_the_square_root_of_time_under_white_noise() -> None:
+    times, points, _ = moving_person(5, 32.0)
     points = points + np.random.default_rng(5).normal(scale=0.02, size=points.shape)
     short, long = (stddev(estimated(times[times < end], points[times < end], 0.02)) for end in (8.0, 32.0))
     assert np.median(long / short) < 0.7  # half, as variances fall with the time
 
 
-def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out() -> None:
-    """Two halves of a minute differ as is stated, by far more than if every frame were new."""
+def test_correlated_errors_do_not_average_out_as_white_noise() -> None:
+    """Two halves of a minute differ as stated, by far more than with independent frames."""
     normalised, as_if_new = [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        times, points, _ = somebody(seed, 60.0, rate=15.0)
-        wrong = 0.02 * lasting(times, rng, 3.0, points[0].size).reshape(points.shape)
+        times, points, _ = moving_person(seed, 60.0, rate=15.0)
+        wrong = 0.02 * correlated_noise(times, rng, 3.0, points[0].size).reshape(points.shape)
         points = points + wrong + rng.normal(scale=0.003, size=points.shape)
         first = times < 30.0
         halves = [estimated(times[part], points[part], 0.003) for part in (first, ~first)]
@@ -146,8 +148,8 @@ def test_errors_that_last_for_seconds_are_not_taken_for_noise_that_averages_out(
     assert np.square(as_if_new).mean() > 5.0
 
 
-def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
-    times, points, lengths = somebody(6, 20.0)
+def test_outlier_frames_and_blocks_do_not_move_the_estimate() -> None:
+    times, points, lengths = moving_person(6, 20.0)
     rng = np.random.default_rng(6)
     points = points + rng.normal(scale=0.01, size=points.shape)
     good = estimated(times, points, 0.01)
@@ -161,8 +163,8 @@ def test_strange_frames_and_strange_seconds_do_not_move_it() -> None:
     assert np.abs(bad.lengths - good.lengths).max() < 0.015
 
 
-def test_seconds_seen_badly_count_less() -> None:
-    times, points, lengths = somebody(7, 20.0)
+def test_blocks_of_large_variance_have_less_weight() -> None:
+    times, points, lengths = moving_person(7, 20.0)
     late = times >= 10.0
     points = points + np.random.default_rng(7).normal(scale=0.003, size=points.shape)
     points[late] *= 1.1
@@ -174,47 +176,47 @@ def test_seconds_seen_badly_count_less() -> None:
     assert off_badly < 0.5 * off_alike
 
 
-def test_stated_slow_errors_keep_a_few_seconds_from_being_sure() -> None:
-    times, points, _ = somebody(8, 6.0)
-    sure, unsure = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
-    assert (unsure > 2.0 * sure).all()
+def test_stated_slow_errors_increase_the_stddev() -> None:
+    times, points, _ = moving_person(8, 6.0)
+    without, with_slow = (stddev(estimated(times, points, slow=slow)) for slow in (0.0, 0.3))
+    assert (with_slow > 2.0 * without).all()
 
 
-def test_two_sensors_are_gathered_apart() -> None:
-    times, points, lengths = somebody(9, 6.0)
+def test_each_sensor_has_its_own_blocks() -> None:
+    times, points, lengths = moving_person(9, 6.0)
     seen = SegmentLengths()
     zero = np.zeros(len(POINTS))
     for time, frame in zip(times, points, strict=True):
         for number, sensor in enumerate(("one", "other")):
-            seen = seen.seen(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
+            seen = seen.with_frame(sensor, round(time * NANOSECONDS) + number, frame + number, EVERY, zero, BASE)
     assert len(seen.blocks) >= 8
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
-def test_a_sensor_of_few_frames_is_learnt_from_too() -> None:
-    times, points, lengths = somebody(10, 12.0, rate=2.0)
-    seen = learnt(times, points)
+def test_a_slow_sensor_gives_blocks() -> None:
+    times, points, lengths = moving_person(10, 12.0, rate=2.0)
+    seen = gathered(times, points)
     assert len(seen.blocks) >= 4
     assert_allclose(seen.estimate().lengths, lengths, rtol=0.0, atol=1e-6)
 
 
-def test_only_as_many_blocks_are_kept_as_the_memory_has() -> None:
-    times, points, lengths = somebody(11, 12.0)
+def test_old_blocks_are_dropped() -> None:
+    times, points, lengths = moving_person(11, 12.0)
     seen = SegmentLengths(memory=3)
     taller = np.where((times < 6.0)[:, None, None], points, 1.1 * points)
     for time, frame in zip(times, taller, strict=True):
-        seen = seen.seen("", round(time * NANOSECONDS), frame, EVERY, np.zeros(len(POINTS)), BASE)
+        seen = seen.with_frame("", round(time * NANOSECONDS), frame, EVERY, np.zeros(len(POINTS)), BASE)
     assert len(seen.blocks) == 3
     assert_allclose(seen.estimate().lengths, 1.1 * lengths, rtol=0.0, atol=1e-6)
 
 
-def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> None:
-    times, points, lengths = somebody(12, 0.9)
+def test_an_unfinished_block_can_be_used_from_the_first_frame() -> None:
+    times, points, lengths = moving_person(12, 0.9)
     for count in (1, 2, 3, 4, len(times)):
-        seen = learnt(times[:count], points[:count])
+        seen = gathered(times[:count], points[:count])
         assert not seen.blocks
         assert not seen.estimate().seen.any()
-        estimate = seen.begun("", np.zeros(len(POINTS))).estimate()
+        estimate = seen.with_unfinished_block("", np.zeros(len(POINTS))).estimate()
         assert estimate.seen.all()
         assert_allclose(estimate.lengths, lengths, rtol=0.0, atol=1e-6)
 
@@ -222,31 +224,31 @@ def test_what_has_begun_counts_from_the_first_frame_and_is_no_block_yet() -> Non
 # --- of filtered skeletons
 
 
-def test_lengths_of_skeletons_are_there_at_once_and_never_jump() -> None:
-    times, points, lengths = somebody(13, 12.0)
-    told = SkeletonLengths()
+def test_lengths_of_skeletons_start_at_once_and_never_jump() -> None:
+    times, points, lengths = moving_person(13, 12.0)
+    tracker = SkeletonLengths()
     course = []
     for time, frame in zip(times, np.where((times < 3.5)[:, None, None], 0.9 * points, points), strict=True):
-        told.update(round(time * NANOSECONDS), frame, BASE)
-        course.append(told.lengths)
+        tracker.update(round(time * NANOSECONDS), frame, BASE)
+        course.append(tracker.lengths)
     assert_allclose(course[0], 0.9 * lengths, rtol=0.0, atol=1e-6)
     assert_allclose(course[-1], lengths, rtol=0.02)  # the blocks of the later pose are the more
     assert (np.abs(np.diff(course, axis=0)) < 0.01 * lengths).all()  # of the tenth that was to be gone
-    told.reset()
-    assert np.isinf(told.stddev).all()
-    assert_allclose(told.lengths, MODEL.default_lengths())
+    tracker.reset()
+    assert np.isinf(tracker.stddev).all()
+    assert_allclose(tracker.lengths, MODEL.default_lengths())
 
 
-def test_who_takes_anothers_place_has_their_own_lengths_within_a_minute() -> None:
-    times, points, lengths = somebody(14, 140.0, rate=10.0)
-    told = SkeletonLengths()
+def test_lengths_adapt_to_another_person_within_a_minute() -> None:
+    times, points, lengths = moving_person(14, 140.0, rate=10.0)
+    tracker = SkeletonLengths()
     for time, frame in zip(times, np.where((times < 80.0)[:, None, None], 0.85 * points, points), strict=True):
-        told.update(round(time * NANOSECONDS), frame, BASE)
-    assert_allclose(told.lengths, lengths, rtol=0.005)
+        tracker.update(round(time * NANOSECONDS), frame, BASE)
+    assert_allclose(tracker.lengths, lengths, rtol=0.005)
 
 
 @pytest.mark.slow
-def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
+def test_both_halves_of_a_real_recording_give_the_same_lengths(shared_data: Path, tmp_path: Path) -> None:
     import_files([shared_data / "kinect_pairs" / "p02_45deg.csv.gz"], tmp_path / "in")
     replay(tmp_path / "in", tmp_path / "out", ReplaySettings(()))
     with BagReader(tmp_path / "out") as reader:
@@ -260,7 +262,7 @@ def test_both_halves_of_a_real_recording_tell_the_same_lengths(shared_data: Path
                 assert frame.covariances is not None
                 variance = frame.covariances[POINTS].diagonal(axis1=1, axis2=2).mean(axis=1)
                 model = np.where(frame.valid[POINTS], variance, BASE)
-                seen = seen.seen(
+                seen = seen.with_frame(
                     "", frame.stamp_ns, frame.positions[POINTS], frame.valid[POINTS], np.full(19, 9e-6), model, 0.1
                 )
         halves.append(seen.estimate())

@@ -228,7 +228,7 @@ def test_impossible_bodies_are_unknown_and_do_not_warn(fill: float) -> None:
     assert np.isinf(angles.velocity_stddev).all()
 
 
-def test_nothing_is_claimed_without_covariances_or_velocities() -> None:
+def test_without_covariances_or_velocities_the_deviations_are_infinite() -> None:
     angles = positional_angles(skeleton(bent_pose(0)))
     assert np.isfinite(angles.position).all() and np.isnan(angles.velocity).all()
     assert np.isinf(angles.position_stddev).all() and np.isinf(angles.velocity_stddev).all()
@@ -257,7 +257,7 @@ def test_joint_classes_cover_every_joint() -> None:
 
 
 def test_a_raised_arm_keeps_its_plane_where_a_hanging_one_has_none() -> None:
-    """What decides is whether the arm is surely raised, not how exactly its plane is known."""
+    """The criterion is whether the elevation is significant, not the accuracy of the plane."""
     for elevation, known in ((8.0, False), (80.0, True)):
         positions = t_pose()
         direction = np.sin(np.radians(elevation)) * LEFT - np.cos(np.radians(elevation)) * UP

@@ -42,7 +42,7 @@ def test_every_angle_has_a_range_around_its_zero_and_both_sides_the_same() -> No
         np.testing.assert_allclose(np.degrees([low, high]), RANGES[name.removesuffix("_left").removesuffix("_right")])
 
 
-def test_what_a_range_alone_says_has_the_limits_at_three_standard_deviations() -> None:
+def test_the_prior_of_a_range_has_its_limits_at_three_standard_deviations() -> None:
     np.testing.assert_allclose(RANGE.centre + 3.0 * RANGE.stddev, RANGE.high)
     np.testing.assert_allclose(RANGE.centre - 3.0 * RANGE.stddev, RANGE.low)
 

@@ -168,7 +168,7 @@ def test_her_ten_joints_observe_20_of_26_angles_and_18_in_the_t_pose() -> None:
 
 @given(theta=angles, turn=st.floats(-3.0, 3.0))
 @settings(max_examples=25, deadline=None)
-def test_nothing_tells_theta15_from_theta16(theta: FloatArray, turn: float) -> None:
+def test_theta15_and_theta16_are_redundant(theta: FloatArray, turn: float) -> None:
     """Not even the forearm's and the hand's rotations do: one turns as much as the other turns back."""
     opposite = np.zeros(26)
     opposite[[14, 21]], opposite[[15, 22]] = turn, -turn
@@ -201,7 +201,7 @@ def test_default_lengths_are_those_of_a_person() -> None:
     assert 0.9 * 1.8 < span < 1.1 * 1.8  # the span of the arms is about the stature
 
 
-def test_what_is_no_pose_is_refused() -> None:
+def test_arrays_of_wrong_shape_raise() -> None:
     with pytest.raises(ModelError, match=r"angles \(25,\)"):
         PLACED.forward(np.zeros(25), LENGTHS)
     with pytest.raises(ModelError, match=r"lengths \(4, 9\)"):

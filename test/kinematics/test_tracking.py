@@ -12,13 +12,7 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.conventions import ConventionError, angles_of
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.kinematics.tracking import (
-    ALL_CONVENTIONS,
-    AngleStream,
-    LengthChanges,
-    SkeletonFit,
-    segment_poses,
-)
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, SkeletonFit, segment_poses
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 
 MODEL = UpperBody()
@@ -28,7 +22,7 @@ FRAME = 1 / 30
 
 
 def motion(time: float) -> tuple[FloatArray, FloatArray]:
-    """Configuration and tangent velocity of somebody who leans, turns and waves, away from singular poses."""
+    """Configuration and tangent velocity of a person who bends, turns and waves, away from singular poses."""
     v = np.zeros(MODEL.nv)
     rate = np.zeros(MODEL.nv)
     amplitudes = {
@@ -168,21 +162,21 @@ def test_segments_stand_where_their_joints_are() -> None:
 def test_lengths_are_told_at_first_when_they_change_and_when_they_settle_but_not_too_often() -> None:
     changes = LengthChanges()
     lengths = np.array([0.3, 0.4])
-    told = []
+    published = []
     for number in range(300):
         time = number * FRAME
         if 1.0 < time <= 4.0:
             lengths = lengths + np.array([0.0002, 0.0])  # 6 mm/s
-        if changes.news(round(time * NANOSECONDS), lengths.copy()):
-            told.append((time, float(lengths[0])))
-    assert told[0][0] == 0.0
-    assert np.diff([time for time, _ in told]).min() >= 1.0 - 1e-6
-    assert 3 <= len(told) <= 6
-    assert told[-1][1] == lengths[0]  # to the last micrometre, once they stay
+        if changes.due(round(time * NANOSECONDS), lengths.copy()):
+            published.append((time, float(lengths[0])))
+    assert published[0][0] == 0.0
+    assert np.diff([time for time, _ in published]).min() >= 1.0 - 1e-6
+    assert 3 <= len(published) <= 6
+    assert published[-1][1] == lengths[0]  # exactly, once they settle
 
 
 def test_lengths_that_stay_are_told_once() -> None:
     changes = LengthChanges()
-    assert [changes.news(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
+    assert [changes.due(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
     changes.reset()
-    assert changes.news(0, np.array([0.3]))
+    assert changes.due(0, np.array([0.3]))

@@ -235,7 +235,7 @@ def test_a_straight_elbow_adds_the_humerus_turning_against_pronation(side: str) 
 
 
 @pytest.mark.parametrize(("nq", "nl"), [(34, 21), (35, 20)])
-def test_what_is_no_configuration_is_refused(nq: int, nl: int) -> None:
+def test_configurations_of_wrong_shape_raise(nq: int, nl: int) -> None:
     with pytest.raises(ModelError, match=r"upper_body: .* expected"):
         MODEL.forward(np.zeros(nq), np.zeros(nl))
     with pytest.raises(ModelError, match=r"upper_body: .* expected"):

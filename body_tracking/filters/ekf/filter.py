@@ -177,7 +177,7 @@ class ExtendedKalmanFilter:
             return False
         state = self._last  # a jump of time may have reset it
         self.counters["frames"] += 1
-        if self.parameters.t_pose and self._centres.see(skeleton, sensor):
+        if self.parameters.t_pose and self._centres.update(skeleton, sensor):
             self._lengths_from_ns = skeleton.stamp_ns
         if state is not None and state.unplaced:
             return self._placed(measurement)

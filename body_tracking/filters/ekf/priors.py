@@ -160,7 +160,7 @@ class Priors:
         that no body can follow, is stopped here at once.
         """
         for _ in range(_PROJECTIONS):
-            if self._ranges.surely_within(state.q, _FAR_BEYOND):
+            if self._ranges.certainly_within(state.q, _FAR_BEYOND):
                 return state
             values = self._ranges.values(state.q)
             excess = self._ranges.excess_of(values)

@@ -327,7 +327,7 @@ class SkeletonUpdate:
         if state.seen is None:
             return state
         sensor = state.sensors[measurement.sensor]
-        seen = state.seen.seen(
+        seen = state.seen.with_frame(
             measurement.sensor,
             measurement.stamp_ns,
             measurement.positions,
