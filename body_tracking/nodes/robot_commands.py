@@ -123,7 +123,7 @@ class RobotCommands(GraphNode):
                 self.follower.refuse_angles(str(error))
                 raise
             convention = str(values.header.frame_id)
-            if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
+            if self.follower.receive_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
                 self.log_seldom("jump", f"{topic}: time jumped back, starting anew", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
@@ -131,25 +131,25 @@ class RobotCommands(GraphNode):
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         """A sensor sees somebody."""
-        self.follower.hear_sensor(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
+        self.follower.receive_frame(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
 
     def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:
         """Since when a sensor's pose holds."""
         pose = transform_to_pose(message)
         if pose.sensor in self.sensors:
-            self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
+            self.follower.calibration.receive_pose(pose.sensor, pose.valid_from_ns)
 
     def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
         """How well the sensors are calibrated, if that is what it says."""
         for status in statuses(message, namespace=self.get_namespace()):
             if status.node == "calibration":
                 quality = CalibrationQuality.from_diagnostics(status.values, self.sensors)
-                self.follower.calibration.heard(quality, time.monotonic_ns())
+                self.follower.calibration.receive_quality(quality, time.monotonic_ns())
 
     def on_robot(self, message: JointState, sent_ns: int) -> None:
         """How the robot stands."""
         position = np.array(message.position, dtype=np.float64)
-        self.follower.hear_robot(tuple(message.name), position, time.monotonic_ns())
+        self.follower.receive_robot_state(tuple(message.name), position, time.monotonic_ns())
 
     def on_enable(self, _: Any, response: Any) -> Any:
         """A person says that the robot may move."""
@@ -180,7 +180,7 @@ class RobotCommands(GraphNode):
     def tell_robot(self) -> None:
         """One command, or none."""
         now_ns = self.now_ns()
-        self.follower.hear_publishers(self.others())
+        self.follower.report_publishers(self.others())
         self.command = command = self.follower.step(now_ns, time.monotonic_ns())
         if command.position is not None:
             output = self.mapping.output
@@ -203,7 +203,7 @@ class RobotCommands(GraphNode):
         """What the robot is told, and why."""
         command = self.command
         if command is None:
-            return 2, "stopped: nothing heard yet", {}
+            return 2, "stopped: nothing received yet", {}
         values: dict[str, object] = {
             "robot": self.mapping.robot,
             "state": command.state,

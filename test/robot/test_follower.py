@@ -87,20 +87,20 @@ class Bench:
         angles = seen(self.stamp_ns(), self.pose, self.velocity, self.stddev, self.velocity_stddev)
         arrays = {each.name: getattr(angles, each.name)[self.order] for each in fields(angles)[2:]}
         angles = replace(angles, names=tuple(angles.names[k] for k in self.order), **arrays)
-        self.follower.hear_angles(angles, convention, self.now_ns, self.steady_ns)
+        self.follower.receive_angles(angles, convention, self.now_ns, self.steady_ns)
 
     def run(self, seconds: float = PERIOD) -> Command:
         """Go on for some time; the last command."""
         for _ in range(round(seconds / PERIOD)):
             self.elapsed_ns += PERIOD_NS
             self.frame += self.frames
-            self.follower.hear_sensor("kinect2", EPOCH_NS + self.frame, self.steady_ns)
+            self.follower.receive_frame("kinect2", EPOCH_NS + self.frame, self.steady_ns)
             if self.quality is not None:
-                self.follower.calibration.heard(self.quality, self.steady_ns)
+                self.follower.calibration.receive_quality(self.quality, self.steady_ns)
             if not self.mute:
                 position = self.commands[-1].position if self.commands else None
                 stands = self.stands or ([0.0, 0.1] if position is None else position)
-                self.follower.hear_robot(
+                self.follower.receive_robot_state(
                     ("elbow", "gripper", "shoulder"), np.array([stands[1], 9.0, stands[0]]), self.steady_ns
                 )
             if not self.silent and self.elapsed_ns - self.seen_ns >= self.every_ns:
@@ -209,8 +209,8 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"quality": quality(translation=math.nan)},
         "poor: standard deviation nan m of a sensor's p",
     ),
-    "no word of the calibration": ({"quality": None}, "calibration has not been heard of"),
-    "a robot that says nothing": ({"mute": True}, "does not say how it stands"),
+    "no word of the calibration": ({"quality": None}, "no diagnostics of calibration"),
+    "a robot that says nothing": ({"mute": True}, "no joint states of the robot"),
 }
 """By name: what is wrong, and the reason that is given."""
 WITHIN = {
@@ -279,7 +279,7 @@ def test_a_joint_may_keep_its_place_alone_and_come_back_slowly() -> None:
 def test_a_calibration_may_get_too_old() -> None:
     bench = Bench(calibration=True, max_calibration_age=20.0)
     assert "age of the calibration is not known" in bench.run(0.1).reason
-    bench.follower.calibration.pose("kinect2", EPOCH_NS - 15 * NANOSECONDS)
+    bench.follower.calibration.receive_pose("kinect2", EPOCH_NS - 15 * NANOSECONDS)
     assert bench.run(4.0).state == State.FOLLOWING
     assert "calibration is 20 s old, limit 20 s" in bench.run(1.4).reason
 
@@ -289,7 +289,7 @@ def test_a_calibration_may_get_too_old() -> None:
 
 def test_angles_that_came_before_the_clock_do_not_count_for_long() -> None:
     bench = Bench()
-    bench.follower.hear_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), CONVENTION, 0, bench.steady_ns)
+    bench.follower.receive_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), CONVENTION, 0, bench.steady_ns)
     assert bench.run(3.0).state == State.FOLLOWING
 
 
@@ -325,7 +325,7 @@ def test_a_backward_jump_of_time_is_told_and_holds() -> None:
     now_ns = bench.now_ns - 10 * NANOSECONDS
     for behind_ns, jumps in ((0, True), (NANOSECONDS - 5, False)):
         angles = seen(now_ns - behind_ns, bench.pose)
-        assert bench.follower.hear_angles(angles, CONVENTION, now_ns, bench.steady_ns) == jumps
+        assert bench.follower.receive_angles(angles, CONVENTION, now_ns, bench.steady_ns) == jumps
     bench = following()
     bench.follower.time_jumped_back()
     bench.silent = True
@@ -348,12 +348,12 @@ def test_foreign_angles_between_the_right_ones_are_not_overlooked() -> None:
 
 def test_beside_another_publisher_of_its_commands_it_is_silent_at_once() -> None:
     bench = following()
-    bench.follower.hear_publishers("another publisher of /arm: /other")
+    bench.follower.report_publishers("another publisher of /arm: /other")
     stopped = bench.run()
     assert (stopped.state, stopped.position) == (State.STOPPED, None)
     assert bench.changes()[-2:] == [(State.FOLLOWING, State.HOLDING), (State.HOLDING, State.STOPPED)]
     assert bench.run(1.0).reason == "another publisher of /arm: /other"
-    bench.follower.hear_publishers("")
+    bench.follower.report_publishers("")
     assert bench.run(0.45).state == State.STOPPED
     assert bench.run(0.2).state == State.APPROACHING
 
@@ -407,7 +407,7 @@ def test_joint_states_that_are_none_are_refused_and_not_followed(
     bench = Bench(state_topic=STATE_TOPIC)
     bench.mute = True
     with pytest.raises(FollowerError, match=said):
-        bench.follower.hear_robot(joints, np.array(position), bench.steady_ns)
+        bench.follower.receive_robot_state(joints, np.array(position), bench.steady_ns)
     assert said in bench.run().reason
 
 
@@ -518,7 +518,9 @@ def test_whatever_is_heard_the_robot_is_never_told_what_it_must_not(events: list
             now_ns += pause_ns
             if position is not None:
                 heard_ns = steady_ns
-                follower.hear_angles(seen(now_ns - age_ns, position, velocity, stddev), CONVENTION, now_ns, steady_ns)
+                follower.receive_angles(
+                    seen(now_ns - age_ns, position, velocity, stddev), CONVENTION, now_ns, steady_ns
+                )
             command = follower.step(now_ns, steady_ns)
             if heard_ns is None or steady_ns - heard_ns >= 90_000_000:
                 assert command.state in (State.HOLDING, State.STOPPED)
