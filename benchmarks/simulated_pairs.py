@@ -58,7 +58,7 @@ from body_tracking.core.skeleton import MIRROR, NANOSECONDS, BoolArray, FloatArr
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.csv_recording import CsvRecording
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
-from body_tracking.recording.calibrate import WHOLE
+from body_tracking.recording.calibrate import HISTORY_S
 from body_tracking.simulation.layouts import Layout, around
 from body_tracking.simulation.people import Person, joints
 from body_tracking.simulation.repertoire import make_movement
@@ -204,7 +204,7 @@ def parts(times: FloatArray) -> np.ndarray:
 
 def calibrated(frames: Sequence[tuple[str, int, Skeleton]]) -> Pair:
     """Frames in order of receipt (sensor, received, skeleton), and the calibration from all of them."""
-    calibration = OnlineCalibration(SENSORS, replace(CalibrationParameters(), history=WHOLE))
+    calibration = OnlineCalibration(SENSORS, replace(CalibrationParameters(), history=HISTORY_S))
     for sensor, received_ns, skeleton in frames:
         calibration.push(sensor, skeleton, received_ns)
     first, second = (

@@ -17,20 +17,20 @@ from body_tracking.core.skeleton import FloatArray
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
-"""Axis of the file that points up to the cyclic exchange that makes it z."""
+"""The cyclic permutation that makes an axis of the file z, by the axis that points up."""
 
 _BLOCK = 512
 _BIG_ENDIAN = 86
-"""C3D's number for processors of this kind."""
+"""C3D's code for big-endian processors."""
 
 
 class MarkerError(BodyTrackingError):
-    """A file does not hold the marker trajectories that are needed; the text says what it holds."""
+    """Raised when a file lacks the required marker trajectories; the text names those that it has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One subject of a file: (n, 3) of each point in the file's units and axes, NaN where it is not seen."""
+    """One subject of a file: (n, 3) metres per point, z up (angles in the file's units), NaN where it is not seen."""
 
     points: dict[str, FloatArray]
     rate: float
@@ -48,11 +48,11 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
 
     Args:
         path: of the file.
-        subject: the prefix of the points' names; needed where several have points that are wanted.
+        subject: the prefix of the points' names; required where several subjects have wanted points.
         wanted: names of points, without prefix.
 
     Raises:
-        MarkerError: the file cannot be read, or the subject is not there.
+        MarkerError: the file cannot be read, or lacks the subject.
     """
     frames = _announced_frames(path)
     try:
@@ -65,7 +65,7 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
         header = file["header"]["points"]
         data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(1, 2, 0)
         residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0]
-    # what it raises for a damaged file depends on where the damage is
+    # a damaged file raises any of these
     except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
         raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
 
@@ -110,7 +110,7 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
 
 
 def _announced_frames(path: Path) -> int:
-    """Frames by the file's header; also finds what ezc3d does not survive: folders, cut off parameters."""
+    """Number of frames by the file's header; refuses files that crash ezc3d: folders, truncated parameters."""
     try:
         size = path.stat().st_size
         if not path.is_file():
@@ -132,7 +132,7 @@ def _announced_frames(path: Path) -> int:
 
 
 def _of_subject(path: Path, labels: list[str], subject: str | None, wanted: Collection[str]) -> dict[str, int]:
-    """Names without prefix, and the places of their points."""
+    """Indices of a subject's points by their names without prefix."""
     split = [tuple(label.rpartition(":")[::2]) for label in labels]
     named = {prefix for prefix, name in split if name in wanted}
     if subject is not None and subject not in named:

@@ -1,4 +1,4 @@
-"""Compare a recorded person with the truth in all ways that ``metrics`` knows."""
+"""Compares a recorded person with the truth by all metrics of ``metrics``."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 MAX_GAP = 0.15
-"""Seconds: samples farther apart have a gap between them."""
+"""Samples farther apart have a gap between them, seconds."""
 WINDOW = 0.5
-"""Seconds up to which delays are looked for."""
+"""Half width of the search for the delay, seconds."""
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
-"""A true angle that would not stand out of 10 mm of doubt in every joint, as the plane of a hanging arm, counts not."""
+"""True angles that 10 mm of noise in every joint would make unknown, as the plane of a hanging arm, do not count."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationParameters:
-    """How to compare.
+    """Parameters of the comparison.
 
     Attributes:
         beyond: a joint farther from the truth is off track, metres.
-        own_clock: the truth's clock has nothing to do with the estimate's, nor its frame: only aligned.
+        own_clock: the truth has a clock and a frame of its own: compare aligned only.
     """
 
     beyond: float = 0.15
@@ -76,7 +76,7 @@ class AngleComparison:
         found: (n, m) radians.
         true: (n, m) radians; NaN where the true pose does not determine the angle.
         stddev: (n, m) radians, infinity where none is stated.
-        errors: between them.
+        errors: of ``found``.
     """
 
     names: tuple[str, ...]
@@ -93,14 +93,14 @@ class Comparison:
 
     Attributes:
         name: :data:`AS_IT_IS` or :data:`ALIGNED`.
-        alignment: what was done to the estimate.
+        alignment: applied to the estimate.
         times: (n,) s in the truth's time.
         found: (n, 25, 3) metres.
         true: (n, 25, 3) metres.
-        joints: errors between them.
-        off_track: (25,) share of the truth's frames from the first estimate on; NaN for joints that have no estimate.
+        joints: errors of ``found``.
+        off_track: (25,) share of the truth's frames from the first estimate on; NaN for joints without estimates.
         positional: the angles of ``kinematics.positional`` of both skeletons.
-        named: the estimate's own angles where the truth has the same names; None where there are none.
+        named: the estimate's own angles that the truth has too; None for none.
     """
 
     name: str
@@ -120,7 +120,7 @@ class SensorErrors:
 
     Attributes:
         sensor: its name.
-        times: (n,) s at which a pose was published, and the errors of each.
+        times: (n,) s at which poses were published.
         poses: errors of these.
         clock_times: (c,) s.
         clock: (c,) s, estimated minus true offset.
@@ -135,19 +135,19 @@ class SensorErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """All that was found.
+    """Result of an evaluation.
 
     Attributes:
-        estimate: what was judged.
-        truth: what it was judged by.
-        parameters: how.
-        span: (first, last) s in the truth's time, of what both cover.
-        delay: s by which the estimate follows the truth; NaN where that cannot be told.
+        estimate: the evaluated recording.
+        truth: its reference.
+        parameters: of the comparison.
+        span: (first, last) s in the truth's time, covered by both.
+        delay: s by which the estimate follows the truth; NaN where it is not observable.
         comparisons: as it is (where clock and frame are shared), and aligned.
         jitter: (25,) metres.
         lengths: of the bones.
         calibration: of each sensor but the one that defines world.
-        notes: what was left out, a line each.
+        notes: omissions, a line each.
     """
 
     estimate: Recorded
@@ -172,12 +172,12 @@ def evaluate(
 
     Args:
         estimate: of one person.
-        truth: of the same.
+        truth: of the same person.
         parameters: the defaults where None.
-        progress: called now and then with the share that is done, from 0 to 1.
+        progress: called with the completed share, from 0 to 1.
 
     Raises:
-        EvaluationError: no joint is known in both, nothing overlaps in time, or too little to compare.
+        EvaluationError: no joint is known in both, no overlap in time, or too little to compare.
     """
     p = parameters or EvaluationParameters()
     done = progress or (lambda share: None)
@@ -238,10 +238,10 @@ def evaluate(
 
 
 def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
-    """What will not be compared.
+    """Notes on what cannot be compared.
 
     Raises:
-        EvaluationError: nothing will.
+        EvaluationError: nothing can be compared.
     """
     mine, theirs = estimate.joints, truth.joints
     if not (mine & theirs).any():
@@ -265,7 +265,7 @@ def _joints(which: BoolArray) -> str:
 
 
 def _span(times: FloatArray, truth: tuple[float, float], estimate: Recorded, true: Recorded) -> tuple[float, float]:
-    """What both cover, s in the truth's time."""
+    """The common time span, s in the truth's time."""
     first, last = max(float(times[0]), truth[0]), min(float(times[-1]), truth[1])
     if not last > first:
         spans = (
@@ -297,10 +297,10 @@ def _own_clock_offset(whole: Trajectory, curve: Curve, estimate: Recorded, truth
     ]
     best = max(found, key=lambda each: each.correlation, default=None)
     if best is None or best.correlation < 0.5:
-        said = "none" if best is None else f"{best.correlation:.2f}"
+        found_best = "none" if best is None else f"{best.correlation:.2f}"
         raise EvaluationError(
             f"{estimate.source} and {truth.source} do not show the same movement: best correlation of their joints' "
-            f"speeds at any shift in time {said}, expected at least 0.5 over at least 2 s"
+            f"speeds at any shift in time {found_best}, expected at least 0.5 over at least 2 s"
         )
     return best.offset
 
@@ -337,8 +337,8 @@ def _compare(
             f"{estimate.source} knows {known(own.positions).mean():.0%} of the positions there, "
             f"{truth.source} {known(curve.at(own.times)).mean():.0%}"
         )
-    # From the first estimate on every frame of the truth counts, also those that the estimate has left out; but to its
-    # end only where the truth was recorded apart from it.
+    # From the first estimate on every frame of the truth counts, including those without estimate; after the last
+    # estimate only where both share a clock.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
     lost = (all_times > last + MAX_GAP) & (not p.own_clock)
     counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
@@ -392,7 +392,7 @@ def _named(
     zero_ns: int,
     p: EvaluationParameters,
 ) -> AngleComparison | None:
-    """The angles that have the same name in both; those that change with the frame are not turned with it."""
+    """The angles with the same names in both; frame-dependent angles are not transformed by the alignment."""
     mine = estimate.angles
     if mine is None or theirs is None:
         return None
@@ -408,7 +408,7 @@ def _named(
 
 
 def _unwrapped(angles: FloatArray) -> FloatArray:
-    """(n, m) angles without jumps by whole turns; what is unknown stays so."""
+    """(n, m) angles without jumps by whole turns; NaN stays NaN."""
     unwrapped = np.full_like(angles, np.nan)
     for column in range(angles.shape[1]):
         there = np.isfinite(angles[:, column])
@@ -417,7 +417,7 @@ def _unwrapped(angles: FloatArray) -> FloatArray:
 
 
 def _calibration(estimate: Recorded, truth: Recorded, zero_ns: int) -> tuple[SensorErrors, ...]:
-    """Of the sensors that both know, but for one that is right by definition: it is world."""
+    """Errors of the sensors known in both, without the one that defines world."""
     base = truth.positions[:, Joint.SPINE_BASE if truth.joints[Joint.SPINE_BASE] else int(truth.joints.argmax())]
     place = base[known(base)].mean(axis=0)
     found = []

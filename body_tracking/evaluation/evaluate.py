@@ -1,4 +1,4 @@
-"""``body_tracking evaluate``: how far an estimate is from the truth, as tables, CSV, JSON and a page with pictures."""
+"""``body_tracking evaluate``: errors against the truth as tables, CSV, JSON and a page with pictures."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _DEFAULTS = EvaluationParameters()
 
 
 def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
-    """The truth by the kind of its file, and whether its clock and frame are its own.
+    """The truth from a bag or a C3D file, and whether its clock and frame are its own.
 
     Raises:
-        BagError: neither a C3D file nor a bag that can be read.
-        EvaluationError: the bag holds no truth, or something was said that is of C3D files only.
-        MarkerError: nothing can be made of the C3D file.
+        BagError: neither a C3D file nor a readable bag.
+        EvaluationError: the bag has no truth, or an option for C3D files was given with a bag.
+        MarkerError: the C3D file is unusable.
     """
     path: Path = args.truth or args.estimate
     if path.suffix.lower() == ".c3d":
@@ -72,7 +72,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, print and write."""
     if not 0.0 < args.off_track < float("inf"):
         raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm, and finite")
     progress = Progress(0, 1000)

@@ -1,15 +1,13 @@
-"""How an estimate of a movement differs from the truth: pure functions on arrays.
+"""Errors of an estimated movement against the truth: pure functions on arrays.
 
-The comparison is made twice. *As it is*: each estimate against the truth at the instant and in the frame that it
-claims for itself, so that delay, calibration and offset count; this is what a robot gets. *Aligned*: as chapter 5.7 of
-Schlagenhauf 2017 compares with a marker system, after one constant shift in time and one rigid transform over the whole
-recording, the estimates interpolated linearly to 100 Hz; this is what the thesis's tables 5.3 and E.1 say.
+There are two comparisons. *As it is*: each estimate against the truth at its own stamp and in its own frame, including
+delay, calibration and offset, as for a robot. *Aligned*: after one constant shift in time and one rigid transform over
+the whole recording, the estimates interpolated linearly to 100 Hz, as chapter 5.7 of Schlagenhauf 2017 compares with a
+marker system (tables 5.3 and E.1).
 
-Besides, each joint's own constant offset can be taken off. It is constant in the frames of the body's segments
-(``segments``), as a sensor's and an anatomist's joint centres differ by a vector that turns with the person; an offset
-along the axes of the room would be none for somebody who turns.
+Errors are also given without each joint's own offset, which is constant in the frame of its segment (``segments``).
 
-NaN is what is not known, in every array; statistics are over what is known in both, and NaN where that is nothing.
+Unknown values are NaN in every array; statistics are over values known in both, and NaN without any.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ from body_tracking.evaluation.segments import segment_frames
 RATE = 100.0
 """Hz, the marker system's rate, to which the thesis interpolates (section 5.7.1)."""
 MIN_SPEED = 0.02
-"""m/s, RMS over joints: a slower movement does not show its time."""
+"""m/s, RMS over joints, below which the delay is not observable."""
 
 _LEVEL = 0.95
 _NORMAL = float(np.sqrt(chdtri(1, 1.0 - _LEVEL)))
@@ -40,7 +38,7 @@ _PARENTS, _CHILDREN = (np.array([bone[end] for bone in BONES], dtype=np.intp) fo
 
 
 class MetricsError(BodyTrackingError):
-    """An estimate and a truth cannot be compared."""
+    """Raised when an estimate and a truth cannot be compared."""
 
 
 class Curve:
@@ -74,7 +72,7 @@ class Curve:
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time of which anything is known, s; NaN if there is none."""
+        """First and last time with known values, s; NaN without any."""
         if not self._pieces:
             return float("nan"), float("nan")
         return min(piece[0] for piece in self._pieces), max(piece[1] for piece in self._pieces)
@@ -108,7 +106,7 @@ class Trajectory:
     Attributes:
         times: (n,) s, increasing.
         positions: (n, 25, 3) metres, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres, NaN or infinite where none is stated; None where none is at all.
+        covariances: (n, 25, 3, 3) square metres, NaN or infinite where none is stated; None without any.
     """
 
     times: FloatArray
@@ -130,7 +128,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """What takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation`` (thesis, eq. 4.1).
+    """Takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation`` (thesis, eq. 4.1).
 
     Attributes:
         delay: s by which the estimate follows the truth.
@@ -152,20 +150,19 @@ class Alignment:
 def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: float = 0.0) -> float:
     """The constant time by which an estimate follows the truth, by least squares (thesis, sections 4.3.2 and 5.7.1).
 
-    The delay with which ``R e_j(t) + b_j - truth_j(t - delay)`` has the least mean square over times and joints, where
-    the rotation R and an offset b_j of each joint are free: for a delay both have a closed form (Umeyama 1991, each
-    joint about its own mean), so that neither frames nor joint centres need agree. A grid finds the valley, Brent's
-    method its bottom.
+    Minimises the mean square of ``R e_j(t) + b_j - truth_j(t - delay)`` over times and joints. The rotation R and the
+    joints' offsets b_j are free, with a closed form for each delay (Umeyama 1991, each joint about its own mean), so
+    that neither frames nor joint centres need agree. A grid search brackets the minimum for Brent's method.
 
     Args:
         estimate: at any times.
         truth: (..., 25, 3) metres.
         window: half the width of the search, s.
-        around: its middle, s.
+        around: its centre, s.
 
     Returns:
-        Seconds; NaN where the movement does not show it: less than 20 mm/s of RMS speed, less than two windows in
-        common, or the best value at the edge of the search.
+        Seconds; NaN where the delay is not observable: less than 20 mm/s of RMS speed, less than two windows in
+        common, or the minimum at the edge of the search.
     """
     first, last = truth.span
     shown = estimate.times - around
@@ -202,9 +199,7 @@ def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: 
 
 
 def align(estimate: Trajectory, truth: Curve, delay: float) -> Alignment:
-    """The rigid transform over the whole recording with the least squares over all joints (thesis, section 5.7.1).
-
-    The registration is that of the thesis, eq. 5.1-5.7.
+    """The least-squares rigid transform over all joints of the whole recording (thesis, section 5.7.1, eq. 5.1-5.7).
 
     Args:
         estimate: at its own times.
@@ -233,7 +228,7 @@ def grid(first: float, last: float, rate: float = RATE) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointErrors:
-    """Differences of k joints over time; metres. The thesis's MAE and MAD are those of its tables 5.2-5.3 and E.1.
+    """Errors of k joints over time; metres. MAE and MAD as in the thesis's tables 5.2-5.3 and E.1.
 
     Attributes:
         frames: (k,) instants at which both are known.
@@ -266,7 +261,7 @@ def joint_errors(found: FloatArray, true: FloatArray, covariances: FloatArray | 
     Args:
         found: (n, 25, 3) metres.
         true: (n, 25, 3) metres.
-        covariances: (n, 25, 3, 3) square metres, of what was found; None where none are stated.
+        covariances: (n, 25, 3, 3) square metres, of ``found``; None where none are stated.
     """
     error = np.where((known(found) & known(true))[..., None], found - true, np.nan)
     distance = np.linalg.norm(error, axis=-1)
@@ -292,7 +287,7 @@ def position_coverage(error: FloatArray, covariances: FloatArray) -> FloatArray:
 
     Args:
         error: (n, k, 3) metres.
-        covariances: (n, k, 3, 3) square metres; those that are not finite or not positive definite state nothing.
+        covariances: (n, k, 3, 3) square metres; ignored where not finite or not positive definite.
 
     Returns:
         (k,) from 0 to 1.
@@ -307,7 +302,7 @@ def position_coverage(error: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 def off_track(found: FloatArray, true: FloatArray, beyond: float) -> FloatArray:
-    """Share of the frames in which a joint is missing or farther off than ``beyond``, of those in which it is known.
+    """Share of the frames with a true joint in which the estimate is missing or farther off than ``beyond``.
 
     Args:
         found: (n, k, 3) metres.
@@ -322,14 +317,14 @@ def off_track(found: FloatArray, true: FloatArray, beyond: float) -> FloatArray:
 
 
 def jitter(times: FloatArray, found: FloatArray, true: FloatArray) -> FloatArray:
-    """The shaking of each joint beyond the true movement, as the white noise that would shake it as much.
+    """Jitter of each joint beyond the true movement, as the standard deviation of equivalent white noise.
 
-    The root of what the mean squared third difference of the estimate exceeds that of the truth at the same instants,
-    over the square root of 20: the third difference of white noise of standard deviation s has s sqrt(1 + 9 + 9 + 1).
-    It is blind to offset, to delay and to errors that change slowly.
+    The excess of the estimate's mean squared third difference over the truth's at the same instants, divided by 20: the
+    third difference of white noise with variance s^2 has the variance (1 + 9 + 9 + 1) s^2. Offsets, delay and slow
+    errors have no influence.
 
     Args:
-        times: (n,) s; four frames in a row count whose steps are within a quarter of the median step.
+        times: (n,) s; uses four frames in a row whose steps are within a quarter of the median step.
         found: (n, k, 3) metres.
         true: (n, k, 3) metres at the same times.
 
@@ -351,7 +346,7 @@ def jitter(times: FloatArray, found: FloatArray, true: FloatArray) -> FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LengthErrors:
-    """Of the 24 bones of ``skeleton.BONES``; metres.
+    """Errors of the lengths of the 24 bones of ``skeleton.BONES``; metres.
 
     Attributes:
         spread: (24,) standard deviation of the estimated length over time.
@@ -385,7 +380,7 @@ def length_errors(found: FloatArray, true: FloatArray) -> LengthErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleErrors:
-    """Differences of m angles over time; radians.
+    """Errors of m angles over time; radians.
 
     Attributes:
         frames: (m,) instants at which both are known.
@@ -412,7 +407,7 @@ def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None 
     Args:
         found: (n, m) radians.
         true: (n, m) radians.
-        stddev: (n, m) radians; what is not finite or not positive states nothing. None where none are stated.
+        stddev: (n, m) radians; ignored where not finite or not positive. None where none are stated.
     """
     error = wrapped(found - true)
     offset = _mean(error)
@@ -432,19 +427,19 @@ def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None 
 
 
 def wrapped(angles: FloatArray) -> FloatArray:
-    """Angles brought to -pi .. pi, radians."""
+    """Angles wrapped to -pi .. pi, radians."""
     around: FloatArray = (angles + np.pi) % (2.0 * np.pi) - np.pi
     return around
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
-    """Of n poses of one sensor.
+    """Errors of n poses of one sensor.
 
     Attributes:
         rotation: (n,) radians.
         translation: (n,) metres, of the sensor.
-        displacement: (n,) metres by which a point where the person is comes out elsewhere.
+        displacement: (n,) metres, of a point at the person's place.
     """
 
     rotation: FloatArray
@@ -478,12 +473,12 @@ def pose_errors(
 
 
 def known(positions: FloatArray) -> BoolArray:
-    """(..., ) which of (..., 3) points have all coordinates."""
+    """(...) which of (..., 3) points are finite."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Over the first axis, of what is known."""
+    """Mean over the first axis, without NaN."""
     there = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(there, values, 0.0).sum(axis=0) / there.sum(axis=0)
@@ -491,6 +486,6 @@ def _mean(values: FloatArray) -> FloatArray:
 
 
 def _max(values: FloatArray) -> FloatArray:
-    """Over the first axis, of what is known."""
+    """Maximum over the first axis, without NaN."""
     largest: FloatArray = np.fmax.reduce(values, axis=0, initial=np.nan)
     return largest

@@ -19,9 +19,9 @@ from body_tracking.evaluation.report import named_are_positional, write
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
 _COLUMNS, _INSTANTS = 4, 6
 _POINTS = 1500
-"""No curve needs more of them than the picture has columns."""
+"""Points of a curve at most: no more than the picture has columns."""
 _VIEW = np.radians(25.0)
-"""By which the viewer stands off the person's front, so that depth shows."""
+"""Angle of the view from the person's front, so that depth is visible."""
 _LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
 
 
@@ -42,7 +42,7 @@ def draw(tracked: Tracked, path: Path) -> None:
 
 
 def pictures(result: Evaluation) -> list[tuple[str, str]]:
-    """Of each picture of an evaluation's report the caption and the ``data:`` address."""
+    """Captions and ``data:`` addresses of the pictures of an evaluation's report."""
     first = result.comparisons[0]
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
     stated = np.isfinite(angles.stddev)
@@ -58,7 +58,7 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
 
 
 def _figure(height: float) -> Any:
-    from matplotlib.figure import Figure  # slow to import, and whoever asks for a table alone does not need it
+    from matplotlib.figure import Figure  # slow to import, and not needed for tables
 
     return Figure(figsize=(15.0, height), dpi=100, layout="constrained")
 
@@ -94,7 +94,7 @@ def _side(name: str) -> str:
 
 
 def _panels(names: tuple[str, ...]) -> dict[str, list[int]]:
-    """Title to columns: left and right of an angle share a panel."""
+    """Columns by title: left and right of an angle share a panel."""
     panels: dict[str, list[int]] = {}
     for column, name in enumerate(names):
         panels.setdefault(name.removesuffix(f"_{_side(name)}").replace("_", " "), []).append(column)
@@ -106,7 +106,7 @@ def _height(names: tuple[str, ...]) -> float:
 
 
 def _unbroken(degrees: FloatArray) -> FloatArray:
-    """The curve with a gap where it passes from +180 to -180 or back."""
+    """The curve with gaps where it wraps between +180 and -180."""
     curve = degrees.copy()
     curve[1:][np.abs(np.diff(degrees)) > 180.0] = np.nan
     return curve
@@ -166,7 +166,7 @@ def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
 
 
 def _view(skeletons: list[Skeleton]) -> FloatArray:
-    """(2, 3) world to picture: somewhat off the front that the person shows on average, z up."""
+    """(2, 3) world to picture: turned from the person's mean front by the angle of the view, z up."""
     across = np.array([each.positions[Joint.HIP_LEFT] - each.positions[Joint.HIP_RIGHT] for each in skeletons])
     left = np.nan_to_num(across).sum(axis=0)
     heading = np.arctan2(left[1], left[0]) + _VIEW  # the person's left is the picture's right

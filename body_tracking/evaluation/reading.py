@@ -1,4 +1,4 @@
-"""What a recording holds of a person: skeletons, joint angles and calibration, estimated and true."""
+"""Reads a person's skeletons, joint angles and calibration from recordings, estimated and true."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
 _EXACT, _AMPLIFIED = 1e-6, 10.0
-"""Radians: so well known is the body model's true pose; an angle that makes more than ten times of it counts not."""
+"""Assumed error of the true pose, radians; true angles that amplify it by more than the factor do not count."""
 
 
 class EvaluationError(BodyTrackingError):
-    """A recording does not hold what is to be evaluated."""
+    """Raised when a recording lacks the data to evaluate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,20 +53,20 @@ class AngleSeries:
 
     @property
     def known(self) -> FloatArray:
-        """(n, m) the angles, NaN where nothing observes them."""
+        """(n, m) the angles, NaN where unobserved."""
         return np.where(np.isfinite(self.stddev), self.position, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """What a recording holds of one person.
+    """One person in a recording.
 
     Attributes:
         bag: the folder or file.
         body: the person's id.
-        angles: what was measured.
+        angles: estimated.
         skeletons: filtered, in time order; may be empty.
-        true_angles: None where the recording holds no truth.
+        true_angles: None where the recording has no truth.
         true_skeletons: in time order; may be empty.
     """
 
@@ -85,10 +85,10 @@ class Tracked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorClaims:
-    """What is said of one sensor's pose and clock over time; stamps in nanoseconds of the reference clock.
+    """One sensor's published poses and clock over time; stamps in nanoseconds of the reference clock.
 
     Attributes:
-        pose_stamps_ns: (n,) from when each pose is used.
+        pose_stamps_ns: (n,) from which each pose holds.
         rotations: (n, 3, 3) sensor to world.
         translations: (n, 3) metres.
         clock_stamps_ns: (c,).
@@ -104,19 +104,19 @@ class SensorClaims:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """Skeletons of one person over time with what belongs to them: an estimate, or the truth.
+    """Skeletons, angles and calibration of one person over time: an estimate, or the truth.
 
     Attributes:
         source: the bag or file.
-        topic: of the skeletons; empty where the file has none.
+        topic: of the skeletons; empty for a file without topics.
         frame_id: of the positions.
         stamps_ns: (n,) capture times, increasing, nanoseconds.
         positions: (n, 25, 3) metres, NaN where unknown.
         covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
-        angles: by name; None where there are none.
+        angles: None for none.
         sensors: calibration by sensor.
-        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None where there are none.
-        warnings: what the file itself lacks, a line each.
+        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None for none.
+        warnings: problems of the file, a line each.
     """
 
     source: Path
@@ -132,7 +132,7 @@ class Recorded:
 
     @property
     def joints(self) -> BoolArray:
-        """(25,) joints that are ever known."""
+        """(25,) joints that are known in any frame."""
         return np.asarray(np.isfinite(self.positions).all(axis=-1).any(axis=0))
 
     def seconds(self, zero_ns: int) -> FloatArray:
@@ -141,7 +141,7 @@ class Recorded:
 
 
 def read(path: Path, body: str | None = None, truth: Path | None = None) -> Tracked:
-    """Read the angles of a person, and all that helps to show them, from a bag.
+    """Read a person's angles and skeletons, and the truth, from a bag.
 
     Args:
         path: a bag folder or an mcap file.
@@ -149,8 +149,8 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
         truth: the bag with the truth; this one where None.
 
     Raises:
-        BagError: no such bag, or nothing of it can be read.
-        EvaluationError: it holds no joint angles, or none of this person.
+        BagError: no such bag, or it is unreadable.
+        EvaluationError: no joint angles, or none of this person.
     """
     with RigReader(path) as bag:
         if not bodies(bag):
@@ -174,15 +174,16 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
 
 
 def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: AngleSeries | None) -> AngleSeries | None:
-    """The truth in the convention of the angles that are judged.
+    """The truth in the convention of the evaluated angles.
 
     Args:
-        names: of the judged angles.
-        own: the true angles that a recording holds, of ``kinematics.positional``; None for none.
+        names: of the evaluated angles.
+        own: the true angles of a recording, of ``kinematics.positional``; None for none.
         coordinates: the true coordinates of the body model; None for none.
 
     Returns:
-        The angles of a convention of the model, made of the coordinates, where these are there; ``own`` otherwise.
+        Angles computed from the coordinates, if there are any and the names are of a convention of the model; else
+        ``own``.
     """
     if coordinates is None:
         return own
@@ -208,7 +209,7 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
 
 
 def bodies(bag: BagReader) -> tuple[str, ...]:
-    """The ids of the people whose joint angles a bag holds, sorted."""
+    """The ids of the people with joint angles in a bag, sorted."""
     return tuple(
         sorted(
             topic.removeprefix(_PREFIX).removesuffix(_SUFFIX)
@@ -226,7 +227,7 @@ def read_angles(bag: BagReader, body: str | None = None) -> tuple[str, AngleSeri
         body: the person's id; the first one in the bag where None.
 
     Raises:
-        EvaluationError: the bag holds no joint angles of this person, or none that can be read.
+        EvaluationError: no readable joint angles of this person.
     """
     found = bodies(bag)
     if body is not None and body not in found:
@@ -239,10 +240,10 @@ def read_angles(bag: BagReader, body: str | None = None) -> tuple[str, AngleSeri
 
 
 def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | None:
-    """A topic's positions as a series in time order; frames with other names than the first are left out.
+    """A topic's positions in time order; messages with other names than the first are left out.
 
     Returns:
-        With standard deviations of zero and names without the body's id; None where there is no such message.
+        A series with zero standard deviations and names without the body's id; None without messages.
     """
     if topic not in bag.topics or bag.topics[topic].type_name != JOINT_STATE:
         return None
@@ -262,7 +263,7 @@ def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | No
 
 
 def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSeries:
-    """Values with the deviations of the same stamp; infinity where there is none."""
+    """Values with the deviations of the same stamp, or infinity."""
     stddev = np.full_like(values.position, np.inf)
     if deviations is not None and deviations.names == values.names:
         _, here, there = np.intersect1d(values.stamps_ns, deviations.stamps_ns, return_indices=True)
@@ -272,22 +273,22 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
 
 
 def read_frames(bag: BagReader, topic: str) -> dict[int, tuple[Skeleton, ...]]:
-    """The bodies of each of a topic's messages, at least one, by stamp and in time order; damaged ones are left out."""
+    """The bodies of a topic's messages by stamp, in time order; malformed messages are left out."""
     if topic not in bag.topics or bag.topics[topic].type_name != POINT_CLOUD:
         return {}
     frames = {}
     for raw in bag.messages([topic]):
         try:
-            everybody = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
+            skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except MessageError:
             continue
-        frames[everybody[0].stamp_ns] = everybody
+        frames[skeletons[0].stamp_ns] = skeletons
     return dict(sorted(frames.items()))
 
 
 def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
-    """The first body of each of a topic's messages in time order; none where the topic is missing or holds others."""
-    return tuple(everybody[0] for everybody in read_frames(bag, topic).values())
+    """The first body of each of a topic's messages, in time order; empty without such a topic."""
+    return tuple(skeletons[0] for skeletons in read_frames(bag, topic).values())
 
 
 def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS) -> IntArray:
@@ -302,7 +303,7 @@ def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS
 
 
 def true_at(angles: AngleSeries, truth: AngleSeries | None) -> FloatArray:
-    """(n, m) the truth at the stamps of what was measured, or within 20 ms; NaN where there is none."""
+    """(n, m) the truth within 20 ms of the stamps of the angles; NaN where there is none."""
     true = np.full_like(angles.position, np.nan)
     if truth is not None:
         matches = nearest(truth.stamps_ns, angles.stamps_ns)
@@ -316,7 +317,7 @@ def true_at(angles: AngleSeries, truth: AngleSeries | None) -> FloatArray:
 
 
 def read_estimate(path: Path, topic: str | None = None, body: str | None = None) -> Recorded:
-    """The skeletons, angles and calibration that a bag holds.
+    """The estimated skeletons, angles and calibration in a bag.
 
     Args:
         path: a bag folder or an mcap file.
@@ -325,7 +326,7 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
 
     Raises:
         BagError: no such bag, or nothing of it can be read.
-        EvaluationError: it holds no such topic, of no such type, nothing in it, or no angles of this person.
+        EvaluationError: the topic is missing, empty or of another type, or there are no angles of this person.
     """
     with RigReader(path) as bag:
         if topic is None:
@@ -337,7 +338,7 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
 
 
 def read_truth(path: Path, body: str | None = None) -> Recorded:
-    """The true skeletons, angles and calibration that a bag holds.
+    """The true skeletons, angles and calibration in a bag.
 
     Args:
         path: a bag folder or an mcap file.
@@ -359,27 +360,27 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
 
 
 def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
-    """Joint centres from markers as the truth; its clock and frame are its own.
+    """Joint centres from markers as the truth, with a clock and a frame of its own.
 
     Args:
         path: a C3D file with the markers of Plug-in Gait.
-        subject: whose; needed where the file holds several.
-        measurements: of the subject, a file of Vicon's; those in the C3D file where None.
+        subject: required where the file has several.
+        measurements: Vicon's file of the subject's measurements; those in the C3D file where None.
 
     Raises:
-        MarkerError: the files cannot be read, or too few markers are there.
+        MarkerError: unreadable files, or too few markers.
     """
     measured = None if measurements is None else read_measurements(measurements)
     markers = read_plug_in_gait(path, subject=subject, measurements=measured)
-    said = [f"{path}: not seen: {gap}" for gap in markers.gaps]
+    warnings = [f"{path}: not seen: {gap}" for gap in markers.gaps]
     for names, what in ((markers.missing, "has no marker"), (markers.estimated, "estimates the subject's")):
         if names:
-            said.append(f"{path}: {what} {', '.join(names)}")
-    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(said))
+            warnings.append(f"{path}: {what} {', '.join(names)}")
+    return replace(truth_of_markers(path, markers.stamps, markers.positions), warnings=tuple(warnings))
 
 
 def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
-    """Joint centres from markers as the truth; its clock and frame are its own.
+    """Joint centres as the truth, with a clock and a frame of its own.
 
     Args:
         source: the file.
@@ -406,10 +407,10 @@ def _recorded(bag: BagReader, topic: str, advice: str) -> Recorded:
             f"{bag.path}: {len(frames)} skeleton(s) with a stamp of their own in the {info.count} messages of "
             f"{topic}, at least 2 are needed"
         )
-    skeletons = [everybody[0] for everybody in frames.values()]
+    skeletons = [bodies_there[0] for bodies_there in frames.values()]
     people = max(map(len, frames.values()))
     crowd = (f"{bag.path}: {topic} holds {people} people, only the first is compared",) if people > 1 else ()
-    # infinite ones state as little as none, and would spread when they are turned
+    # infinite covariances become NaN: a rotation would spread infinity over all elements
     stated = [
         np.where(np.isfinite(each.covariances), each.covariances, np.nan)
         for each in skeletons

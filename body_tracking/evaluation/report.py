@@ -1,4 +1,4 @@
-"""What an evaluation found, for people and programs: tables on a terminal, CSV, JSON and one page of HTML."""
+"""Writes the results of an evaluation: tables on a terminal, CSV, JSON and one page of HTML."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def _rms(values: FloatArray) -> float:
 
 
 class Column(NamedTuple):
-    """A number for each row of a table.
+    """A column of a table.
 
     Attributes:
-        key: for programs.
-        title: for people.
+        key: in CSV and JSON.
+        title: in text.
         unit: mm, deg, % or ms.
-        values: (rows,) in the unit; NaN where there is nothing to say.
-        pool: how rows become one.
+        values: (rows,) in the unit; NaN for no value.
+        pool: combines rows into one.
     """
 
     key: str
@@ -48,14 +48,14 @@ class Column(NamedTuple):
     pool: Callable[[FloatArray], float] = np.mean
 
     def text(self, row: int) -> str:
-        """One number for people."""
+        """The formatted value of a row."""
         value = self.values[row]
         return "-" if np.isnan(value) else f"{value:.{_DIGITS[self.unit]}f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Rows of numbers; ``key`` is for programs, ``title`` and ``note`` for people."""
+    """Rows of numbers; ``key`` is used in CSV and JSON, ``title`` and ``note`` in text."""
 
     key: str
     title: str
@@ -68,7 +68,7 @@ class Table:
         return {column.key: float(column.values[self.names.index(name)]) for column in self.columns}
 
     def text(self) -> str:
-        """For people: titles, units, a line and the rows."""
+        """Titles, units, a line and the rows."""
         titles = [self.title, *(column.title for column in self.columns)]
         rows = [titles, ["", *(column.unit for column in self.columns)]]
         rows += [[name, *(column.text(row) for column in self.columns)] for row, name in enumerate(self.names)]
@@ -80,7 +80,7 @@ class Table:
         return "\n".join([header, units, "-" * len(header), *others])
 
     def pooled(self, groups: dict[str, IntArray], rows: IntArray) -> Table:
-        """The given rows, and one more for each group of rows."""
+        """The given rows, and a pooled row for each group."""
 
         def values(column: Column) -> FloatArray:
             known = [column.values[group][np.isfinite(column.values[group])] for group in groups.values()]
@@ -91,7 +91,7 @@ class Table:
 
 
 def tables(result: Evaluation) -> tuple[Table, ...]:
-    """Everything that was found, as tables."""
+    """All results as tables."""
     made = [_joint_table(result, comparison) for comparison in result.comparisons]
     for each in result.comparisons:
         made.append(_angle_table(each.positional, each.name, "angles", "angles of both skeletons"))
@@ -101,7 +101,7 @@ def tables(result: Evaluation) -> tuple[Table, ...]:
 
 
 def named_are_positional(result: Evaluation) -> bool:
-    """Whether the angles that the estimate states are those that are computed from its skeletons anyway."""
+    """Whether the estimate's own angles are those computed from its skeletons."""
     angles = result.estimate.angles
     return angles is not None and set(angles.names) == set(result.comparisons[0].positional.names)
 
@@ -180,7 +180,7 @@ def _calibration_table(result: Evaluation) -> Table:
 
 
 def facts(result: Evaluation) -> str:
-    """What is true of the whole recording, a line each."""
+    """Facts about the whole recording, a line each."""
     estimate, truth = result.estimate, result.truth
     first, last = result.span
     length = float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / NANOSECONDS
@@ -192,22 +192,22 @@ def facts(result: Evaluation) -> str:
         ("delay", "cannot be told" if np.isnan(result.delay) else delay),
     ]
     for comparison in result.comparisons:
-        said = {column.key: column.text(-1) for column in _joint_table(result, comparison).columns}
-        offset = f"{said['fixed_rms']} mm without each joint's own offset"
-        rows.append((comparison.name, f"RMS 3D {said['rms']} mm; {offset}"))
+        pooled = {column.key: column.text(-1) for column in _joint_table(result, comparison).columns}
+        offset = f"{pooled['fixed_rms']} mm without each joint's own offset"
+        rows.append((comparison.name, f"RMS 3D {pooled['rms']} mm; {offset}"))
     if named_are_positional(result):
         rows.append(("angles", "those that the estimate states by name are those of its skeletons"))
     return "\n".join(f"{name:<9} {value}" for name, value in (*rows, *(("note", note) for note in result.notes)))
 
 
 def text(result: Evaluation) -> str:
-    """The tables for people: without angles by name that are those of the skeletons once more."""
+    """The tables as text, without named angles that repeat those of the skeletons."""
     shown = [each for each in tables(result) if not (each.key.startswith("named") and named_are_positional(result))]
     return "\n".join(f"\n{each.text()}\n{each.note}" for each in shown)
 
 
 def as_csv(result: Evaluation) -> str:
-    """A line per number: table, row, column, unit, value, which is empty where there is nothing to say."""
+    """A line per number: table, row, column, unit, value; the value is empty for NaN."""
     lines = io.StringIO()
     writer = csv.writer(lines, lineterminator="\n")
     writer.writerow(("table", "row", "column", "unit", "value"))
@@ -222,7 +222,7 @@ def as_csv(result: Evaluation) -> str:
 
 
 def as_json(result: Evaluation) -> str:
-    """For programs: facts, and tables of rows of columns; null where there is nothing to say."""
+    """Facts and tables as JSON; null for NaN."""
 
     def number(value: float) -> float | None:
         return round(float(value), 6) if np.isfinite(value) else None
@@ -249,7 +249,7 @@ def as_json(result: Evaluation) -> str:
 
 
 def page(result: Evaluation, pictures: Iterable[tuple[str, str]]) -> str:
-    """One HTML page that needs nothing else; of each picture the caption and the ``data:`` address."""
+    """One self-contained HTML page; ``pictures`` are captions and ``data:`` addresses."""
     title = html.escape(f"{result.estimate.source.name}: accuracy")
     shown = "".join(f'<h2>{html.escape(caption)}</h2>\n<img alt="" src="{data}">\n' for caption, data in pictures)
     return f"""<!DOCTYPE html>
@@ -263,7 +263,7 @@ def page(result: Evaluation, pictures: Iterable[tuple[str, str]]) -> str:
 
 
 def write(path: Path, content: bytes) -> None:
-    """A file; its folder is made where it is missing.
+    """Write a file, and create its folder if needed.
 
     Raises:
         EvaluationError: it cannot be written.

@@ -1,12 +1,12 @@
-"""Frames that move with the segments of a body, from its joint positions alone.
+"""Frames of a body's segments, computed from its joint positions.
 
-An anatomist's joint centre and a sensor's differ by a vector that stays with the segment, not with the room: on a
-person who turns round it turns too. So a constant offset is told, and taken off, in these frames.
+An anatomical joint centre and a sensor's differ by a vector that is constant in the frame of the segment, so constant
+offsets are estimated and removed in these frames.
 
-Pelvis and thorax have three points each. A limb's segment has two, which leave its rotation about itself open; it is
-taken over from the segment before it by the smallest rotation that brings the one along the other. For an elbow or
-knee, a hinge, that is the joint's own movement, straight or bent; for a shoulder or hip it starts from a direction
-whose opposite the limb cannot reach, so that it is continuous.
+Pelvis and thorax have three points each. A limb's segment has two, which leave its rotation about its axis free; its
+frame is that of its parent segment, turned by the smallest rotation that aligns the two. For an elbow or knee, a hinge,
+that is the joint's own movement; for a shoulder or hip it starts from a direction whose opposite is out of reach, so
+that it is continuous.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NEUTRAL = {
     Joint.HIP_LEFT: np.array([0.0, 0.0, -1.0]),
     Joint.HIP_RIGHT: np.array([0.0, 0.0, -1.0]),
 }
-"""The middle of what the first bone of each limb can reach: x forward, y left, z up."""
+"""Centre of the reach of each limb's first bone: x forward, y left, z up."""
 
 
 def segment_frames(positions: FloatArray) -> FloatArray:
@@ -42,8 +42,8 @@ def segment_frames(positions: FloatArray) -> FloatArray:
 
     Returns:
         (n, 25, 3, 3) rotations that take coordinates in the segment's frame (in the neutral pose x forward, y left,
-        z up) to those of the positions. Where one of pelvis and thorax is unknown the other stands for it, and for a
-        bone that is unknown the one before it; NaN where both pelvis and thorax are.
+        z up) to those of the positions. An unknown pelvis or thorax is replaced by the other one, an unknown bone by
+        its parent; NaN where both pelvis and thorax are unknown.
     """
     joint = {each: positions[:, each] for each in Joint}
     middle = joint[Joint.SPINE_MID]
@@ -77,20 +77,20 @@ def _axes(up: FloatArray, left: FloatArray) -> FloatArray:
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """(n, 3) vectors of length 1; NaN where they have none."""
+    """(n, 3) vectors of length 1; NaN for zero vectors."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     unit: FloatArray = vectors / np.where(length > 1e-6, length, np.nan)
     return unit
 
 
 def _known_or(values: FloatArray, others: FloatArray) -> FloatArray:
-    """``values`` (n, ...) with the ``others`` at the instants at which they are not known."""
+    """``values`` (n, ...), replaced by ``others`` at instants where they are not finite."""
     known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)), keepdims=True)
     return np.where(known, values, others)
 
 
 def _smallest_rotation(start: FloatArray, end: FloatArray) -> FloatArray:
-    """(n, 3, 3) rotations that bring (n, 3) unit vectors along others: Rodrigues' formula about their normal."""
+    """(n, 3, 3) rotations that take (n, 3) unit vectors to others: Rodrigues' formula about their normal."""
     cross = skew(np.cross(start, end))
     cosine = (start * end).sum(axis=-1)[:, None, None]
     rotation: FloatArray = np.eye(3) + cross + cross @ cross / np.maximum(1.0 + cosine, 1e-9)

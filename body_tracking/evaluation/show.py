@@ -18,8 +18,8 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
     """A row per angle, degrees.
 
     Args:
-        angles: what was measured.
-        truth: what was true, at any stamps within 20 ms of the measured ones; its columns are left out without it.
+        angles: estimated.
+        truth: at any stamps within 20 ms of the estimated ones; without it its columns are left out.
     """
     known, true = angles.known, true_at(angles, truth)
     final = np.array([next(iter(column[np.isfinite(column)][::-1]), np.nan) for column in known.T])
@@ -44,7 +44,7 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
 
 
 def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
-    """The least and the greatest of (n, m) angles, NaN where unknown."""
+    """Minimum and maximum of (n, m) angles, without NaN."""
     known = np.isfinite(values)
     least, most = np.where(known, values, np.inf).min(axis=0), np.where(known, values, -np.inf).max(axis=0)
     least, most = (np.degrees(np.where(known.any(axis=0), each, np.nan)) for each in (least, most))
@@ -53,7 +53,7 @@ def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
 
 
 def summarise(bag: Path, png: Path | None = None, body: str | None = None, truth: Path | None = None) -> Table:
-    """A summary of every joint angle in a bag; the picture too where a path for it is given.
+    """A summary of every joint angle in a bag; with ``png``, also draws a picture.
 
     Raises:
         BagError: no such bag, or nothing of it can be read.
@@ -70,7 +70,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "show",
         description="Print a table of the joint angles in a recording with their standard deviations, and draw them. "
-        "Where the recording holds the truth, errors are shown beside.",
+        "Where the recording holds the truth, errors are shown too.",
     )
     parser.add_argument("bag", type=Path, help="a bag folder with joint angles, such as the output of replay")
     parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
@@ -80,7 +80,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print, and draw."""
     print(summarise(args.bag, args.output, args.body, args.truth).text())
     if args.output is not None:
         print(f"\npicture: {args.output}")

@@ -1,4 +1,4 @@
-"""Marker trajectories without their short gaps and their noise, as Schlagenhauf (2017, section 5.6.3) prepares them."""
+"""Fills short gaps in marker trajectories and smooths them, as Schlagenhauf (2017, section 5.6.3)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ _ROUGHEST = -4.0
 def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> FloatArray:
     """A trajectory with its gaps shorter than ``longest`` filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
 
-    A spline goes through all that is known between two longer gaps. What precedes the first known sample and follows
-    the last one stays unknown.
+    A spline goes through all known samples between two longer gaps. The ends are not extrapolated.
 
     Args:
         values: (n, 3), NaN where unknown.
@@ -65,7 +64,7 @@ def smooth(values: FloatArray) -> FloatArray:
 
 
 def _gcv_residual(values: FloatArray) -> FloatArray:
-    """(n, k) what the smoothing spline takes away."""
+    """(n, k) residuals of the smoothing spline."""
     n = len(values)
     curvature = np.diff(values, 2, axis=0)
     roughness = np.repeat([[1.0], [-4.0], [6.0]], n - 2, axis=1)  # of Q'Q and R in Reinsch's names

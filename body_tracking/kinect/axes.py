@@ -1,4 +1,4 @@
-"""Kinect v2 camera space to the optical frame: the only place where the two meet.
+"""Kinect v2 camera space to the optical frame.
 
 Camera space (Kinect for Windows SDK 2.0, ``CameraSpacePoint``): metres, x to the sensor's left, y up, z forward.
 Optical frame (REP-103): x to the right, y down, z forward. Both are right-handed; they differ by half a turn about z.

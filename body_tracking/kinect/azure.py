@@ -3,17 +3,16 @@
 Microsoft's ROS driver (Azure_Kinect_ROS_Driver, both for ROS 1 and 2) publishes ``body_tracking_data``, a
 ``visualization_msgs/MarkerArray`` with a sphere per joint and body, whose id is ``100 body + joint`` with the joint of
 ``k4abt_joint_id_t``, in the frame of the depth camera (metres, x right, y down, z forward: already an optical frame),
-and with the capture time as its stamp. The SDK's confidence in a joint is not in there, and the SDK places occluded
-joints too, so nothing tells a seen joint from a guessed one.
+stamped with the capture time. The message lacks the SDK's confidence, and the SDK places occluded joints too, so seen
+and guessed joints cannot be distinguished.
 
-Each of the 25 joints has a counterpart, but for two: the Kinect v2's SpineMid lies between the SDK's navel and chest,
-and its SpineShoulder where the clavicles begin, between the two of them; both are halfway here. Nose, eyes and ears of
-the SDK have no counterpart and are left out. That the two systems put a name on slightly different points of a body
-(Albert et al. 2020, Sensors 20:5104) no mapping can mend.
+Two of the 25 joints have no counterpart: the Kinect v2's SpineMid lies between the SDK's navel and chest, and its
+SpineShoulder between the inner ends of the clavicles; both are computed as midpoints. Nose, eyes and ears of the SDK
+are left out. The two systems place joints of one name at slightly different points of the body (Albert et al. 2020,
+Sensors 20:5104), which no mapping corrects.
 
-REP-155 (``hri_msgs``) is not read here: its ``Skeleton2D`` holds image coordinates only, and its three-dimensional body
-is a URDF with joint angles and frames in TF, of 14 or so links without spine, hands and feet as joints. A point per
-joint cannot be had of that without inventing most of the trunk.
+REP-155 (``hri_msgs``) is not read: its ``Skeleton2D`` holds image coordinates only, and its three-dimensional body is a
+URDF with joint angles and frames in TF, of about 14 links without spine, hands and feet.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import MAX_RANGE, FloatArray, IntArray, Joint, Skeleton, TrackingState
 
 JOINTS_PER_BODY = 100
-"""A marker's id is so many times the body's, and the joint."""
+"""A marker's id is the body's times this, plus the joint."""
 
 MAX_BODIES = 64
-"""More bodies than this in one message is taken for a malformed one."""
+"""A message with more bodies is malformed."""
 
 _BODY_NUMBERS = 1 << 16
 
 
 class AzureError(BodyTrackingError):
-    """Markers that are no bodies of the Azure Kinect."""
+    """Raised for markers that are no bodies of the Azure Kinect."""
 
 
 class AzureJoint(IntEnum):
@@ -83,10 +82,10 @@ COUNTERPARTS: Final[dict[Joint, tuple[AzureJoint, AzureJoint]]] = {
     Joint.SPINE_SHOULDER: (AzureJoint.CLAVICLE_LEFT, AzureJoint.CLAVICLE_RIGHT),
     Joint.HAND_TIP_LEFT: (AzureJoint.HANDTIP_LEFT,) * 2,
     Joint.HAND_TIP_RIGHT: (AzureJoint.HANDTIP_RIGHT,) * 2,
-    # all others have the same name there
+    # all others have the same name in both
     **{joint: (AzureJoint[joint.name],) * 2 for joint in Joint if joint.name in AzureJoint.__members__},
 }
-"""Of each joint the two between which it lies; the same one twice where it has a counterpart."""
+"""The two joints of the SDK whose midpoint each joint is; the same one twice where it has a counterpart."""
 
 _FIRST: IntArray = np.array([COUNTERPARTS[joint][0] for joint in Joint], dtype=np.intp)
 _SECOND: IntArray = np.array([COUNTERPARTS[joint][1] for joint in Joint], dtype=np.intp)
@@ -99,21 +98,21 @@ def bodies_of(
     frame_id: str,
     state: TrackingState = TrackingState.TRACKED,
 ) -> tuple[Skeleton, ...]:
-    """The bodies in the markers of one message, by number.
+    """The bodies in the markers of one message, in order of their numbers.
 
     Args:
         ids: of the markers, in any order.
         points: (n, 3) metres, in the optical frame.
         stamp_ns: of the capture.
         frame_id: of the skeletons.
-        state: what is said of every joint that is there, as nothing in the message tells them apart.
+        state: of every joint in the message, which has no tracking states.
 
     Returns:
-        Skeletons; a joint that is missing or not finite is NaN and NOT_TRACKED, and so is what lies between it and
-        another. A body's number is the SDK's, modulo 65536.
+        Skeletons; a joint that is missing or not finite is NaN and NOT_TRACKED, and so is a midpoint with it. A body's
+        number is the SDK's, modulo 65536.
 
     Raises:
-        AzureError: an id that is no joint's, or one twice; more than 64 bodies.
+        AzureError: an invalid or duplicate id; more than 64 bodies.
     """
     if not len(ids):
         return ()

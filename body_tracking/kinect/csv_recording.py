@@ -32,7 +32,7 @@ _MAX_BODY = 2**16 - 1  # the message numbers bodies in 16 bits
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Where things are in a row; None for what the file does not have."""
+    """Indices of the columns; None for those that the file lacks."""
 
     names: tuple[str, ...]
     stamp: int
@@ -46,7 +46,7 @@ class _Columns:
 
 @dataclass(slots=True)
 class _Frame:
-    """The rows of one frame, as far as they have come."""
+    """The rows of one frame so far."""
 
     sensor: str
     stamp_ns: int
@@ -60,18 +60,18 @@ class _Frame:
 class CsvRecording:
     """Reads a CSV recording, a block of lines at a time.
 
-    Consecutive rows of one sensor with the same stamp and different persons are one frame. Stamps are taken as they are
-    written, also where they repeat or run backwards, and counted in :attr:`problems`.
+    Consecutive rows of one sensor with the same stamp and different persons are one frame. Stamps are kept as written;
+    those that repeat or run backwards are counted in :attr:`problems`.
 
     Args:
         path: the file; gzip is recognised by the suffix ``.gz``.
-        sensor: the sensor's name where the file has no column for it, and instead of it where it has one sensor only.
-        partial: read a file that is cut off (gzip, or in the middle of its last line) up to its last whole row, with
-            a warning, instead of refusing it.
+        sensor: the sensor's name, for a file without that column; replaces the name in a file of one sensor.
+        partial: read a truncated file (gzip, or in the middle of its last line) up to its last whole row, with a
+            warning, instead of refusing it.
 
     Raises:
-        CsvError: while iterating, if anything about the file is not as the format says.
-        SensorNameError: the name cannot be a sensor's.
+        CsvError: while iterating, if the file violates the format.
+        SensorNameError: an invalid name.
     """
 
     def __init__(self, path: Path | str, sensor: str | None = None, partial: bool = False) -> None:
@@ -137,7 +137,7 @@ class CsvRecording:
         missing = [name for name in ("stamp", *wanted) if name not in place]
         strange = [name for name in names if not _is_known(name) and _looks_like_a_joint(name)]
         if missing or strange:
-            # Both together, since a misspelt column is usually also a missing one.
+            # Both together: a misspelt column is usually also a missing one.
             parts = [_listing("missing column", missing), _listing("unknown joint column", strange)]
             raise self._file.error(1, "; ".join(part for part in parts if part))
         state_joints = [joint for joint in range(N_JOINTS) if f"{JOINT_NAMES[joint]}_state" in place]
@@ -163,7 +163,7 @@ class CsvRecording:
             where: the line of each row.
             rows: their cells.
             columns: of the file.
-            counts: of oddities, to be added to.
+            counts: of problems, updated in place.
         """
         if not rows:
             return []
@@ -243,7 +243,7 @@ class CsvRecording:
 
 
 def sensor_column(path: Path | str) -> bool:
-    """Whether the file names its sensors itself; also False if its header cannot be read."""
+    """Whether the file has a column of sensor names; False if its header cannot be read."""
     try:
         header = next(CsvFile(Path(path)).lines())
         return "sensor" in (name.strip() for name in next(csv.reader([header])))

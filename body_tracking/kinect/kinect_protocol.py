@@ -53,7 +53,7 @@ LEAST_KEY = 16
 """Bytes of the shortest key."""
 
 NO_KEY = b""
-"""Signs packets that never leave the machine: the signature finds damage, and anybody can make it."""
+"""Signs packets that never leave the machine: detects damage, but authenticates nothing."""
 
 _HEADER = struct.Struct("<4sBBH32sQQq")
 _FRAME = struct.Struct("<qBBxx4f")
@@ -67,11 +67,11 @@ _BODY_SIZE = _BODY.size + N_JOINTS * _JOINT.size
 
 MIN_PACKET = _HEADER.size + _CLOCK.size + _TAG
 MAX_PACKET = _HEADER.size + _FRAME.size + MAX_BODIES * _BODY_SIZE + _TAG
-"""Bytes; a receiver reads one more, by which it knows a larger packet."""
+"""Bytes; a receiver reads one more to detect larger packets."""
 
 
 class ProtocolError(ValueError):
-    """Raised for an invalid packet, name or key; ``reason`` is one of a few words, by which refusals are counted."""
+    """Raised for an invalid packet, name or key; ``reason`` is a key for counters."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -79,7 +79,7 @@ class ProtocolError(ValueError):
 
 
 class Header(NamedTuple):
-    """The header of the table above, without what is constant."""
+    """The variable fields of the header in the table above."""
 
     kind: int
     sensor: str
@@ -93,7 +93,7 @@ class Body(NamedTuple):
 
     Attributes:
         sdk_index: 0 to 5.
-        tracking_id: of the SDK; another one whenever a person is seen anew.
+        tracking_id: of the SDK; a new one whenever a person reappears.
         positions: 25 of (x, y, z), metres, Kinect camera space.
         states: 25 of 0 not tracked, 1 inferred, 2 tracked.
         orientations: 25 of (x, y, z, w), unit quaternions, or zeros.
@@ -113,7 +113,7 @@ class Frame(NamedTuple):
         time_ns: by the sensor's own clock.
         bodies: none to six.
         floor: (x, y, z, w) of the plane ``x X + y Y + z Z + w = 0`` in camera space, metres, or None.
-        silent: the sender runs, and its sensor delivers nothing; then there are no bodies, and no time.
+        silent: the sender runs, but its sensor delivers no frames; then there are no bodies, and no time.
     """
 
     time_ns: int
@@ -154,7 +154,7 @@ def pack_frame(frame: Frame, header: Header, key: bytes) -> bytes:
 
 
 def pack_clock(times: ClockTimes, header: Header, key: bytes) -> bytes:
-    """A packet of kind CLOCK_REQUEST or CLOCK_ANSWER, as the header says.
+    """A packet of the header's kind, CLOCK_REQUEST or CLOCK_ANSWER.
 
     Raises:
         ProtocolError: an invalid name.
@@ -181,10 +181,10 @@ def _tag(data: bytes, key: bytes) -> bytes:
 
 
 def read_header(packet: bytes) -> Header:
-    """The header of a packet of whatever origin, whose signature is still to be checked.
+    """The header of an untrusted packet, before its signature is checked.
 
     Raises:
-        ProtocolError: too long or too short, not ours, another version, an unknown kind, another size than it says.
+        ProtocolError: too long or too short, another protocol or version, an unknown kind, a wrong size field.
     """
     if len(packet) > MAX_PACKET:
         raise ProtocolError("too large", f"a packet of more than {MAX_PACKET} bytes")
@@ -205,10 +205,10 @@ def read_header(packet: bytes) -> Header:
 
 
 def check_signature(packet: bytes, key: bytes) -> None:
-    """Check that somebody with the key made this packet, as it is.
+    """Check the signature.
 
     Raises:
-        ProtocolError: the signature is another one.
+        ProtocolError: it is wrong.
     """
     if not hmac.compare_digest(_tag(packet[:-_TAG], key), packet[-_TAG:]):
         raise ProtocolError("wrong signature", "signed with another key, or changed on its way")
@@ -218,7 +218,7 @@ def read_frame(packet: bytes) -> Frame:
     """The content of a packet of kind FRAME whose header was read.
 
     Raises:
-        ProtocolError: sizes that contradict each other, an index or a state out of range, an index twice.
+        ProtocolError: inconsistent sizes, an index or a state out of range, a duplicate index.
     """
     at, end = _HEADER.size + _FRAME.size, len(packet) - _TAG
     if end < at:
@@ -250,7 +250,7 @@ def read_clock(packet: bytes) -> ClockTimes:
 
 
 def sensor_bytes(name: str) -> bytes:
-    """A sensor's name as a packet holds it.
+    """A sensor's name, padded for the header.
 
     Raises:
         ProtocolError: not 1 to 32 letters, digits and underscores, a letter first.
@@ -265,7 +265,7 @@ def read_key(path: str) -> bytes:
     """The key in a file: its bytes without white space around them.
 
     Raises:
-        ProtocolError: no regular file, one that others may read, or too short a key; the text never holds the key.
+        ProtocolError: not a regular file, readable by others, or too short a key; the text never contains the key.
     """
     try:
         mode = Path(path).stat().st_mode

@@ -1,4 +1,4 @@
-"""Streams the bodies that a Kinect v2 sees to another computer, where ``kinect_skeleton`` takes them.
+"""Streams the bodies that a Kinect v2 sees to another computer, where ``kinect_skeleton`` receives them.
 
 Runs on Windows without ROS and without this package: copy kinect_sender.py and kinect_protocol.py into one folder,
 install PyKinect2 (docs/sensors.md says which), and
@@ -7,7 +7,7 @@ install PyKinect2 (docs/sensors.md says which), and
     python kinect_sender.py --sensor kinect1 --to 192.168.1.20:7525 --key-file kinect.key
 
 The receiving computer needs the same key file. With --replay a recording takes the place of the sensor (needs the
-package body_tracking). A receiver, network or sensor that is absent is waited for.
+package body_tracking). The sender waits for an absent receiver, network or sensor.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING or __package__:
     from body_tracking.kinect import kinect_protocol as protocol
-else:  # a plain file beside kinect_protocol.py
+else:  # a plain file in the folder of kinect_protocol.py
     protocol = importlib.import_module("kinect_protocol")
 
 STATUS_PERIOD = 5.0
 RETRY_PERIOD = 2.0
 SILENT_AFTER, SILENT_PERIOD = 2.0, 0.5
-"""Seconds without a frame after which the receiver hears that the sensor is silent, and how often."""
+"""Seconds without a frame after which the sender reports that the sensor is silent, and the period of the reports."""
 
 _ANSWER_PERIOD_NS = 1_000_000
-"""Requests are answered once a millisecond at most; a receiver asks every 50 ms."""
+"""At most one answer per millisecond; a receiver sends requests every 50 ms."""
 
 _POLL = 0.002
 _TICKS_NS = 100
@@ -46,7 +46,7 @@ _TICKS_NS = 100
 
 
 class SenderError(Exception):
-    """It cannot start; the text says why, in one line."""
+    """Raised when the sender cannot start; the text is one line."""
 
 
 def now_ns() -> int:
@@ -54,7 +54,7 @@ def now_ns() -> int:
     return time.perf_counter_ns()
 
 
-# --- where bodies come from
+# --- sources
 
 
 class Kinect:
@@ -63,7 +63,7 @@ class Kinect:
     ended = False
 
     def __init__(self) -> None:
-        # PyKinect2 was last released in 2014 and uses names that have gone since from Python and numpy.
+        # PyKinect2 was last released in 2014 and uses names since removed from Python and numpy.
         try:
             numpy = importlib.import_module("numpy")
             for module, name, value in ((time, "clock", time.perf_counter), (numpy, "object", object)):
@@ -89,7 +89,7 @@ class Kinect:
                 if seen is not None:
                     return self._frame(seen)
                 time.sleep(_POLL)
-        except Exception as error:  # whatever COM raises without a sensor
+        except Exception as error:  # COM's exceptions without a sensor are not documented
             print(f"kinect_sender: the sensor cannot be read ({error}); trying again", file=sys.stderr)
             self._sensor = None
             time.sleep(timeout)
@@ -109,17 +109,16 @@ class Kinect:
             bodies.append(protocol.Body(index, tracking_id, positions, states, orientations))
         floor = seen.floor_clip_plane
         plane = (0.0,) if floor is None else (floor.x, floor.y, floor.z, floor.w)
-        known = any(plane[:3])  # the SDK marks an unknown floor by a normal of zero
+        known = any(plane[:3])  # the normal of an unknown floor is zero
         return protocol.Frame(int(seen.relative_time) * _TICKS_NS, tuple(bodies), plane if known else None)
 
     def close(self) -> None:
-        """Release the sensor."""
         if self._sensor is not None:
             self._sensor.close()
 
 
 class Replay:
-    """A recording in real time, as a sensor would deliver it: its own clock goes on when the recording begins again."""
+    """A recording in real time; its sensor clock continues when the recording restarts."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         try:
@@ -138,11 +137,10 @@ class Replay:
 
     @property
     def ended(self) -> bool:
-        """Whether the recording is over."""
         return bool(self._source.ended)
 
     def read(self, timeout: float) -> protocol.Frame | None:
-        """The next frame; None when none is within the timeout, seconds."""
+        """As of :class:`Kinect`."""
         frame = self._source.read(timeout)
         if frame is None:
             return None
@@ -159,7 +157,6 @@ class Replay:
         return protocol.Frame(self._zero_ns + round((stamp_ns - self._recorded_ns) / self._rate), tuple(bodies))
 
     def close(self) -> None:
-        """Close the file."""
         self._source.close()
 
 
@@ -167,7 +164,7 @@ class Replay:
 
 
 class Sender:
-    """Sends frames and answers clock requests, whatever the network does.
+    """Sends frames and answers clock requests; network errors are counted and retried.
 
     Args:
         sensor: the name under which frames are sent.
@@ -176,7 +173,7 @@ class Sender:
         key: of the signatures.
 
     Raises:
-        SenderError: an address beyond this computer without a key.
+        SenderError: an address of another computer without a key.
     """
 
     def __init__(self, sensor: str, host: str, port: int, key: bytes) -> None:
@@ -194,7 +191,7 @@ class Sender:
         threading.Thread(target=self._answer, daemon=True).start()
 
     def _open(self) -> None:
-        """Look the receiver up and make a socket; a failure is followed by another trial later."""
+        """Resolve the receiver's address and open a socket; on failure, :meth:`send` retries later."""
         try:
             family, kind, number, _, address = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
@@ -231,7 +228,7 @@ class Sender:
                 self._failed(error)
 
     def _answer(self) -> None:
-        """In a thread of its own: answer clock requests as soon as they come, each once."""
+        """Run in a thread of its own: answer each clock request once, without delay."""
         while not self._closed.is_set():
             current = self._socket
             if current is None:
@@ -244,7 +241,7 @@ class Sender:
             except protocol.ProtocolError:
                 continue
             except (OSError, ValueError):
-                self._closed.wait(0.01)  # nobody listens at the other end, or the socket was replaced
+                self._closed.wait(0.01)  # no receiver at the other end, or the socket was replaced
 
     def _answer_one(self, current: socket.socket, packet: bytes, source: Any, received_ns: int) -> None:
         header = protocol.read_header(packet)
@@ -276,20 +273,20 @@ def parser() -> argparse.ArgumentParser:
         prog="kinect_sender", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     to = f"127.0.0.1:{protocol.DEFAULT_PORT}"
-    said = "the computer that runs kinect_skeleton, and its port (default %(default)s)"
-    made.add_argument("--to", metavar="HOST:PORT", default=to, help=said)
-    said = "the sensor's name there (default %(default)s)"
-    made.add_argument("--sensor", default="kinect1", metavar="NAME", help=said)
+    text = "the computer that runs kinect_skeleton, and its port (default %(default)s)"
+    made.add_argument("--to", metavar="HOST:PORT", default=to, help=text)
+    text = "the sensor's name there (default %(default)s)"
+    made.add_argument("--sensor", default="kinect1", metavar="NAME", help=text)
     made.add_argument("--key-file", metavar="FILE", help="the shared key; not needed for 127.0.0.1")
     made.add_argument("--make-key", metavar="FILE", help="write a new key into a new file, and end")
     replay = made.add_argument_group("a recording in place of the sensor")
     replay.add_argument("--replay", metavar="FILE", help="a bag, a .csv, .csv.gz or .skeleton file")
-    said = "the sensor's name in it (default: --sensor)"
-    replay.add_argument("--recorded-sensor", default="", metavar="NAME", help=said)
+    text = "the sensor's name in it (default: --sensor)"
+    replay.add_argument("--recorded-sensor", default="", metavar="NAME", help=text)
     replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="play it X times as fast (default 1)")
     replay.add_argument("--loop", action="store_true", help="begin again at its end")
-    said = "wall time, seconds, at which it begins, to keep several in step (default: now)"
-    replay.add_argument("--start-time", type=float, default=0.0, metavar="S", help=said)
+    text = "wall time, seconds, at which it begins, to keep several in step (default: now)"
+    replay.add_argument("--start-time", type=float, default=0.0, metavar="S", help=text)
     return made
 
 
@@ -297,7 +294,7 @@ def make_key(path: str) -> None:
     """Write a new key into a new file that only its owner may read.
 
     Raises:
-        SenderError: the file is there already, or cannot be written.
+        SenderError: the file exists or cannot be written.
     """
     try:
         number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -305,11 +302,11 @@ def make_key(path: str) -> None:
         raise SenderError(f"{path}: cannot be made ({error.strerror})") from error
     with os.fdopen(number, "w") as file:
         file.write(secrets.token_hex(32) + "\n")
-    print(f"{Path(path)}: a new key; copy it to both computers, and show it to nobody")
+    print(f"{Path(path)}: a new key; copy it to both computers, and keep it secret")
 
 
 def stream(sender: Sender, source: Any) -> None:
-    """Send the frames of a source until it ends, with a line of status on stderr every few seconds."""
+    """Send the frames of a source until it ends; prints a status line on stderr every ``STATUS_PERIOD``."""
     begin = last = time.monotonic()
     silent_at = begin + SILENT_AFTER
     while not source.ended:
@@ -333,10 +330,10 @@ def stream(sender: Sender, source: Any) -> None:
 
 
 def run() -> None:
-    """Do what the command line says.
+    """Run the command line.
 
     Raises:
-        SenderError, ProtocolError: it cannot.
+        SenderError, ProtocolError: invalid arguments, key or source.
         KeyboardInterrupt: on Ctrl-C, also while a sensor's library or a recording is loaded.
     """
     args = parser().parse_args()

@@ -1,8 +1,7 @@
-"""The place for live sensors: what a backend offers to the ``kinect_skeleton`` node, and how it is found by name.
+"""Backends of the ``kinect_skeleton`` node: their interface, and how they are found by name.
 
-A new backend is a class with the methods of :class:`SkeletonSource`; the node, its topics and everything after them
-stay as they are. There are ``recording`` (``recording/source.py``) and ``network`` (``network.py``). Another package
-brings one by an entry point of the group ``body_tracking.backends``: its name, and what opens it.
+A backend is a class with the methods of :class:`SkeletonSource`: ``recording`` (``recording/source.py``), ``network``
+(``network.py``), or one of another package, registered as an entry point of the group ``body_tracking.backends``.
 """
 
 from __future__ import annotations
@@ -19,25 +18,25 @@ from body_tracking.pipeline.system import load
 
 
 class SourceError(BodyTrackingError):
-    """A sensor, or what takes its place, cannot be opened or read."""
+    """Raised when a backend cannot open or read its sensor."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceSettings:
-    """What a backend is told; each uses what concerns it.
+    """Settings for all backends; each uses those that concern it.
 
     Attributes:
         sensor: the name under which its skeletons are published.
         device: which of several devices, such as a serial number; empty for the only one.
-        file: what is played by ``recording``.
+        file: played by ``recording``.
         recorded_sensor: the sensor's name in that file; empty for the same name.
         rate: seconds of the recording per second.
         loop: begin again at the end.
         start_time: wall time, seconds, at which the recording's first frame of any sensor plays; 0 for now.
-        address: on which ``network`` listens: an IP address of this computer.
-        port: likewise.
-        key_file: holds the key that senders share; empty for none, on a loopback address.
-        least_delay: seconds that the sensor takes at least from capture until its frame can be sent.
+        address: IP address of this computer on which ``network`` listens.
+        port: on which ``network`` listens.
+        key_file: with the key that senders share; empty for none, on a loopback address.
+        least_delay: seconds, the sensor's shortest delay from capture until its frame can be sent.
     """
 
     sensor: str
@@ -54,29 +53,29 @@ class SourceSettings:
 
 
 class SkeletonSource(Protocol):
-    """A stream of frames of one sensor, in the package's conventions (see ``sensors``)."""
+    """A stream of frames of one sensor."""
 
     @property
     def ended(self) -> bool:
-        """Whether no frame will ever come again."""
+        """Whether there will be no more frames."""
 
     @property
     def counters(self) -> Mapping[str, object]:
-        """What was met so far, such as frames that were dropped."""
+        """Counters for diagnostics, such as dropped frames."""
 
     @property
     def problem(self) -> str:
-        """What keeps frames from coming, in a line, although they may come again; empty if nothing does."""
+        """Why there are no frames at present, in one line; empty for no problem."""
 
     def read(self, timeout: float) -> RecordedFrame | None:
-        """The next frame as soon as it is there; None when none is within the timeout (seconds).
+        """The next frame as soon as it arrives; None after the timeout (seconds).
 
         Raises:
             BodyTrackingError: the device or file failed; there will be no more frames.
         """
 
     def close(self) -> None:
-        """Let go of the device or file; a ``read`` in another thread returns."""
+        """Release the device or file; a ``read`` in another thread returns."""
 
 
 Opener = Callable[[SourceSettings], SkeletonSource]
@@ -86,11 +85,11 @@ _BACKENDS = {
     "network": "body_tracking.kinect.network:NetworkSource",
     "recording": "body_tracking.recording.source:RecordingSource",
 }
-"""Those of this package; a process loads the one that it opens."""
+"""Of this package; a process imports only the one that it opens."""
 
 
 def backends() -> tuple[str, ...]:
-    """The names of the backends, with those of other packages that are installed."""
+    """The names of all backends, including those of other installed packages."""
     return tuple(sorted({*_BACKENDS, *entry_points(group=ENTRY_POINTS).names}))
 
 
@@ -98,8 +97,8 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
     """Open a sensor.
 
     Raises:
-        SourceError: no such backend, or it is of another package and something is wrong with it.
-        BodyTrackingError: the backend cannot open it.
+        SourceError: no such backend, or one of another package failed.
+        BodyTrackingError: the backend cannot open its sensor.
     """
     if backend not in backends():
         raise SourceError(f"unknown backend {backend!r}, expected one of {', '.join(backends())}")
@@ -112,11 +111,11 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
         return opener(settings)
     except BodyTrackingError:
         raise
-    except Exception as error:  # whatever others write
+    except Exception as error:  # of another package
         raise SourceError(f"backend {backend!r}: {described(error)}") from error
 
 
 def described(error: Exception) -> str:
-    """What went wrong, in a line: an error of this package says that by itself."""
+    """An error in one line; with its type unless it is an error of this package."""
     text = " ".join(str(error).split())
     return text if isinstance(error, BodyTrackingError) else f"{type(error).__name__}: {text}"

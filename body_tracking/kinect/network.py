@@ -1,9 +1,9 @@
 """The backend ``network``: skeletons that ``kinect_sender`` streams from a computer with a Kinect v2.
 
-Packets are checked in the order size, header, name of the sensor, signature, session and sequence, content, so that a
-stranger without the key gets no further than the signature, which takes ten microseconds. No rate is limited before
-it: anybody can write the sender's address into a packet, and would use up the sender's share. A session counts only
-after its sender has answered a new question, so that recorded packets are worth nothing, even after a restart.
+Packets are checked in the order size, header, name of the sensor, signature, session and sequence, content, so that
+packets without the key are dropped at the signature, which takes ten microseconds. There is no rate limit before it:
+an attacker can forge the sender's address and would use up the sender's share. A session is accepted only after its
+sender has answered a new challenge, so that replayed packets are rejected, even after a restart.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from body_tracking.kinect.remote_clock import CaptureClock, RoundTrips
 Address: TypeAlias = tuple[str, int]
 
 TAKEOVER_NS = NANOSECONDS // 2
-"""A sender that was started anew replaces one that has been silent for so long."""
+"""A restarted sender replaces one that has been silent for this long."""
 
 SILENCE_NS = NANOSECONDS
-"""From when on a stream that has stopped is a problem."""
+"""Time without frames after which the stream is reported as stopped."""
 
 _REFUSAL_SHOWN_NS = 10 * NANOSECONDS
 _ANSWER_TIMEOUT_NS = 2 * NANOSECONDS
 _EARLIEST_NS, _LATEST_NS = NANOSECONDS, 5 * NANOSECONDS
-"""A frame is refused that was sent so long after its receipt, or so long before."""
+"""Frames are refused that were sent this long after their receipt, or this long before."""
 _FIRST_ASKS, _ASK_FAST_NS, _ASK_NS = 20, NANOSECONDS // 20, NANOSECONDS // 4
-"""A new session is asked every 50 ms at first, later four times a second."""
+"""Number and period of the first clock requests of a session, and the period of the later ones."""
 
 _CHALLENGE_NS, _CHALLENGED = NANOSECONDS // 10, 64
-"""How often an unknown session is asked whether it is alive, and how many of them are remembered."""
+"""Shortest period of the challenges to an unknown session, and the number of sessions remembered for that."""
 
 _MAX_RATE, _MAX_JUMP = 600, 120
-"""Frames per second, and at once, by which sequence numbers go up at most; a Kinect makes 30 a second."""
+"""Greatest increase of sequence numbers, per second and at once; a Kinect sends 30 frames a second."""
 
 _RECEIVE_BUFFER = 1 << 20
 _SHORTEST_WAIT = 0.001
@@ -56,14 +56,14 @@ _SHORTEST_WAIT = 0.001
 
 @dataclass(frozen=True, slots=True)
 class ReceivedFrame:
-    """An accepted frame and the time of its capture, by the local clock of stamps (ns)."""
+    """An accepted frame and its capture time by the local wall clock (ns)."""
 
     frame: protocol.Frame
     stamp_ns: int
 
 
 class _Session:
-    """State of the sender whose frames are taken: number, address, clocks, the newest frame and answer."""
+    """State of the accepted sender: number, address, clocks, the newest frame and answer."""
 
     def __init__(self, number: int, address: Address, least_delay_ns: int, now_ns: int) -> None:
         self.number, self.address = number, address
@@ -73,22 +73,22 @@ class _Session:
 
 
 class Receiver:
-    """Judges packets; knows neither socket nor clock. Its memory is bounded, whatever comes.
+    """Checks packets; has neither socket nor clock. Its memory is bounded.
 
-    Times are nanoseconds of the local monotonic clock, but for stamps.
+    Times other than stamps are nanoseconds of the local monotonic clock.
 
     Args:
-        sensor: whose frames are taken; others are refused.
+        sensor: whose frames are accepted; others are refused.
         key: of the signatures.
         least_delay_ns: see :class:`CaptureClock`.
 
     Attributes:
         counters: accepted frames, and refused packets by reason.
-        lost: frames of the sessions so far that did not come, or came after a later one.
-        refusal: why the last refused packet was refused, and whose it was.
-        refused_ns: when that was.
-        silent: whether the sender says that its sensor delivers nothing.
-        floor: of the last frame that had one, see :class:`~body_tracking.kinect.kinect_protocol.Frame`.
+        lost: frames of all sessions that were lost or arrived after a later one.
+        refusal: reason and source of the last refused packet.
+        refused_ns: its time.
+        silent: whether the sender reports that its sensor delivers no frames.
+        floor: of the last frame with one, see :class:`~body_tracking.kinect.kinect_protocol.Frame`.
         outgoing: packets to be sent and their addresses; the caller empties the list.
     """
 
@@ -107,13 +107,13 @@ class Receiver:
     # --- packets
 
     def take(self, packet: bytes, source: Address, now_ns: int, wall_ns: int) -> ReceivedFrame | None:
-        """Judge a packet of whatever origin; the frame, if it is a new one of the sender that is listened to.
+        """Process an untrusted packet; returns its frame if that is a new one of the accepted sender.
 
         Args:
             packet: at most one byte more than the largest one.
-            source: its address, as the network has it.
+            source: its address, which may be forged.
             now_ns: its receipt.
-            wall_ns: its receipt by the clock of stamps.
+            wall_ns: its receipt by the wall clock.
         """
         try:
             header = protocol.read_header(packet)
@@ -129,7 +129,7 @@ class Receiver:
                 self._challenge(header.session, source, now_ns)
             else:
                 return self._take_frame(session, header, packet, source, now_ns, wall_ns - now_ns)
-        except (ArithmeticError, ValueError) as failure:  # numbers that no clock shows, and ProtocolError
+        except (ArithmeticError, ValueError) as failure:  # absurd times, and ProtocolError
             error = failure if isinstance(failure, ProtocolError) else ProtocolError("out of range", str(failure))
             self.counters[f"rejected, {error.reason}"] += 1
             self.refusal, self.refused_ns = f"{error} (from {source[0]} port {source[1]})", now_ns
@@ -162,12 +162,12 @@ class Receiver:
     # --- sessions and clocks
 
     def _challenge(self, session: int, source: Address, now_ns: int) -> None:
-        """Ask whether a session is alive; nothing is kept of the question, its random number holds the question."""
+        """Send a challenge to an unknown session; its random number is derived from it, so that none is stored."""
         self.counters["of unknown sessions"] += 1
         if now_ns - self._unknown_ns > SILENCE_NS:
             self._challenged_ns = now_ns
         self._unknown_ns = now_ns
-        asked = source, session  # so that a recorded session uses up no other's share
+        asked = source, session  # per session, so that a replayed one uses up no other's share
         if now_ns - self._challenges.get(asked, -_CHALLENGE_NS) >= _CHALLENGE_NS:
             self._challenges.pop(asked, None)  # the newest ones last
             self._challenges[asked] = now_ns
@@ -180,7 +180,7 @@ class Receiver:
         self.outgoing.append((protocol.pack_clock(ClockTimes(now_ns, 0, 0), header, self._key), address))
 
     def _random(self, session: int, asked_ns: int) -> int:
-        """A number that only this receiver can have made of this question."""
+        """A keyed hash of a request, which only this receiver can compute."""
         question = session.to_bytes(8, "little") + asked_ns.to_bytes(8, "little", signed=True)
         return int.from_bytes(hashlib.blake2b(question, key=self._secret, digest_size=8).digest(), "little")
 
@@ -212,7 +212,7 @@ class Receiver:
     # --- diagnostics
 
     def problem(self, now_ns: int) -> str:
-        """What keeps the stream from being as it should, in a line; empty if nothing does."""
+        """The problem of the stream in one line; empty for none."""
         refused = self.refusal and now_ns - self.refused_ns < _REFUSAL_SHOWN_NS
         refusal = f"packets are refused: {self.refusal}" if refused else ""
         if not self._last_frame_ns or now_ns - self._last_frame_ns > SILENCE_NS:
@@ -225,7 +225,7 @@ class Receiver:
         return "the sender is there, but its sensor delivers nothing" if self.silent else refusal
 
     def values(self, now_ns: int) -> dict[str, object]:
-        """For diagnostics."""
+        """Values for diagnostics."""
         values: dict[str, object] = {"accepted": 0, **self.counters, "lost": self.lost}
         if self._last_frame_ns:
             values["last frame s ago"] = f"{(now_ns - self._last_frame_ns) / NANOSECONDS:.2f}"
@@ -251,13 +251,13 @@ class NetworkSource:
     """A socket and a :class:`Receiver`; stamps are capture times in this computer's wall clock.
 
     Args:
-        settings: ``sensor``, ``device`` (the sensor's name at the sender; empty for the same), ``address``, ``port``,
-            ``key_file`` and ``least_delay`` count.
+        settings: uses ``sensor``, ``device`` (the sensor's name at the sender; empty for the same), ``address``,
+            ``port``, ``key_file`` and ``least_delay``.
 
     Raises:
         SensorNameError: an invalid name of the sensor.
-        SourceError: an invalid name at the sender, no key for an address beyond this computer, an invalid key file, an
-            address or port that cannot be had.
+        SourceError: an invalid name at the sender, no key for an address reachable from other computers, an invalid
+            key file, an address or port that is not available.
     """
 
     def __init__(self, settings: SourceSettings) -> None:
@@ -281,14 +281,13 @@ class NetworkSource:
 
     @property
     def address(self) -> Address:
-        """Where it listens."""
+        """Host and port on which it listens."""
         host, port = self._socket.getsockname()[:2]
         return str(host), int(port)
 
     @property
     def ended(self) -> bool:
-        """Never: a sender may always come."""
-        return False
+        return False  # a sender may start at any time
 
     @property
     def counters(self) -> Mapping[str, object]:
@@ -297,12 +296,10 @@ class NetworkSource:
 
     @property
     def problem(self) -> str:
-        """What keeps frames from coming."""
         text = self._receiver.problem(time.monotonic_ns())
         return f"{self._where}: {text}" if text else ""
 
     def close(self) -> None:
-        """Let a ``read`` in another thread return."""
         self._closed.set()
 
     def read(self, timeout: float) -> RecordedFrame | None:
@@ -314,12 +311,12 @@ class NetworkSource:
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return None
-            # Not longer than until the next clock request; 0 would mean not to wait at all.
+            # No longer than until the next clock request; 0 would make the socket non-blocking.
             self._socket.settimeout(max(_SHORTEST_WAIT, min(left, _ASK_FAST_NS / NANOSECONDS)))
             try:
                 packet, source = self._socket.recvfrom(protocol.MAX_PACKET + 1)
             except OSError:
-                continue  # none came; or an answer to an earlier packet could not be delivered
+                continue  # timeout, or an ICMP error for an earlier packet
             wall_ns = time.time_ns()
             received = self._receiver.take(packet, source[:2], time.monotonic_ns(), wall_ns)
             if received is not None and received.frame.bodies:
@@ -339,7 +336,7 @@ class NetworkSource:
 
 
 def skeleton_of(body: protocol.Body, stamp_ns: int, frame_id: str) -> Skeleton:
-    """A body in the package's conventions; a joint without sound coordinates is NaN and not tracked."""
+    """A body in the package's conventions; a joint with invalid coordinates is NaN and not tracked."""
     positions = camera_space_to_optical(np.array(body.positions, dtype=np.float64))
     unsound = ~(np.abs(positions) < MAX_RANGE).all(axis=1)
     positions[unsound] = np.nan

@@ -37,11 +37,11 @@ _NAME = re.compile(r"S\d{3}C(\d{3})P\d{3}R\d{3}A\d{3}")
 
 
 class NtuError(BodyTrackingError):
-    """A ``.skeleton`` file does not have its format; the text names file and line."""
+    """Raised for an invalid ``.skeleton`` file; the text names file and line."""
 
 
 class _CutOff(Exception):
-    """The file ends in the middle of a frame."""
+    """Raised where the file ends in the middle of a frame."""
 
 
 def sensor_of(path: Path) -> str | None:
@@ -56,11 +56,11 @@ class NtuRecording:
     Args:
         path: the file.
         sensor: the sensor's name; None to take ``kinect<camera>`` from the file's name.
-        partial: read a file that is cut off up to its last whole frame, with a warning, instead of refusing it.
+        partial: read a truncated file up to its last whole frame, with a warning, instead of refusing it.
 
     Raises:
-        NtuError: no name for the sensor; or, while iterating, the file is not as the format says.
-        SensorNameError: the name cannot be a sensor's.
+        NtuError: no name for the sensor; or, while iterating, the file violates the format.
+        SensorNameError: an invalid name.
     """
 
     def __init__(self, path: Path | str, sensor: str | None = None, partial: bool = False) -> None:
@@ -116,7 +116,7 @@ class NtuRecording:
         self.progress = 1.0
 
     def _error(self, text: str) -> Exception:
-        """What is wrong with the current line; if that is the last one and lacks its end, it was cut off."""
+        """The error of the current line; :class:`_CutOff` for an incomplete last line."""
         if self._next == len(self._lines) and not self._whole:
             return _CutOff()
         return NtuError(f"{self.path}, line {self._next}: {text}")

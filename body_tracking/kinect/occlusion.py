@@ -1,4 +1,4 @@
-"""What of a body a sensor cannot see because the body itself stands before it: rays against capsules of flesh."""
+"""Occlusion of joints by the body itself and by other people: lines of sight against capsules."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _TRUNK: BoolArray = _SPINE | named("SHOULDER", "HIP")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsules:
-    """The flesh of a body: a capsule round each line between two joints, a ball where both are the same.
+    """The surface of a body: a capsule round each line between two joints, a ball where both are the same.
 
     Attributes:
         starts: (k,) :class:`~body_tracking.core.skeleton.Joint` indices.
-        ends: (k,) the same.
+        ends: (k,) likewise.
         radii: (k,) metres, greater than zero.
     """
 
@@ -35,11 +35,11 @@ class Capsules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstruction:
-    """What stands before the joints of a body.
+    """Self-occlusion of a body's joints.
 
     Attributes:
         cover: (n, 25) 0 where a joint is seen, to 1 where its line of sight goes through the middle of another part.
-        nearer: (n, 25) metres from a joint towards the sensor to the surface of what covers it most; 0 where none does.
+        nearer: (n, 25) metres from a joint towards the sensor to the surface that covers it most; 0 where none does.
     """
 
     cover: FloatArray
@@ -49,15 +49,15 @@ class Obstruction:
 def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
     """How deep each joint lies behind the body.
 
-    A joint is looked for where the skin over it faces the sensor: as far before its centre as the widest capsule that
-    ends in it reaches. The line of sight to there passes the axis of a capsule at a distance d; the joint is covered
-    by 1 - d / radius, and where the capsule is thinner than the joint's own, by the square of their ratio less. A
-    capsule never covers the joints it ends in, nor the trunk its spine, nor anything a joint that lies within half the
-    radius of its axis; from there to its surface the cover grows to the whole.
+    The line of sight ends at the skin over the joint that faces the sensor: in front of its centre by the radius of the
+    widest capsule that ends in it. If it passes the axis of another capsule at a distance d, the cover is
+    1 - d / radius, times the square of the ratio of the radii where that capsule is thinner than the joint's own. A
+    capsule covers neither the joints at its ends nor a joint within half its radius of its axis, from where to its
+    surface the cover grows to the whole; the trunk does not cover its spine.
 
     Args:
         sight: (n, 25, 3) metres, the joints in the sensor's optical frame.
-        capsules: the flesh.
+        capsules: the surface.
     """
     distance = np.linalg.norm(sight, axis=2, keepdims=True)
     own, reach = _skin(sight, capsules)
@@ -81,13 +81,13 @@ def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
 
 
 def veil(sight: FloatArray, capsules: Capsules, other: FloatArray, flesh: Capsules) -> FloatArray:
-    """(n, 25) how deep each joint lies behind somebody else, 0 to 1; as of :func:`obstruction`.
+    """(n, 25) how deep each joint lies behind another person, 0 to 1; as of :func:`obstruction`.
 
     Args:
         sight: (n, 25, 3) metres, the joints in the sensor's optical frame.
-        capsules: the flesh round them.
-        other: (n, 25, 3) metres, the other's joints.
-        flesh: round those.
+        capsules: their surface.
+        other: (n, 25, 3) metres, the other person's joints.
+        flesh: the other person's surface.
     """
     _, reach = _skin(sight, capsules)
     covered = np.zeros(sight.shape[:2])
@@ -116,7 +116,7 @@ def _distance_to_segment(points: FloatArray, start: FloatArray, end: FloatArray)
 
 
 def _nearest_of_rays(points: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the lines of sight from the origin to (..., 3) points come nearest to the segment.
+    """Closest points of the lines of sight from the origin to (..., 3) points and of the segment.
 
     Closest points of two segments as Ericson 2005, Real-Time Collision Detection, 5.1.9, with s along the ray and t
     along the segment.

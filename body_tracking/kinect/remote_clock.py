@@ -1,9 +1,9 @@
 """The time of capture of a sensor at another computer, in this computer's clock.
 
-Three clocks are concerned. The sensor's own one stamps frames; it has a rate and a zero of its own. The sender's one is
-read when a frame is sent and when a clock request comes. The local one is this computer's. Round trips relate the
-sender's to the local one (:class:`RoundTrips`); the delays between the sensor's time and the sending of its frames
-relate the sensor's to the sender's (:class:`CaptureClock`), but for the shortest delay, which nothing tells.
+There are three clocks. The sensor's clock stamps frames; it has its own rate and zero. The sender reads its clock when
+it sends a frame and when it receives a clock request. The local clock is this computer's. Round trips relate the
+sender's clock to the local one (:class:`RoundTrips`); the delays from the sensor's stamps to the sending of its frames
+relate the sensor's clock to the sender's (:class:`CaptureClock`), up to the shortest delay, which is unobservable.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from body_tracking.core.clocks import ClockModel, LeastDelay, clock_of_line, fit
 from body_tracking.core.skeleton import NANOSECONDS
 
 WINDOW = 60
-"""Seconds with round trips that count, the latest ones; those of a cut of the link between them do not."""
+"""Number of bins of one second, not counting those without round trips."""
 
 LONGEST = 300.0
-"""Seconds after which a round trip counts no more."""
+"""Greatest age of a round trip, seconds."""
 
 DRIFT_PRIOR = 50e-6
-"""Standard deviation of the drift of one computer's clock against another's: crystals keep 50 ppm."""
+"""Standard deviation of the drift between two computers' clocks: crystals keep 50 ppm."""
 
 _BIN = NANOSECONDS
-"""Of the round trips of a second only the shortest one counts."""
+"""Only the shortest round trip of each bin counts."""
 _ERROR = 50e-6
-"""Seconds by which the shortest round trips err: the scheduling of the two processes."""
+"""Error of the shortest round trips by the scheduling of the two processes, seconds."""
 _STEP = 0.01
-"""Seconds beyond its own bounds by which a round trip must contradict the others for a clock to have been set."""
+"""A round trip contradicts the others when it deviates by this beyond its own bounds, seconds: a clock was set."""
 _CONTRADICTIONS = 3
 
 _LAG_WINDOW = 300
-"""Frames, ten seconds of a Kinect's: after a cut of the link the first frames need not be fast ones."""
+"""Frames, ten seconds of a Kinect: after an interruption of the link the first frames may be slow."""
 _SLEW = 100
-"""The correction of a stamp changes by at most a hundredth of the time that has passed."""
+"""The correction of a stamp changes by at most a hundredth of the elapsed time."""
 _SET_NS = NANOSECONDS // 4
-"""A correction that is off by more is set at once: a clock was set, or the first round trip was a bad one."""
+"""A greater error of the correction is removed at once: a clock was set, or the first round trip was inaccurate."""
 
 
 class RoundTrips:
@@ -47,15 +47,15 @@ class RoundTrips:
 
         t1 - t2 <= offset <= t4 - t3,                                                                               (1)
 
-    whatever either way took. Jitter only ever makes a way longer, so short round trips say more than long ones: a line
-    (offset and drift) is fitted to the middles of eq. 1 of the shortest round trip of each second, with a standard
-    deviation of half of that by which it is longer than the shortest one of all. Where all bounds can be kept, they
-    are. What no round trip can tell is half the difference between the shortest ways there and back.
+    whatever the two delays. Jitter only lengthens delays, so short round trips are more accurate: a line (offset and
+    drift) is fitted to the midpoints of eq. 1 of the shortest round trip of each second, with a standard deviation of
+    half its excess over the shortest one of all. The offset is clipped to all bounds if they are consistent. Half the
+    difference between the shortest delays of the two directions is unobservable.
     """
 
     def __init__(self) -> None:
         self._bins: deque[tuple[int, int, int]] = deque()
-        self._clock = ClockModel()  # the local one against the remote one
+        self._clock = ClockModel()  # local minus remote
         self._contradictions = 0
         self.steps = 0
 
@@ -84,15 +84,16 @@ class RoundTrips:
         return self._clock.offset_ns_at(remote_ns)
 
     def add(self, t1: int, t2: int, t3: int, t4: int) -> bool:
-        """Take a round trip, nanoseconds; whether it counts.
+        """Add a round trip, nanoseconds; returns whether it was accepted.
 
-        It does not where it contradicts the others; when several in a row do, a clock was set, and they count alone.
+        A round trip that contradicts the others is rejected; after several in a row, a clock was set, and the earlier
+        ones are discarded.
         """
         trip = (t4 - t1) - (t3 - t2)
         if t4 < t1 or t3 < t2 or trip < 0:
             return False
         remote, offset = (t2 + t3) // 2, (t1 - t2 + t4 - t3) // 2
-        # the middle of a round trip is off by half of it, and what is known by half of the shortest one (eq. 1)
+        # the midpoint errs by at most half the round trip, the fitted line by half of the shortest one (eq. 1)
         if self.known and abs(offset - self.offset_ns(remote)) > (trip + self.round_trip_ns) // 2 + _STEP * NANOSECONDS:
             self._contradictions += 1
             if self._contradictions < _CONTRADICTIONS:
@@ -123,14 +124,14 @@ class RoundTrips:
 
 
 class CaptureClock:
-    """Capture times in the local clock, ever later.
+    """Monotonic capture times in the local clock.
 
-    A frame is sent some time after its capture, the sensor's delay, never less than the least one. So the least of
-    sending time minus sensor's time over some hundred frames is the difference of the two clocks plus that least delay.
-    The correction of the stamps follows what is known by and by, so that their distances stay those of the sensor.
+    A frame is sent after the sensor's delay, which is at least the least delay. So the minimum of sending time minus
+    sensor time over some hundred frames is the offset of the two clocks plus the least delay. The correction of the
+    stamps follows this estimate slowly, so that their distances stay those of the sensor.
 
     Args:
-        least_delay_ns: what the sensor takes at least from capture until its frame can be sent.
+        least_delay_ns: the sensor's least delay from capture until its frame can be sent.
     """
 
     def __init__(self, least_delay_ns: int = 0) -> None:
@@ -150,11 +151,10 @@ class CaptureClock:
             offset_ns: the local clock minus the sender's.
 
         Returns:
-            Nanoseconds; later than that of the frame before, unless the local clock itself was set back by more than a
-            second, where time jumps back for everybody.
+            Nanoseconds; later than the previous stamp, unless the local clock was set back by more than a second.
         """
         lag, step = sent_ns - sensor_ns, sensor_ns - self._last_sensor_ns
-        anew = self._last_stamp_ns is None or step < 0  # the sensor has begun to count anew
+        anew = self._last_stamp_ns is None or step < 0  # the sensor's clock has restarted
         if anew:
             self._lag.clear()
         self._frames += 1

@@ -1,4 +1,4 @@
-"""How much a simulated Kinect v2 (``kinect_sensor``) errs, and the file that says so (``config/simulator.yaml``)."""
+"""Parameters of the errors of a simulated Kinect v2 (``simulated_sensor``), read from ``config/simulator.yaml``."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ SECTION: Final = "simulated_kinect"
 
 
 class SimulatedKinectError(BodyTrackingError):
-    """Errors of a simulated Kinect that are out of their range, or a file that does not hold them."""
+    """Raised for a parameter out of its range, or a file without these parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class KinectErrors:
-    """How much a simulated Kinect v2 errs; each field's metadata says what it is, its unit and its range.
+    """Parameters of the errors of a simulated Kinect v2; the fields' metadata have units and ranges.
 
-    Lengths hold for a joint of the trunk of a person who faces the sensor at 2 m; the other joints have their multiples
-    (``kinect_joints``).
+    Lengths hold for a joint of the trunk of a person who faces the sensor at 2 m; ``simulated_joints`` has the
+    multiples for the other joints.
 
     Raises:
         SimulatedKinectError: a value out of its range.
@@ -97,17 +97,16 @@ class KinectErrors:
         check_fields(self, "simulated Kinect", SimulatedKinectError)
 
     def offsets_alone(self) -> KinectErrors:
-        """Only where they take the joints' centres to be, beside where an anatomist does."""
+        """Only the constant offsets from the anatomical joint centres."""
         return replace(self.none(), anatomical=self.anatomical, offset=self.offset)
 
     @classmethod
     def none(cls) -> KinectErrors:
-        """A sensor that errs in nothing, though what is covered is still inferred or not tracked."""
-        nothing = {item.name: 0.0 for item in parameters() if item.min == 0.0}
-        return cls(**nothing)
+        """No errors of position or time; hidden joints are still inferred or not tracked."""
+        return cls(**{item.name: 0.0 for item in parameters() if item.min == 0.0})
 
     def scaled(self, factor: float, names: tuple[str, ...] | None = None) -> KinectErrors:
-        """All parameters, or those named, times the factor, within their ranges."""
+        """All parameters, or those named, times the factor, clipped to their ranges."""
         changes = {
             item.name: float(np.clip(factor * getattr(self, item.name), item.min, item.max))
             for item in parameters()
@@ -117,12 +116,11 @@ class KinectErrors:
 
 
 def parameters() -> tuple[Parameter, ...]:
-    """The parameters of :class:`KinectErrors`."""
     return parameters_from(KinectErrors)
 
 
 def read_errors(path: Path) -> KinectErrors:
-    """Errors from the section ``simulated_kinect`` of a parameters file; what it does not name is at its default.
+    """Errors from the section ``simulated_kinect`` of a parameters file, with defaults for missing parameters.
 
     Raises:
         SimulatedKinectError: no such file or section, an unknown name, a value out of its range.
@@ -140,6 +138,6 @@ def read_errors(path: Path) -> KinectErrors:
 
 
 def errors_as_yaml(errors: KinectErrors | None = None) -> str:
-    """A parameters file of these errors, or of the defaults, explained."""
+    """A commented parameters file of these errors, or of the defaults."""
     values = errors or KinectErrors()
     return as_yaml({SECTION: [replace(item, default=getattr(values, item.name)) for item in parameters()]})

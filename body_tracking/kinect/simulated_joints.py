@@ -1,4 +1,4 @@
-"""Joint by joint, how a Kinect v2 misplaces it: the tables of the simulated sensor (``kinect_sensor``)."""
+"""Tables of the simulated sensor (``simulated_sensor``): errors of a Kinect v2 by joint."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ray: the consistent disagreement of sensors 45 and 90 degrees apart there; anato
 
 
 def _column(number: int) -> FloatArray:
-    """(25, ...) of the table; a right joint without a column of its own is as the left one, 0 where there is none."""
+    """(25, ...) a column of the table; a right joint without its own entry has the left one's, 0 where neither has."""
     values = []
     for joint in Joint:
         row = _KINDS[joint.name.removesuffix("_LEFT").removesuffix("_RIGHT")]
@@ -63,19 +63,19 @@ PARENTS: Final[IntArray] = np.arange(N_JOINTS, dtype=np.intp)
 for _parent, _child in BONES:
     PARENTS[_child] = _parent
 ANCHORS: Final[IntArray] = np.where(SPINE | named("HIP"), np.intp(Joint.SPINE_SHOULDER), PARENTS)
-"""(25,) from where a joint's length is measured that varies: the trunk's as a whole, from its best seen joint."""
+"""(25,) the joint from which a varying length is measured: for the trunk SPINE_SHOULDER, its most precise joint."""
 VARYING: Final[IntArray] = np.where(ANCHORS == Joint.SPINE_SHOULDER, np.intp(Joint.SPINE_BASE), np.arange(N_JOINTS))
 VARYING[[Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT]] = Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT
 ON_TRUNK: Final = ~(ARMS | LEGS)
 FIRST: Final[IntArray] = np.where(ON_TRUNK, np.intp(Joint.ELBOW_LEFT), np.arange(N_JOINTS))
 SECOND: Final[IntArray] = np.where(ON_TRUNK, np.intp(Joint.ELBOW_RIGHT), PARENTS)
 SECOND[named("ELBOW", "KNEE")] = np.flatnonzero(named("WRIST", "ANKLE"))
-"""(25,) segments, named by their outer joints, with which the errors of a joint change; the trunk's with the arms."""
+"""(25,) segments, named by their outer joints, on whose directions a joint's errors depend; the trunk's on the arms."""
 REST: Final[FloatArray] = np.zeros((N_JOINTS, 3))
 REST[LEGS] = [0.0, 0.0, -1.0]
 REST[ARMS, 1] = [1.0 if joint.name.endswith("LEFT") else -1.0 for joint in Joint if ARMS[joint]]
 FOLLOWS: Final = (
-    # how far a limb follows its root where this is seen as turned less than it is
+    # shares by which a limb's joints follow the displacement of its root by ``turn_loss``
     (Joint.SPINE_SHOULDER, "SHOULDER", {"ELBOW": 0.6, "WRIST": 0.2, "HAND": 0.2, "HAND_TIP": 0.2, "THUMB": 0.2}),
     (Joint.SPINE_BASE, "HIP", {"KNEE": 0.4}),
 )
@@ -84,9 +84,9 @@ CHAINS: Final = tuple(
     for names in (("SHOULDER", "HIP"), ("ELBOW", "KNEE"), ("WRIST", "ANKLE"), ("HAND", "FOOT"), ("HAND_TIP", "THUMB"))
 )
 _KINSHIP = 0.8
-"""Correlation of slow errors along a segment: limbs err as a whole more than they change their lengths."""
+"""Correlation of slow errors along a segment: limbs shift as a whole more than their lengths change."""
 KIN: Final[FloatArray] = np.eye(N_JOINTS)
-"""(25, 25) independent errors of unit variance to those of the joints, correlated from parents to children."""
+"""(25, 25) takes independent errors of unit variance to errors correlated from parents to children."""
 for _parent, _child in BONES:
     KIN[_child] = _KINSHIP * KIN[_parent]
     KIN[_child, _child] = np.sqrt(1.0 - _KINSHIP**2)

@@ -1,20 +1,20 @@
-"""What a Kinect v2 would have said of a person, when, and how wrongly.
+"""Simulates the skeletons that a Kinect v2 reports of a person: their errors and their times.
 
-The errors are those of the sensor's own skeleton, so they are told of the body that the sensor believes to see: one
-that faces it, with left and right exchanged where it does not (``mirrored``). From the true joints to the reported:
+The errors apply to the body as the sensor interprets it: facing the sensor, so that left and right are swapped where
+the person faces away (``mirrored``). From the true joints to the reported ones:
 
-1. the trunk is told too straight, lifted shoulders too low, a turned body as turned less (``straightening``,
+1. the trunk is reported too straight, lifted shoulders too low, the body's yaw too small (``straightening``,
    ``lift_damping``, ``turn_loss``);
-2. each joint is placed beside the anatomical one, always by the same in the body's own frames (``offset``), and along
-   the ray by what its kind is wrong by (``depth_offset``);
-3. it errs with the pose and the side it is seen from, in the same pose in the same way (``bias``, ``bias_turn``,
-   ``length_spread``), and wanders besides (``drift``, ``drift_time``); :class:`Misreading` holds what is drawn once for
-   a person and a type of sensor;
-4. a hidden joint is guessed (``guess``), drawn to the surface that hides it (``drag``) and comes free with a delay
-   (``hang_over``); limbs nearly keep their lengths in all of this;
-5. all frames bring noise (``white``) and, rarely, outliers.
+2. each joint has a constant offset from the anatomical one in the body's own frames (``offset``), and along the ray an
+   offset by its kind (``depth_offset``);
+3. each joint has an error that is a function of pose and view (``bias``, ``bias_turn``, ``length_spread``), and one
+   that drifts with time (``drift``, ``drift_time``); :class:`Misreading` holds what is drawn once per person and type
+   of sensor;
+4. a hidden joint is guessed (``guess``), pulled to the surface that hides it (``drag``) and released with a delay
+   (``hang_over``); limbs nearly keep their lengths;
+5. all frames have white noise (``white``) and, rarely, outliers.
 
-Bias, drift and noise grow with the distance (``distance_growth``) and with the angle under which the body is seen
+Bias, drift and noise grow with the distance (``distance_growth``) and with the yaw of the body against the sensor
 (``growth_60``, ``growth_90``), on its far side more than on its near side; guesses grow with the distance. All of these
 are greater along the ray than across it.
 """
@@ -51,33 +51,33 @@ from body_tracking.kinect.occlusion import Capsules, obstruction, veil
 from body_tracking.kinect.simulated import KinectErrors
 
 FIELD_OF_VIEW: Final = (np.radians(70.6), np.radians(60.0))
-"""Radians, across and down: of the depth camera."""
+"""Horizontal and vertical angle of the depth camera, radians."""
 RANGE: Final = (0.5, 4.5)
 """Metres along the optical axis within which the sensor sees bodies."""
 RATE, DARK_RATE = 30.0, 15.0
 """Frames per second, in the light and in the dark."""
 REFERENCE_DISTANCE: Final = 2.0
-"""Metres: where the errors are as large as their parameters say."""
+"""Distance at which the parameters of the errors hold, metres."""
 ALONG_RAY: Final = 1.5
-"""Errors along the ray against those across it."""
+"""Ratio of the errors along the ray to those across it."""
 _RAY_AXES: Final = np.array([1.0, 1.0, ALONG_RAY])
 _SPINE_WEIGHT, _FAR_DEPTH = 0.4, 0.3
-"""What of the variance that grows with yaw the spine has; metres behind it at which a limb has all of the far side."""
+"""The spine's share of the variance that grows with yaw; metres behind the spine at which a limb is all far side."""
 _MIDDLE = 0.75
-"""Cover from which a joint is behind the middle of something."""
+"""Cover from which a joint is behind the middle of a body part."""
 _LOST_FROM, _FIND_AGAIN = 0.6, 0.15
-"""Share of the trunk's joints that must be behind others for a body to be lost, and the seconds that it stays so."""
+"""Share of the trunk's joints behind other people from which a body is lost, and the seconds until it is found."""
 _REST_LEVEL = -0.27
-"""Shoulder against SpineShoulder of a person who stands, as a share of its distance (``kinect_pairs``)."""
+"""Height of a shoulder over SpineShoulder when standing, as a share of its distance (``kinect_pairs``)."""
 _STIFFNESS = 0.7
-"""How far the sensor keeps the length of a limb when it misplaces the limb's joints."""
+"""Share of a limb's error of length that the sensor corrects."""
 _FEATURES = 24
 """Random features per joint: enough for errors that are nearly Gaussian."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misreading:
-    """How a type of sensor misreads one person: drawn once, so that all sensors err alike in the same view and pose.
+    """Systematic errors of a type of sensor for one person: the same for all sensors in the same view and pose.
 
     All in units of the parameters of :class:`KinectErrors`, of standard deviation 1.
 
@@ -96,7 +96,7 @@ class Misreading:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Misreading:
-        """A person at random; a smooth random function by Rahimi and Recht 2007, of a Gaussian kernel."""
+        """Draw the random features of a Gaussian kernel (Rahimi and Recht 2007)."""
         shape = (N_JOINTS, _FEATURES)
         return cls(
             tables.KIN @ rng.normal(size=(N_JOINTS, 3)),
@@ -106,7 +106,7 @@ class Misreading:
         )
 
     def at(self, directions: FloatArray, turn: float) -> FloatArray:
-        """(n, 25, 4) errors at (n, 25, 9) directions, with another error after a turn by ``turn`` radians."""
+        """(n, 25, 4) errors at (n, 25, 9) directions, with a correlation length of ``turn`` radians."""
         angles = np.einsum("njd,jmd->njm", directions, self.frequencies / turn, optimize=True) + self.phases
         result: FloatArray = np.einsum("njm,jme->nje", np.cos(angles), self.amplitudes, optimize=True)
         return result
@@ -114,14 +114,14 @@ class Misreading:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedKinect:
-    """A Kinect v2 at its place, with its clock and its errors.
+    """A Kinect v2 with its pose, clock and errors.
 
     Attributes:
         pose: of its optical frame in ``world``; its name is the sensor's.
         clock: its clock against the reference clock.
         phase: seconds of its first frame after the start.
-        errors: how much it errs.
-        dark: whether it is dark: it then takes half as many frames.
+        errors: their parameters.
+        dark: without light the frame rate is halved.
     """
 
     pose: SensorPose
@@ -136,7 +136,7 @@ class SimulatedKinect:
         return DARK_RATE if self.dark else RATE
 
     def capture_times(self, duration: float, rng: np.random.Generator) -> FloatArray:
-        """(n,) seconds at which it takes its frames, in order: at the rate of its own clock, with jitter."""
+        """(n,) seconds of its captures, ascending: at the rate of its own clock, with jitter."""
         period = 1.0 / (self.rate * (1.0 + self.clock.drift_ppm * 1e-6))
         times = np.arange(self.phase, duration, period)
         moved = np.clip(rng.normal(scale=self.errors.jitter, size=len(times)), -0.3 * period, 0.3 * period)
@@ -152,18 +152,18 @@ class SimulatedKinect:
         misreading: Misreading,
         others: Sequence[tuple[FloatArray, Capsules]] = (),
     ) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """One person as the sensor reports them.
+        """One person as the sensor reports it.
 
         Args:
             times: (n,) seconds of the captures after the start.
             truth: (n, 25, 3) metres, true joints in ``world`` at these times.
-            capsules: the person's flesh.
-            rng: where all chance comes from.
+            capsules: the person's surface.
+            rng: random generator.
             misreading: of this person; the same for all sensors.
-            others: true joints and flesh of each who may stand before the person.
+            others: true joints and surface of each person who may hide this one.
 
         Returns:
-            (n, 25, 3) metres in the optical frame, NaN where a joint is not tracked, and its (n, 25) states.
+            (n, 25, 3) metres in the optical frame, NaN where a joint is not tracked, and the (n, 25) states.
         """
         if len(times) == 0:
             return np.empty((0, N_JOINTS, 3)), np.empty((0, N_JOINTS), dtype=np.uint8)
@@ -184,14 +184,14 @@ class SimulatedKinect:
         received_from_ns: int,
         rng: np.random.Generator,
     ) -> list[RecordedFrame]:
-        """The frames that arrive, in order of receipt; a frame without any tracked joint is none.
+        """The frames that arrive, in order of receipt; frames without any tracked joint are left out.
 
         Args:
             times: (n,) seconds of the captures after the start.
-            bodies: what :meth:`see` says of these, by the sensor's numbers of the persons.
+            bodies: results of :meth:`see`, by the sensor's body numbers.
             start_ns: the start in the reference clock.
             received_from_ns: the start in the receiver's clock.
-            rng: where all chance comes from.
+            rng: random generator.
         """
         errors, count = self.errors, len(times)
         lost = rng.random(count) < errors.lost
@@ -202,7 +202,7 @@ class SimulatedKinect:
                 lost[during] = True
             else:
                 received[during] = np.maximum(received[during], end + errors.delay)
-        # a connection keeps the order: a frame that is held up holds up those behind it
+        # the connection keeps the order: a delayed frame delays the next ones
         received = np.maximum.accumulate(received)
         frames = []
         for k in np.flatnonzero(~lost):
@@ -220,14 +220,14 @@ class SimulatedKinect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """The body that a sensor believes to see, over n frames.
+    """The body as the sensor interprets it, over n frames.
 
     Attributes:
         trunk: (n, 3, 3) the trunk's axes (forward, left, up) in the optical frame, as columns.
-        yaw: (n,) radians about its own axis from where it faces to the sensor, positive to its left.
+        yaw: (n,) radians about the trunk's axis from its forward direction to the sensor, positive to its left.
         rays: (n, 25, 3, 3) unit vectors right, down and along the ray of each joint, as rows.
-        growth: (n, 25) how many times greater errors are for the distance and the yaw.
-        distance: (n, 25) how many times greater they are for the distance alone.
+        growth: (n, 25) factor of the errors by distance and yaw.
+        distance: (n, 25) factor of the errors by distance alone.
     """
 
     trunk: FloatArray
@@ -246,7 +246,7 @@ class _View:
         distance = (far / REFERENCE_DISTANCE) ** errors.distance_growth
         grown = [1.0, 1.0, 1.0 + errors.growth_60, 1.0 + errors.growth_90]
         factor = np.interp(np.abs(yaw), np.radians([0.0, 30.0, 60.0, 90.0]), grown)[:, None]
-        # the root of the mean square of both sides is the factor: the near side is seen nearly as well as ever
+        # the RMS of both sides is the factor; the near side is hardly affected
         away = _unit(sight[:, Joint.SPINE_MID])
         behind = np.einsum("nji,ni->nj", sight - sight[:, None, Joint.SPINE_MID], away)
         weight = np.where(tables.SPINE, _SPINE_WEIGHT, np.clip(1.0 + behind / _FAR_DEPTH, 0.1, 1.9))
@@ -254,14 +254,14 @@ class _View:
         return cls(trunk, yaw, rays, growth, distance)
 
     def in_optical(self, errors: FloatArray) -> FloatArray:
-        """(n, 25, 3) errors to the right, down and along the ray into the optical frame."""
+        """Transform (n, 25, 3) errors from (right, down, along the ray) into the optical frame."""
         result: FloatArray = np.einsum("njk,njki->nji", errors, self.rays)
         return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sighting:
-    """Errs over frames at a regular ``period`` in seconds."""
+    """Applies the errors to frames at a regular ``period`` in seconds."""
 
     errors: KinectErrors
     period: float
@@ -270,13 +270,20 @@ class _Sighting:
     def of(
         self, sight: FloatArray, capsules: Capsules, misreading: Misreading, veiled: FloatArray
     ) -> tuple[FloatArray, NDArray[np.uint8]]:
-        """True joints in the optical frame, (n, 25) hidden by others, to reported ones and their states."""
-        # one generator per kind of error, so that one kind does not depend on how often another one happens
+        """The reported joints and their states.
+
+        Args:
+            sight: (n, 25, 3) metres, true joints in the optical frame.
+            capsules: the person's surface.
+            misreading: of the person.
+            veiled: (n, 25) how deep each joint is behind other people, 0 to 1.
+        """
+        # one generator per kind of error, so that the kinds do not affect each other
         for_labels, for_slow, for_states, for_white = self.rng.spawn(4)
         before, in_view = obstruction(sight, capsules), _in_view(sight)
         labels = self._labels(sight, for_labels)
         sight = np.take_along_axis(sight, labels[..., None], axis=1)
-        # the sensor knows the other for somebody else: what is hidden by others is not drawn to them
+        # the sensor separates people: a joint hidden by another person is not pulled to that person
         covers = np.maximum(before.cover, veiled), np.where(veiled > before.cover, 0.0, before.nearer)
         cover, nearer = (np.take_along_axis(values, labels, axis=1) for values in covers)
         in_view = np.take_along_axis(in_view, labels, axis=1)
@@ -295,7 +302,7 @@ class _Sighting:
         return placed, states
 
     def _labels(self, sight: FloatArray, rng: np.random.Generator) -> IntArray:
-        """(n, 25) which joint the sensor takes for which."""
+        """(n, 25) the true joint that the sensor reports as each joint."""
         errors, count = self.errors, len(sight)
         times: FloatArray = self.period * np.arange(count, dtype=np.float64)
         labels = np.tile(np.arange(N_JOINTS, dtype=np.intp), (count, 1))
@@ -309,14 +316,14 @@ class _Sighting:
         return labels
 
     def _mirrored(self, yaw: FloatArray, times: FloatArray, rng: np.random.Generator) -> BoolArray:
-        """(n,) whether the sensor exchanges left and right; yaw (n,) radians from 0 to pi."""
+        """(n,) whether the sensor swaps left and right; yaw (n,) radians from 0 to pi."""
         errors = self.errors
         back = yaw > np.pi / 2 + errors.mirror_hysteresis
         front = yaw < np.pi / 2 - errors.mirror_hysteresis
         mirrored: BoolArray = np.zeros_like(back)
         edges = np.flatnonzero(np.diff(back, prepend=False, append=False))
         for begin, end in edges.reshape(-1, 2):
-            # who turns back is seen rightly when it cannot be mistaken any more, or a while before
+            # the swap ends when the person faces the sensor unambiguously, or a while before
             until = min(end + round(rng.exponential(errors.mirror_time) / self.period), len(yaw))
             seen = np.flatnonzero(front[end:until])
             mirrored[begin : end + int(seen[0]) if len(seen) else until] |= rng.random() < errors.mirrored
@@ -329,7 +336,7 @@ class _Sighting:
         return mirrored
 
     def _shape(self, sight: FloatArray, view: _View) -> FloatArray:
-        """(n, 25, 3) displacement: straightened spine, damped lift of the shoulders, body turned less than it is."""
+        """(n, 25, 3) displacement: straightened spine, damped lift of the shoulders, reduced yaw of the body."""
         errors, moved = self.errors, np.zeros_like(sight)
         base, top = sight[:, Joint.SPINE_BASE], sight[:, Joint.SPINE_SHOULDER]
         chord, middle = top - base, sight[:, Joint.SPINE_MID] - base
@@ -353,13 +360,13 @@ class _Sighting:
         return moved
 
     def _offset(self, view: _View, segments: FloatArray, misreading: Misreading) -> FloatArray:
-        """(n, 25, 3) what is constant: in the body's frames, and along the ray."""
+        """(n, 25, 3) the constant offsets: in the body's frames, and along the ray."""
         constant = (
             self.errors.anatomical * tables.ANATOMICAL
             + self.errors.offset * tables.SLOW_SCALE[:, None] * misreading.offset
         )
         offset = np.einsum("nik,jk->nji", view.trunk, constant)
-        # limbs: by the least rotation that takes the segment's rest direction to where it points
+        # limbs: by the least rotation that takes the segment's rest direction to its present one
         limbs = ~tables.ON_TRUNK
         rest = np.einsum("nik,jk->nji", view.trunk, tables.REST[limbs])
         offset[:, limbs] = _least_rotation(rest, segments[:, limbs], offset[:, limbs])
@@ -374,9 +381,9 @@ class _Sighting:
         misreading: Misreading,
         rng: np.random.Generator,
     ) -> tuple[FloatArray, FloatArray]:
-        """What persists, with the pose and with time: (n, 25, 3) displacement, (n, 25) how much longer segments are.
+        """Bias and drift: (n, 25, 3) displacement, and (n, 25) relative errors of the segments' lengths.
 
-        A joint's segment is the one from its anchor; the displacement has the lengths in it.
+        A joint's segment is the one from its anchor; the displacement includes the errors of the lengths.
         """
         errors = self.errors
         pointing = np.einsum("nki,njk->nji", view.trunk, segments)
@@ -391,7 +398,7 @@ class _Sighting:
         return displacement + length[..., None] * (anatomy - anatomy[:, tables.ANCHORS]), length
 
     def _hidden(self, view: _View, cover: FloatArray, nearer: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """(n, 25, 3) displacement of hidden joints; those of the trunk are not drawn to what hides them."""
+        """(n, 25, 3) displacement of hidden joints; those of the trunk are not pulled to the hiding surface."""
         errors = self.errors
         half = 0.5 * errors.hidden_from
         hidden = np.clip((cover - half) / half, 0.0, 1.0)
@@ -403,7 +410,7 @@ class _Sighting:
 
     @staticmethod
     def _keep_lengths(placed: FloatArray, anatomy: FloatArray, longer: FloatArray) -> None:
-        """Move the limbs' joints of ``placed``, from the trunk outwards, to nearly their lengths."""
+        """Move the limbs' joints of ``placed``, from the trunk outwards, so that limbs nearly keep their lengths."""
         for joints in tables.CHAINS:
             parents = tables.PARENTS[joints]
             way = placed[:, joints] - placed[:, parents]
@@ -425,7 +432,7 @@ class _Sighting:
         """(n, 25) tracking states."""
         errors, shape = self.errors, cover.shape
         hidden = self._lag(cover)
-        # what is said of a hidden joint is said for a while
+        # the state of a hidden joint persists for a while
         chance = self._wander(shape, rng)
         inferred = (hidden > errors.hidden_from) & (chance > ndtri(errors.mislabelled))
         lost = inferred & (hidden > _MIDDLE) & (chance > -ndtri(errors.given_up))
@@ -435,13 +442,13 @@ class _Sighting:
         return states
 
     def _unseen(self, veiled: FloatArray) -> BoolArray:
-        """(n,) when the body is lost: most of the trunk behind others, and for a moment after that."""
+        """(n,) whether the body is lost: most of the trunk is, or was a moment ago, behind other people."""
         hidden = (veiled[:, tables.ON_TRUNK] > self.errors.hidden_from).mean(axis=1) > _LOST_FROM
         until = np.convolve(hidden, np.ones(1 + round(_FIND_AGAIN / self.period)))[: len(hidden)]
         return until > 0.5
 
     def _wander(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-        """A smooth process of unit variance over the first axis: an Ornstein-Uhlenbeck process, followed by another.
+        """A smooth process of unit variance over the first axis: two Ornstein-Uhlenbeck processes in series.
 
         Its correlation is (1 + t) exp(-t) after a time t in units of half the ``drift_time`` (Matern, 3/2).
         """
@@ -452,7 +459,7 @@ class _Sighting:
         return result
 
     def _lag(self, values: FloatArray) -> FloatArray:
-        """(n, ...) values as they are followed with a delay, from rest."""
+        """(n, ...) values through a first-order low-pass filter with time constant ``hang_over``."""
         keep = np.exp(-self.period / max(self.errors.hang_over, 1e-9))
         result: FloatArray
         result, _ = lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=keep * values[:1])
@@ -460,7 +467,7 @@ class _Sighting:
 
 
 def _events(times: FloatArray, rate: float, duration: float, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """(begin, end) in seconds of what happens at random, lasting at random."""
+    """(begin, end) in seconds of the events of a Poisson process, with exponential durations."""
     span = float(times[-1] - times[0]) if len(times) else 0.0
     begins = times[:1] + np.sort(rng.uniform(0.0, span, rng.poisson(rate * span)))
     return [(float(begin), float(begin + rng.exponential(duration))) for begin in begins]
@@ -484,7 +491,7 @@ def _trunk(sight: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _least_rotation(start: FloatArray, end: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(..., 3) vectors turned as the least rotation turns unit vectors ``start`` into ``end``."""
+    """(..., 3) vectors rotated by the least rotation that takes unit vectors ``start`` to ``end``."""
     cos = (start * end).sum(axis=-1, keepdims=True)
     axis = np.cross(start, end)
     along = (axis * vectors).sum(axis=-1, keepdims=True) / np.maximum(1.0 + cos, 0.05)

@@ -53,8 +53,8 @@ def sensors_of(options: Options) -> tuple[str, ...]:
     """The sensors of a graph.
 
     Raises:
-        GraphError: no sensor, or one twice.
-        SensorNameError: a name that cannot be a sensor's.
+        GraphError: no sensor, or a duplicate.
+        SensorNameError: an invalid name.
     """
     given = options["sensors"]
     sensors = tuple(check_sensor_name(sensor) for sensor in given) if isinstance(given, tuple) else ()
@@ -66,10 +66,10 @@ def sensors_of(options: Options) -> tuple[str, ...]:
 
 
 def _adapted(options: Options) -> dict[str, dict[str, Value]]:
-    """Of each sensor that another driver's topic is adapted for, the adapter's parameters.
+    """The adapter's parameters by sensor, for sensors with another driver.
 
     Raises:
-        GraphError: a sensor that is none of the graph's.
+        GraphError: a sensor that is not in the graph.
     """
     found: dict[str, dict[str, Value]] = {}
     sensors, given = sensors_of(options), options["adapt"]
@@ -98,7 +98,7 @@ SYSTEM = System(
             "names, the reference first (default: those in the bag, else kinect1,kinect2)",
             "A,B",
         ),
-        Option("external", False, "start no sensor nodes: somebody else publishes /<sensor>/skeleton"),
+        Option("external", False, "start no sensor nodes: other processes publish /<sensor>/skeleton"),
         Option(
             "adapt",
             (),

@@ -120,29 +120,29 @@ class RobotCommands(GraphNode):
                 self.follower.refuse_angles(str(error))
                 raise
             convention = str(values.header.frame_id)
-            if self.follower.hear_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
+            if self.follower.receive_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
                 self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
             self.monitor.totals["unpaired"] += 1
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
-        self.follower.hear_sensor(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
+        self.follower.receive_frame(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
 
     def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:
         pose = transform_to_pose(message)
         if pose.sensor in self.sensors:
-            self.follower.calibration.pose(pose.sensor, pose.valid_from_ns)
+            self.follower.calibration.receive_pose(pose.sensor, pose.valid_from_ns)
 
     def on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
         for status in statuses(message, namespace=self.get_namespace()):
             if status.node == "calibration":
                 quality = CalibrationQuality.from_diagnostics(status.values, self.sensors)
-                self.follower.calibration.heard(quality, time.monotonic_ns())
+                self.follower.calibration.receive_quality(quality, time.monotonic_ns())
 
     def on_robot(self, message: JointState, sent_ns: int) -> None:
         position = np.array(message.position, dtype=np.float64)
-        self.follower.hear_robot(tuple(message.name), position, time.monotonic_ns())
+        self.follower.receive_robot_state(tuple(message.name), position, time.monotonic_ns())
 
     def on_enable(self, _: Any, response: Any) -> Any:
         try:
@@ -170,7 +170,7 @@ class RobotCommands(GraphNode):
 
     def publish_command(self) -> None:
         now_ns = self.now_ns()
-        self.follower.hear_publishers(self.others())
+        self.follower.report_publishers(self.others())
         self.command = command = self.follower.step(now_ns, time.monotonic_ns())
         if command.position is not None:
             output = self.mapping.output

@@ -19,12 +19,12 @@ from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.recording.replay import Progress, parameters_for, sensor_topics, skeletons_of
 from body_tracking.recording.rig import RigReader
 
-WHOLE = 600.0
-"""Raw frames kept, seconds: a recording up to this long is interpolated anew with the final clock."""
+HISTORY_S = 600.0
+"""Raw frames kept, seconds: a recording up to this long is interpolated again with the final clock."""
 
 
 def relative_yaw(result: CalibrationResult, sensor: str) -> float:
-    """The turn about the vertical that takes a sensor's coordinates into the reference's, in Kinect camera axes.
+    """The rotation about the vertical from a sensor's coordinates to the reference's, in Kinect camera axes.
 
     Args:
         result: with both sensors.
@@ -41,7 +41,7 @@ def relative_yaw(result: CalibrationResult, sensor: str) -> float:
 def calibrate(
     bag_path: Path, parameters: CalibrationParameters, sensors: tuple[str, ...] = (), reference: str = ""
 ) -> tuple[CalibrationResult, list[str]]:
-    """Calibrate from a bag, with all of it.
+    """Calibrate from a whole bag.
 
     Args:
         bag_path: a rosbag2 folder or an mcap file.
@@ -50,7 +50,7 @@ def calibrate(
         reference: the sensor that defines ``world``; the first when empty.
 
     Returns:
-        The result, and what happened on the way, a line each.
+        The result, and events, a line each.
 
     Raises:
         ReplayError: no skeletons in the bag.
@@ -61,7 +61,7 @@ def calibrate(
     with RigReader(bag_path) as bag:
         topics = sensor_topics(bag, sensors)
         names = tuple(topics.values())
-        calibration = OnlineCalibration(names, replace(parameters, history=WHOLE), reference or None)
+        calibration = OnlineCalibration(names, replace(parameters, history=HISTORY_S), reference or None)
         progress = Progress(bag.start_ns, bag.end_ns)
         frames = 0
         for sensor, skeleton, log_time_ns, _ in skeletons_of(bag, topics, counters):
@@ -86,7 +86,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking calibrate``."""
     command = subparsers.add_parser(
         "calibrate",
-        description="Finds where each sensor of a recording stood and how its clock ran, from the person they saw.",
+        description="Estimates the pose and clock of each sensor of a recording from the skeletons of a person.",
     )
     command.add_argument(
         "bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics"
@@ -107,7 +107,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """The command."""
     own: dict[str, Value] = {
         "use_sim_time": False,
         "reliable": False,

@@ -1,6 +1,6 @@
-"""The second half of the offline graph, filter, angles and the bag that is written, in a process of its own.
+"""The second half of the offline graph (filter, angles and writing the bag) in a process of its own.
 
-Each half takes about half of the time; the messages, their order and the numbers are the same in one process.
+Each half takes about half of the time; the results are the same as in one process.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remov
 from body_tracking.systems import NODES, stage_class
 
 _BATCH = 128
-"""Messages that go through the pipe at once: each trip costs as much as several of them."""
+"""Messages per batch through the pipe, where each batch costs as much as several messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What the second half did.
+    """Result of the second half.
 
     Attributes:
-        frames: joint angle messages.
-        counters: of the filter, and what could not be used.
+        frames: number of joint angle messages.
+        counters: of the filter, and of unusable messages.
     """
 
     frames: int
@@ -43,14 +43,14 @@ class Written:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What is to be run and written.
+    """Parameters of the second half.
 
     Attributes:
         values: parameters of each stage, by its name.
-        out: the bag to be made.
-        topics: type and QoS of further topics that will be written.
-        overwrite: replace ``out`` if it is there.
-        model_covariance: write the covariance of the filter's model, too.
+        out: the bag to write.
+        topics: type and QoS of further topics to write.
+        overwrite: replace an existing ``out``.
+        model_covariance: also write the covariance of the filter's model.
     """
 
     values: Mapping[str, Mapping[str, Value]]
@@ -61,18 +61,15 @@ class Job:
 
 
 def is_second(executable: str) -> bool:
-    """Whether a stage is one of the second half."""
+    """Whether a stage belongs to the second half."""
     return NODES[executable].place >= Place.FILTER
 
 
 class Downstream:
     """Writes every message, and runs the second half on it.
 
-    Args:
-        job: what is to be done.
-
     Raises:
-        BodyTrackingError: ``out`` cannot be written, or the parameters make no sense.
+        BodyTrackingError: ``out`` cannot be written, or invalid parameters.
     """
 
     def __init__(self, job: Job) -> None:
@@ -87,7 +84,6 @@ class Downstream:
                 self._writer.add_topic(topic, type_name, qos)
 
     def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
-        """One message."""
         self._writer.write(topic, cdr, at_ns)
         self._runner.push(topic, cdr, at_ns)
 
@@ -100,7 +96,7 @@ class Downstream:
             self._writer.write(topic, cdr, at_ns)
 
     def finish(self, at_ns: int) -> Written:
-        """Close the bag; one without angles is removed again."""
+        """Close the bag, or remove it if it has no angles."""
         self._runner.finish(at_ns)
         if self._frames:
             self._writer.close()
@@ -111,7 +107,7 @@ class Downstream:
 
     @property
     def path(self) -> Path:
-        """The file that is written."""
+        """The file of the bag."""
         return self._writer.path
 
     def abandon(self) -> None:
@@ -120,36 +116,34 @@ class Downstream:
 
 
 class ForkedDownstream:
-    """:class:`Downstream` in a process of its own; same argument, same errors."""
+    """:class:`Downstream` in a process of its own; arguments and errors as there."""
 
     def __init__(self, job: Job) -> None:
         context = multiprocessing.get_context("fork")
-        self._connection, theirs = context.Pipe()
-        # What a process that is killed at once leaves of a bag that was not there before.
+        self._connection, remote = context.Pipe()
+        # Removed if the process is killed before it reports its file, unless the bag existed before.
         self._path = None if job.out.exists() else job.out.absolute() / f"{job.out.absolute().name}_0.mcap"
-        self._process = context.Process(target=_serve, args=(self._connection, theirs, job), daemon=True)
+        self._process = context.Process(target=_serve, args=(self._connection, remote, job), daemon=True)
         self._batch: list[tuple[str, bytes, int]] = []
         with warnings.catch_warnings():
-            # Python 3.12 warns of forking with threads; those of the numeric libraries are prepared for it.
+            # Python 3.12 warns of forking with threads; those of the numeric libraries handle it.
             warnings.simplefilter("ignore", DeprecationWarning)
-            collects = gc.isenabled()
-            gc.disable()  # until the other process has set aside what it inherits
+            enabled = gc.isenabled()
+            gc.disable()  # until gc.freeze() in the other process
             try:
                 self._process.start()
             finally:
-                if collects:
+                if enabled:
                     gc.enable()
-        theirs.close()
+        remote.close()
         self._path = self._receive()
 
     def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
-        """One message."""
         self._batch.append((topic, cdr, at_ns))
         if len(self._batch) >= _BATCH:
             self._send()
 
     def finish(self, at_ns: int) -> Written:
-        """Close the bag; one without angles is removed again."""
         self._send()
         self._connection.send(at_ns)
         written = self._receive()
@@ -168,13 +162,13 @@ class ForkedDownstream:
         try:
             self._connection.send(self._batch)
         except (BrokenPipeError, ConnectionResetError):
-            self._receive()  # raises why
+            self._receive()  # raises the error of the other process
         self._batch = []
 
     def _receive(self) -> Any:
         try:
             answer = self._connection.recv()
-        except (EOFError, ConnectionResetError):  # the latter where it left something unread
+        except (EOFError, ConnectionResetError):  # the latter if it left data unread
             self.abandon()
             raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
         if isinstance(answer, BaseException):
@@ -183,12 +177,11 @@ class ForkedDownstream:
         return answer
 
 
-def _serve(theirs: Connection, connection: Connection, job: Job) -> None:
+def _serve(inherited: Connection, connection: Connection, job: Job) -> None:
     """The other process."""
-    # While a copy of the first process's end is open here, its closing would not be seen.
-    theirs.close()
-    # Garbage of the first process is not this one's to take down. ROS nodes among it have threads that are not here,
-    # and end in a crash.
+    # With this copy of the first process's end open, recv() would not notice that it was closed there.
+    inherited.close()
+    # Inherited garbage must not be collected here: ROS nodes, whose threads do not exist in this process, would crash.
     gc.freeze()
     gc.enable()
     downstream: Downstream | None = None
@@ -209,7 +202,7 @@ def _serve(theirs: Connection, connection: Connection, job: Job) -> None:
 
 
 def start_downstream(job: Job) -> Downstream | ForkedDownstream:
-    """The second half, in another process where that is possible and there are processors for both.
+    """The second half, in another process if the platform allows it and there are two processors.
 
     Raises:
         BodyTrackingError: as of :class:`Downstream`.

@@ -46,18 +46,18 @@ _Message = tuple[str, str, Qos, object]
 
 
 class ImportFileError(BodyTrackingError):
-    """Files that cannot be imported, or not together."""
+    """Raised when files cannot be imported, or not together."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedSensor:
-    """What was imported of one sensor.
+    """The imported messages of one sensor.
 
     Attributes:
-        frames: messages.
-        bodies: the most bodies in one frame; 0 of an inertial sensor.
+        frames: number of messages.
+        bodies: the most bodies in one frame; 0 for an inertial sensor.
         seconds: from the first to the last receipt.
-        topics: where they went.
+        topics: of the messages.
     """
 
     frames: int
@@ -68,14 +68,14 @@ class ImportedSensor:
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What an import did.
+    """Result of an import.
 
     Attributes:
         bag: the folder.
         sensors: by name.
         seconds: from the first to the last receipt of all.
-        problems: how often each kind of oddity was met; all of it was imported as recorded.
-        warnings: what is missing.
+        problems: counts of irregularities, by kind; their data were imported as recorded.
+        warnings: missing data, a line each.
     """
 
     bag: Path
@@ -136,8 +136,8 @@ def open_recording(path: Path, sensor: str | None = None, partial: bool = False)
 
     Args:
         path: ``.csv``, ``.csv.gz`` or ``.skeleton``.
-        sensor: the sensor's name, where the file does not tell it or tells another.
-        partial: read a file that is cut off up to its last whole frame.
+        sensor: the sensor's name, if the file lacks it or to replace it.
+        partial: read a truncated file up to its last whole frame.
 
     Raises:
         ImportFileError: another suffix, or no such file.
@@ -180,16 +180,16 @@ def import_files(
 
     Args:
         files: each with sensors of its own.
-        bag: the folder to make.
-        sensors: names for files, where a file does not tell its sensor or tells another. A CSV file without the column
-            ``sensor`` is ``kinect1`` without this, the next one ``kinect2``.
-        overwrite: replace a bag that is there.
-        partial: import files that are cut off as far as they go.
-        progress: show on stderr how far it is.
+        bag: the folder to create.
+        sensors: names by file, for files that lack the sensor's name or to replace it. By default CSV files without the
+            column ``sensor`` are ``kinect1``, ``kinect2``, ...
+        overwrite: replace an existing bag.
+        partial: import truncated files up to their last whole frame.
+        progress: show progress on stderr.
 
     Raises:
-        BodyTrackingError: a file is not as its format says, or two files have a sensor in common, or the bag cannot be
-            written. No bag is left then.
+        BodyTrackingError: an invalid file, two files with the same sensor, or the bag cannot be written. The incomplete
+            bag is removed.
     """
     if not files:
         raise ImportFileError("no file to import")
@@ -201,7 +201,7 @@ def import_files(
     ]
     tallies: dict[str, _Tally] = {}
     owners: dict[str, Path] = {}
-    # Read once before anything that is there is replaced: a file that turns out to be bad must not cost a bag.
+    # Read all files before an existing bag is replaced: an invalid file must not destroy it.
     if overwrite and bag.exists():
         for recording in recordings:
             for _ in recording:
@@ -251,7 +251,7 @@ def import_files(
 
 
 def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]:
-    """The name to give to each file's sensor; None where the file itself tells it."""
+    """The name for each file's sensor; None to take it from the file."""
     unknown = [path for path in given if path not in files]
     if unknown:
         raise ImportFileError(f"--sensor {given[unknown[0]]}={unknown[0]}: no such file is imported")
@@ -259,14 +259,14 @@ def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]
     for path in files:
         name = given.get(path)
         if name is None and path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and not sensor_column(path):
-            # an inertial reader names its sensors itself
+            # the inertial reader names its sensors itself
             name = None if _is_inertial(path) else f"kinect{sum(value is not None for value in names) + 1}"
         names.append(name)
     return names
 
 
 def _messages(item: _Item) -> list[_Message]:
-    """What is written of an item."""
+    """The messages of an item."""
     if isinstance(item, RecordedFrame):
         cloud = skeletons_to_cloud(item.skeletons, BAG_MESSAGES)
         return [(f"/{item.sensor}/skeleton", POINT_CLOUD, SENSOR_DATA, cloud)]
@@ -284,7 +284,7 @@ def _messages(item: _Item) -> list[_Message]:
 
 
 def _ordered(recording: Recording | ImuRecording, number: int) -> Iterator[tuple[int, int, _Item]]:
-    """Items with a key that never falls, so that merging keeps each file's own order."""
+    """Items with a non-decreasing key, so that merging keeps the order within each file."""
     latest = -(2**63)
     for item in recording:
         latest = max(latest, item.received_ns)
@@ -292,7 +292,7 @@ def _ordered(recording: Recording | ImuRecording, number: int) -> Iterator[tuple
 
 
 class _Progress:
-    """One line on stderr that is written over; nothing where stderr is no terminal, or for short imports."""
+    """A percentage on stderr, if that is a terminal and the import takes more than a second."""
 
     def __init__(self, recordings: Sequence[Recording | ImuRecording]) -> None:
         self._recordings = recordings
@@ -330,10 +330,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         default=[],
         metavar="NAME[=FILE]",
-        help="the sensor's name, where the file does not tell it or tells another; with several files, once per file; "
+        help="the sensor's name, if the file lacks it or to replace it; with several files, once per file; "
         "NAME,NAME,... for a file of several inertial sensors",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     parser.add_argument("--partial", action="store_true", help="import files that are cut off as far as they go")
     parser.add_argument("--json", action="store_true", help="print what was imported as JSON")
     parser.set_defaults(run=run)

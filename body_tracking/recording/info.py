@@ -1,4 +1,4 @@
-"""``body_tracking bag info`` and ``bag recover``: what is in a recording, and closing one that was cut off."""
+"""``body_tracking bag info`` and ``bag recover``: the content of a bag, and closing a truncated one."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from body_tracking.recording.rosbag2 import BagReader, TopicInfo, recover
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """A topic of a bag: its messages that can be read, and what its publishers offered.
+    """A topic of a bag: its readable messages, and its publishers' QoS.
 
     Attributes:
         rate: mean, in hertz, between the first and the last message; None with fewer than two.
-        longest_gap: seconds between two messages at most; None with fewer than two.
+        longest_gap: between two messages, seconds; None with fewer than two.
     """
 
     name: str
@@ -38,16 +38,16 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True)
 class BagInfo:
-    """What is in a bag.
+    """Content of a bag.
 
     Attributes:
         path: of the bag.
         files: mcap files with their sizes in bytes.
         start_ns: earliest log time.
         duration_s: seconds from the first to the last message.
-        messages: that can be read.
+        messages: number of readable messages.
         topics: by name.
-        warnings: what is missing or damaged.
+        warnings: missing or damaged parts.
     """
 
     path: Path
@@ -60,10 +60,10 @@ class BagInfo:
 
 
 def bag_info(path: Path | str) -> BagInfo:
-    """Look through a whole bag, a folder or a single mcap file; what is counted is what can really be read.
+    """Read a whole bag, a folder or a single mcap file, and count its readable messages.
 
     Raises:
-        BagError: nothing there can be read as a recording.
+        BagError: no readable recording.
     """
     with BagReader(path) as reader:
         found: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
@@ -90,7 +90,7 @@ def _summary(name: str, topic: TopicInfo, times_ns: NDArray[np.uint64]) -> Topic
 
 
 def _qos_text(offers: tuple[Qos, ...]) -> str:
-    """``best_effort 5``, ``reliable transient_local 10``; the durability only where it is not the usual one."""
+    """``best_effort 5``, ``reliable transient_local 10``; the durability is omitted if volatile."""
     texts = []
     for qos in offers:
         durability = "" if qos.durability == "volatile" else f" {qos.durability}"

@@ -1,12 +1,12 @@
-"""One mcap file, whole or damaged: what is in it, and what is missing.
+"""Reads one mcap file, complete or damaged.
 
-A file that was closed ends in a summary (channels, chunk index, counts) under a checksum, and opens from that at once.
-A file without one, because the recorder or the power died, is read record by record; a cut chunk is decompressed as far
-as it goes and yields its whole messages. A chunk whose checksum does not fit is skipped.
+A closed file ends in a summary (channels, chunk index, counts) with a checksum, and is opened from that. A file without
+a summary, after a crash or power failure, is read record by record; a truncated chunk is decompressed as far as
+possible and yields its whole messages. A chunk with a wrong checksum is skipped.
 
 Records are parsed by the ``mcap`` library (format: https://mcap.dev/spec, version 0). Its readers, and those of
-``rosbags``, stop at the first record that is damaged or cut off, decompress a chunk whatever size it claims, and take
-1.6 and 2.4 times as long for a recording (tpose_torso_twist, 3204 messages, one run, rosbags 0.11.9, mcap 1.6.0).
+``rosbags``, stop at the first damaged record, do not limit the size of decompressed chunks, and take 1.6 and 2.4 times
+as long for a recording (tpose_torso_twist, 3204 messages, one run, rosbags 0.11.9, mcap 1.6.0).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from body_tracking.core.skeleton import NANOSECONDS
 
 MAGIC: bytes = MCAP0_MAGIC
 LIBRARY = "body_tracking"
-"""Who wrote a file, in its header."""
+"""Name of the writer in a file's header."""
 
 _HEAD = struct.Struct("<BQ")  # opcode, length of the content
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -45,21 +45,21 @@ _RUN_BYTES = 1 << 20
 """Records outside of chunks are read in runs of about this size."""
 
 MAX_CHUNK_BYTES = 64 << 20
-"""Decompressed bytes of a chunk that is read: recorders close theirs after some megabytes."""
+"""Limit of a chunk's decompressed bytes: recorders close theirs after some megabytes."""
 MAX_RECORDS = 500_000
-"""Records of a chunk that is read; they take a second."""
+"""Limit of a chunk's records; parsing them takes a second."""
 
 
 class BagError(BodyTrackingError):
-    """A recording cannot be read or written."""
+    """Raised when a recording cannot be read or written."""
 
 
 class Damaged(Exception):
-    """A record is not what its place promises."""
+    """Raised for a damaged record."""
 
 
 class StoredMessage(NamedTuple):
-    """A message as it lies in the file."""
+    """A serialised message in the file."""
 
     channel: int
     log_time_ns: int
@@ -69,7 +69,7 @@ class StoredMessage(NamedTuple):
 
 @dataclass(slots=True)
 class Block:
-    """A run of messages that is read at once: a chunk, or messages that lie outside of chunks.
+    """A unit of reading: a chunk, or a run of messages outside of chunks.
 
     Attributes:
         offset: of its first byte in the file.
@@ -78,8 +78,8 @@ class Block:
         cut: whether the file ends inside of it.
         start_ns: earliest log time in it.
         end_ns: latest log time in it.
-        channels: of its messages; None where only reading the block tells.
-        count: messages in it; None likewise.
+        channels: of its messages; None if unknown before it is read.
+        count: of its messages; None likewise.
     """
 
     offset: int
@@ -97,16 +97,16 @@ def _parse(record: type[Any], content: bytes) -> Any:
 
 
 def _chunk_records(content: bytes, cut: bool) -> bytes:
-    """The records in a chunk record; of one that is cut off the first of them.
+    """The records in a chunk; of a truncated one the first of them.
 
     Raises:
-        Damaged: the chunk is not as it was written, or larger than any that is read.
+        Damaged: the chunk is damaged or too large.
     """
     chunk: Chunk = _parse(Chunk, content)
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise Damaged(_too_large(size))
-    data = _decompress(chunk.compression, chunk.data, size + 1)  # a byte more, where it is more than it says
+    data = _decompress(chunk.compression, chunk.data, size + 1)  # one byte more, to detect a wrong size
     if not cut and len(data) != size:
         raise Damaged("its size does not fit")
     if not cut and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -115,7 +115,7 @@ def _chunk_records(content: bytes, cut: bool) -> bytes:
 
 
 def _decompress(compression: str, data: bytes, limit: int) -> bytes:
-    """As much as decompresses, and no more than the limit, whatever size the data says that it has."""
+    """Decompress up to the limit, regardless of the size that the data claims."""
     if compression == "zstd":
         return zstandard.ZstdDecompressor().stream_reader(data).read(limit)
     if compression == "lz4":
@@ -140,16 +140,16 @@ class McapFile:
         path: of the file.
         schemas: by id.
         channels: by id.
-        blocks: where the messages are, in the order of the file.
+        blocks: of the messages, in the order of the file.
         counts: messages per channel.
         start_ns: earliest log time; 0 without messages.
         end_ns: latest log time; 0 without messages.
         whole: whether it ends in a valid summary, as a closed recording does.
-        warnings: what is missing or damaged, as far as it is known yet.
-        damaged_at: bytes at which something is damaged, other than that the end is missing.
+        warnings: missing or damaged parts found so far.
+        damaged_at: offsets of damaged parts, other than a missing end.
 
     Raises:
-        BagError: the file cannot be read, is empty, is no mcap file, or nothing in it can be read.
+        BagError: the file is unreadable, empty, no mcap file, or has no readable content.
     """
 
     def __init__(self, path: Path) -> None:
@@ -168,7 +168,6 @@ class McapFile:
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     @property
@@ -177,7 +176,7 @@ class McapFile:
         return self.counts.total()
 
     def read(self, block: Block) -> list[StoredMessage]:
-        """The messages of a block, in the order in which they were written; none of a damaged block."""
+        """The messages of a block, in the order of writing; none of a damaged block."""
         messages = self._messages(block)
         known = [message for message in messages if message.channel in self.channels]
         if len(known) < len(messages) and block.offset not in self.damaged_at:
@@ -185,8 +184,6 @@ class McapFile:
             lost = len(messages) - len(known)
             self._warn(f"{lost} message(s) at byte {block.offset} belong to a topic whose description is lost")
         return known
-
-    # --- inside
 
     def _forget(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -199,7 +196,7 @@ class McapFile:
         self.warnings.append(f"{self.path.name}: {text}")
 
     def _bytes_at(self, offset: int, length: int) -> bytes:
-        """A piece of the file; shorter where the file ends."""
+        """Bytes of the file; fewer at its end."""
         try:
             self._file.seek(offset)
             return self._file.read(length)
@@ -207,7 +204,7 @@ class McapFile:
             raise BagError(f"{self.path}: {error.strerror}") from error
 
     def _messages(self, block: Block) -> list[StoredMessage]:
-        """What is in a block; nothing, and a warning, if it is damaged."""
+        """The messages of a block; none, and a warning, if it is damaged."""
         try:
             if block.length > MAX_CHUNK_BYTES + _RUN_BYTES:
                 raise Damaged(_too_large(block.length))
@@ -221,13 +218,13 @@ class McapFile:
             return self._records(data)
         except BagError:
             raise
-        except Exception as error:  # what the parsers and decompressors raise where the bytes are others is not listed
+        except Exception as error:  # parsers and decompressors do not document what they raise for damaged data
             if not block.cut:
                 self._skip(block, error if isinstance(error, Damaged) else Damaged("it cannot be read"))
             return []
 
     def _records(self, data: bytes) -> list[StoredMessage]:
-        """The messages at the beginning of ``data``, up to the last whole one; topics are taken note of."""
+        """The whole messages in ``data``; without a summary, also stores schemas and channels."""
         messages: list[StoredMessage] = []
         position, end, left = 0, len(data), MAX_RECORDS
         while end - position >= _HEAD.size:
@@ -280,7 +277,7 @@ class McapFile:
                 raise BagError(f"{self.path}: nothing in it can be read ({self.warnings[0]})")
 
     def _read_summary(self, size: int) -> bool:
-        """Take everything from the summary; False if there is none, or it cannot be trusted or does not tell all."""
+        """Read the summary; False if it is missing, damaged or incomplete."""
         ending = self._bytes_at(max(0, size - _ENDING_BYTES), _ENDING_BYTES)
         if not ending.endswith(MAGIC) or not ending.startswith(_HEAD.pack(Opcode.FOOTER, _FOOTER.size)):
             return False
@@ -311,7 +308,7 @@ class McapFile:
         return complete and (not self.message_count or bool(self.blocks and self.channels))
 
     def _index(self, index: ChunkIndex, data_end: int) -> None:
-        """A chunk, from the summary. Message indexes are 15 bytes, and 16 for each message."""
+        """Add a chunk from the summary. A channel's message index has 15 bytes, plus 16 for each message."""
         if index.chunk_start_offset + index.chunk_length > data_end:
             raise Damaged("a chunk lies behind the data")
         if index.uncompressed_size > MAX_CHUNK_BYTES:
@@ -330,7 +327,7 @@ class McapFile:
 
     def _scan(self, size: int) -> None:
         """Read the records one by one, to the last whole one."""
-        position = run = len(MAGIC)  # where the next record begins, and the first that was not looked into
+        position = run = len(MAGIC)  # offsets of the next record, and of the first one not in a block yet
         opcode = stop = 0
         while size - position >= _HEAD.size:
             opcode, length = _HEAD.unpack(self._bytes_at(position, _HEAD.size))
@@ -360,7 +357,7 @@ class McapFile:
             self._warn(f"cut off at byte {size}: it was not closed{rest}")
 
     def _take(self, block: Block) -> list[StoredMessage]:
-        """Look into a block that no index tells of."""
+        """Read a block without index, and add it if it has messages."""
         messages = self._messages(block)
         if messages:
             times = [message.log_time_ns for message in messages]
@@ -372,7 +369,7 @@ class McapFile:
         return messages
 
     def _take_cut_chunk(self, position: int, size: int, stop: int) -> None:
-        """The chunk at ``position`` in which the file ends, instead of at ``stop``."""
+        """Read the chunk from ``position`` to ``stop``, in which the file ends at ``size``."""
         before = max((block.end_ns for block in self.blocks), default=0)
         messages = self._take(Block(position, size - position, cut=True))
         missing = ""

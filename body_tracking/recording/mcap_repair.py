@@ -1,4 +1,4 @@
-"""A file that was cut off, written anew with an ending, so that every mcap reader opens it at once."""
+"""Rewrites a truncated mcap file with a summary, so that every mcap reader can open it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from body_tracking.recording.mcap_file import LIBRARY, BagError, McapFile
 
 
 def finish(path: Path) -> None:
-    """Give a file that was cut off its ending: what can be read of it is copied, and the copy takes its place.
+    """Replace a truncated file by a complete copy of its readable messages.
 
-    A file that is whole, or damaged in other ways than by its end, is left as it is.
+    A complete file, or one damaged elsewhere than at its end, is left unchanged.
 
     Raises:
         BagError: the file cannot be read or written.

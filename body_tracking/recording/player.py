@@ -1,6 +1,6 @@
-"""The timing of playback: which messages of a bag are due, and what the clock says; no publishing, no waiting.
+"""The timing of playback: the messages of a bag that are due, and the time on ``/clock``.
 
-Whoever plays calls :meth:`Playback.step` with a steady clock, sends what it returns, and comes back when it says so.
+The caller passes a steady clock to :meth:`Playback.step`, publishes the result, and calls again at its ``wake_ns``.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.recording.rosbag2 import BagError, BagReader, RawMessage
 
-_BATCH = 200  # messages at once at most, so that a pause takes effect while the player is catching up
-_LOOP_GAP_NS = 10_000_000  # between the end and the beginning: a bag of one instant must not spin
+_BATCH = 200  # messages per step at most, so that a pause takes effect while the player is catching up
+_LOOP_GAP_NS = 10_000_000  # between two loops, so that a bag of one instant is no busy loop
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Messages of one log time, to be sent after the clock.
+    """Messages of one log time, to be published after the clock.
 
     Attributes:
         clock_ns: the bag's time to publish on ``/clock``.
-        messages: to be sent then; none if it is only the clock's turn.
+        messages: to publish; none for a mere tick of the clock.
     """
 
     clock_ns: int
@@ -31,11 +31,11 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What to do now, and when to come back.
+    """Result of a step.
 
     Attributes:
-        batches: in order.
-        wake_ns: steady time of the next step; None when there is nothing more to play.
+        batches: to publish now, in order.
+        wake_ns: steady time of the next step; None at the end.
     """
 
     batches: tuple[Batch, ...]
@@ -46,20 +46,20 @@ class Playback:
     """Plays a bag against a steady clock.
 
     The bag's time runs ``rate`` times as fast as the steady clock, from the first step on. Messages that are late,
-    because nobody called in time, are returned at once and never left out. The clock never runs ahead of a message that
-    is still to be sent, nor beyond the last one, and runs backwards only where the bag begins anew.
+    because the caller was, are returned at once and never dropped. The clock never runs ahead of a pending message nor
+    beyond the last one, and jumps back only when the bag restarts.
 
     Args:
-        reader: of the bag; stays open while this is used.
+        reader: of the bag; must stay open.
         rate: bag seconds per second, above 0.
-        loop: begin again at the end.
-        start_offset_s: seconds of the bag to leave out at its beginning.
+        loop: restart at the end.
+        start_offset_s: seconds to skip at the beginning of the bag.
         topics: only these; empty for all.
         clock_hz: ticks of the clock per second of the steady clock; 0 for none but those with messages.
         paused: do not run until :meth:`resume`.
 
     Raises:
-        BagError: a value is out of its range, or nothing of the bag is left to play.
+        BagError: a value is out of its range, or there are no messages to play.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class Playback:
             raise BagError(f"clock rate {clock_hz} Hz: expected 0 or more")
         self.loop = loop
         self.loops = 0
-        """How often the bag began anew."""
+        """Number of restarts."""
         self.sent = 0
         """Messages returned so far."""
         self.late_ns = 0
-        """By how much the latest messages were late, in steady time."""
+        """Delay of the latest messages, in steady time."""
         self._reader = reader
         self._topics = frozenset(topics) or None
         self._rate = _checked_rate(rate)
@@ -105,12 +105,11 @@ class Playback:
 
     @property
     def paused(self) -> bool:
-        """Whether the bag's time stands still."""
         return self._paused
 
     @property
     def finished(self) -> bool:
-        """Whether everything was returned and the bag does not begin anew."""
+        """Whether all messages were returned and the bag does not restart."""
         return self._next is None and not self.loop
 
     @property
@@ -125,17 +124,15 @@ class Playback:
         return self._bag_ns + int((steady_ns - self._steady_ns) * self._rate)
 
     def pause(self, steady_ns: int) -> None:
-        """Let the bag's time stand still."""
         self._anchor(steady_ns)
         self._paused = True
 
     def resume(self, steady_ns: int) -> None:
-        """Let it run again."""
         self._anchor(steady_ns)
         self._paused = False
 
     def set_rate(self, rate: float, steady_ns: int) -> None:
-        """Run faster or slower from now on.
+        """Change the rate from now on.
 
         Raises:
             BagError: the rate is not above 0.
@@ -145,17 +142,17 @@ class Playback:
         self._rate = checked
 
     def step(self, steady_ns: int) -> Step:
-        """What is due at a steady time, which never runs backwards.
+        """The messages that are due.
 
         Args:
-            steady_ns: nanoseconds of any steady clock.
+            steady_ns: nanoseconds of any steady clock, never decreasing.
         """
         if self._steady_ns is None:
             self._steady_ns = self._next_tick_ns = steady_ns
         if self._next is None:
             if not self.loop:
                 return Step((), None)
-            # Begin anew; the bag's time jumps back, and waits for the gap to be over.
+            # Restart; the bag's time jumps back, and stands still during the gap.
             self.loops += 1
             self._rewind()
             self._bag_ns, self._steady_ns = self._start_ns, steady_ns + (0 if self._paused else _LOOP_GAP_NS)
@@ -169,21 +166,19 @@ class Playback:
         if self._tick_ns and steady_ns >= self._next_tick_ns and pending is not None:
             if not batches or batches[-1].clock_ns < now_ns:
                 batches.append(Batch(now_ns, ()))
-            # Ticks that were missed are not made up for.
+            # Missed ticks are skipped.
             missed = (steady_ns - self._next_tick_ns) // self._tick_ns
             self._next_tick_ns += (missed + 1) * self._tick_ns
         return Step(tuple(batches), self._wake(pending, steady_ns))
 
-    # --- inside
-
     def _anchor(self, steady_ns: int) -> None:
         if self._steady_ns is not None:
-            # While the gap between two rounds lasts, the bag's time has not begun to run yet.
+            # During the gap between two loops, the bag's time does not run yet.
             self._bag_ns = max(self._bag_ns, self.bag_time_ns(steady_ns))
             self._steady_ns = max(self._steady_ns, steady_ns) if not self._paused else steady_ns
 
     def _rewind(self) -> bool:
-        """Begin (anew); False if there is nothing to play."""
+        """Start at the beginning; False without messages."""
         self._stream = self._reader.messages(self._topics, self._start_ns)
         self._next = next(self._stream, None)
         return self._next is not None
@@ -217,11 +212,11 @@ class Playback:
             else:
                 ahead_ns = (pending.log_time_ns - self._bag_ns) / self._rate
                 wake_ns = self._steady_ns + math.ceil(ahead_ns)
-                # Rounded once there and once back, the bag's time may still be a nanosecond short of the message.
+                # By rounding, the bag's time may be a nanosecond short of the message.
                 while self.bag_time_ns(wake_ns) < pending.log_time_ns:
                     wake_ns += 1
                 times.append(wake_ns)
-        # Paused and without ticks only a call to resume changes anything.
+        # Paused and without ticks, only a call of resume changes anything.
         return max(steady_ns, min(times, default=steady_ns + NANOSECONDS))
 
 

@@ -1,7 +1,6 @@
-"""The whole graph offline: a bag in, a bag out, deterministic, as fast as the processor allows.
+"""Runs the whole graph offline on a bag and writes a bag; deterministic, as fast as the processor allows.
 
-The library's classes are called as the nodes call them, and every skeleton passes through its message between them, so
-that the angles are those of the live graph.
+The stages are those of the nodes, and exchange serialised messages, so that the angles are those of the live graph.
 """
 
 from __future__ import annotations
@@ -51,15 +50,15 @@ _P = TypeVar("_P")
 
 
 class ReplayError(BodyTrackingError):
-    """The bag holds nothing to run the graph on."""
+    """Raised when the bag lacks the input of the graph."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReplaySettings:
-    """What the offline graph is to do; defaults as the nodes'.
+    """Parameters of the offline graph; defaults as the nodes'.
 
     Attributes:
-        sensors: the first is the reference unless ``reference`` says otherwise; all of the bag when empty.
+        sensors: the first is the reference unless ``reference`` is set; all of the bag when empty.
         reference: or empty.
         filter_name: one of the filters.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
@@ -69,8 +68,8 @@ class ReplaySettings:
         people: whom to track.
         calibration, fusion, tracking: parameters of the calibration, the fusion and the inertial sensors.
         filter_parameters: parameters of the filter, without its prefix.
-        parameters: further parameters by node; they hold against all of the above.
-        model_covariance: write the covariance of the filter's model, too.
+        parameters: further parameters by node; they override all of the above.
+        model_covariance: also write the covariance of the filter's model.
     """
 
     sensors: tuple[str, ...] = ()
@@ -90,7 +89,7 @@ class ReplaySettings:
     model_covariance: bool = False
 
     def options(self) -> Options:
-        """The graph that runs."""
+        """Options of the graph."""
         return options_of(
             sensors=self.sensors or graph.DEFAULT_SENSORS,
             filter=self.filter_name,
@@ -106,7 +105,7 @@ class ReplaySettings:
         """All parameters of each stage, by its name.
 
         Raises:
-            BodyTrackingError: they do not go together.
+            BodyTrackingError: inconsistent settings.
         """
         specs = sorted(
             (spec for spec in nodes_for(self.options()) if spec.name in STAGES),
@@ -134,14 +133,14 @@ class ReplaySettings:
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """What a replay did.
+    """Result of a replay.
 
     Attributes:
-        frames: joint angle messages that came out.
+        frames: number of joint angle messages.
         recording_s: length of the recording by its log times.
-        elapsed_s: time that it took.
-        counters: what was seen and left out on the way.
-        warnings: what the bag itself lacks.
+        elapsed_s: computing time.
+        counters: of events and unusable messages.
+        warnings: missing or damaged parts of the bag.
     """
 
     frames: int
@@ -156,7 +155,7 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
 
     Args:
         bag: open.
-        wanted: sensor names; all that are there when empty.
+        wanted: sensor names; all in the bag when empty.
 
     Returns:
         Sensor name by topic.
@@ -178,7 +177,7 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
 
 
 class _Frames:
-    """Decodes the frames of sensors, and counts those of no use.
+    """Decodes the frames of sensors, and counts unusable ones.
 
     Args:
         topics: sensor name by topic.
@@ -190,7 +189,7 @@ class _Frames:
         self._last: dict[str, int] = {}
 
     def skeletons(self, raw: RawMessage) -> tuple[Skeleton, ...] | None:
-        """The bodies in a frame; None for one of no use."""
+        """The bodies in a frame; None for an unusable one."""
         try:
             skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except BodyTrackingError:
@@ -209,9 +208,9 @@ class _Frames:
 def skeletons_of(
     bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
 ) -> Iterator[tuple[str, Skeleton, int, bytes]]:
-    """Each sensor's frames in log-time order: sensor, the body that is nearest to it, log time, and the message.
+    """Each sensor's frames in log-time order: sensor, the body nearest to it, log time, and the message.
 
-    A body stays the nearest one for as long as it is there. Frames of no use are counted and skipped.
+    A selected body is kept while it is tracked. Unusable frames are counted and skipped.
     """
     subjects = {sensor: SubjectSelector() for sensor in topics.values()}
     last: dict[str, int] = {}
@@ -238,7 +237,7 @@ class Progress:
         self._on = sys.stderr.isatty()
 
     def at(self, log_time_ns: int) -> None:
-        """Show how far it is."""
+        """Update the percentage."""
         percent = min(100, 100 * (log_time_ns - self._start) // self._length)
         if self._on and percent != self._shown:
             self._shown = percent
@@ -251,13 +250,13 @@ class Progress:
 
 
 def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bool = False) -> ReplayReport:
-    """Run the graph over a bag and write all that it publishes, beside the sensors' own messages and the ground truth.
+    """Run the graph over a bag and write its output, with the sensors' messages and the ground truth.
 
     Args:
         bag_path: a rosbag2 folder or an mcap file.
-        out: the bag to be made.
-        settings: with the sensors to use; all sensors of the bag when that is empty.
-        overwrite: replace ``out`` if it is there.
+        out: the bag to write.
+        settings: of the graph.
+        overwrite: replace an existing ``out``.
 
     Raises:
         ReplayError: no skeletons in the bag.
@@ -273,7 +272,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         kept = (*topics, *truth, *graph.played_imu_topics(settings.imus, bag.topics))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         if settings.calibration_file is not None:
-            load(settings.calibration_file)  # it has to be there
+            load(settings.calibration_file)  # raises if it is missing or invalid
         values = settings.values()
         # before `out` is touched
         stages = [stage_class(name)(each) for name, each in values.items() if not forked.is_second(name)]
@@ -329,19 +328,19 @@ def _listed(counters: Mapping[str, int]) -> str:
 def parameters_for(
     node: str, parameter_class: type[_P], file: Path | None, own: Mapping[str, Value]
 ) -> tuple[_P, dict[str, object]]:
-    """What a parameters file tells a node, for the library class behind it.
+    """A node's parameters from a parameters file.
 
     Args:
         node: its name, such as ``fusion``.
         parameter_class: the dataclass of its parameters.
         file: a ROS parameters file, or None.
-        own: names and defaults of the node's parameters beside those of the class.
+        own: names and defaults of the node's parameters that are not in the class.
 
     Returns:
-        The parameters, and the others as given.
+        The parameters, and the values of ``own`` in the file.
 
     Raises:
-        ParameterError: a file that is none, a value of the wrong type or out of range, an unknown name.
+        ParameterError: an invalid file, a value of the wrong type or out of range, an unknown name.
     """
     checked, others = values_for(node, parameters_from(parameter_class), file, own)
     return parameter_class(**fields_of(parameter_class, checked)), others
@@ -350,7 +349,7 @@ def parameters_for(
 def values_for(
     node: str, table: Sequence[Parameter], file: Path | None, own: Mapping[str, Value]
 ) -> tuple[dict[str, Value], dict[str, object]]:
-    """The same for a table of parameters: the value of each, and the others as given."""
+    """As :func:`parameters_for`, for a table of parameters."""
     given: dict[str, object] = {}
     for pattern, values in read_file(file).items() if file is not None else ():
         if matches(pattern, f"/{node}"):
@@ -360,7 +359,7 @@ def values_for(
 
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
-    """The settings that a command line asks for."""
+    """The settings of a command line."""
     chosen = with_file(options_of(**{**options_from(args), "external": True}), args.params_file)
     specs = [spec for spec in nodes_for(chosen) if spec.name in STAGES]
     given = parameters_of_nodes(specs, args.params_file, absent=all_nodes_for(chosen))
@@ -375,16 +374,16 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     if args.reference:
         for values in parameters.values():
             values["reference"] = args.reference
-    words: dict[str, Any] = dict(chosen)
+    options: dict[str, Any] = dict(chosen)
     return ReplaySettings(
-        words["sensors"] if args.sensors else (),
+        options["sensors"] if args.sensors else (),
         args.reference or "",
-        words["filter"] or DEFAULT_FILTER,
-        words["convention"] or graph.AUTO,
-        words["filter_input"] or graph.AUTO,
-        words["angles_input"] or graph.AUTO,
+        options["filter"] or DEFAULT_FILTER,
+        options["convention"] or graph.AUTO,
+        options["filter_input"] or graph.AUTO,
+        options["angles_input"] or graph.AUTO,
         args.calibration,
-        words["imus"],
+        options["imus"],
         PeopleParameters(**people),  # type: ignore[arg-type]
         parameters=parameters,
         model_covariance=args.model_covariance,
@@ -421,7 +420,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """The command."""
     report = replay(args.bag, args.output, settings_from(args), overwrite=args.overwrite)
     if args.json:
         print(

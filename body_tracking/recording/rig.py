@@ -1,4 +1,4 @@
-"""The recording of one rig, whatever the namespace in which it was made and the clocks by which its sensors stamp."""
+"""Reads the recording of one rig, with topics in the root namespace and stamps in ROS time."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from body_tracking.recording.stamps import RecordedStamps
 
 
 class RigReader(BagReader):
-    """A bag whose topics have the names that they have in the root namespace, and whose header stamps are ROS time.
+    """A bag whose topics are renamed to the root namespace, and whose header stamps are converted to ROS time.
 
-    Stamps by a sensor's own clock are related to the log, see :mod:`body_tracking.recording.stamps`, when messages are
-    first read. Arguments and errors as of :class:`BagReader`. Topics of other namespaces keep their names, but for one
-    that the rig has too.
+    The clocks of sensors are fitted when messages are first read, see :mod:`body_tracking.recording.stamps`. Arguments
+    and errors as of :class:`BagReader`. Topics of other namespaces keep their names, unless the rig has the same one.
 
     Attributes:
-        namespace: in which the rig was recorded; ``/`` too where the bag holds several rigs.
+        namespace: in which the rig was recorded; also ``/`` for a bag of several rigs.
     """
 
     def __init__(self, path: Path | str) -> None:

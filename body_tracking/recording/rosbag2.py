@@ -1,10 +1,7 @@
 """Bags: folders of mcap files with a ``metadata.yaml``, as ``ros2 bag`` (Jazzy) reads and writes them.
 
-Messages stay the CDR bytes that they are on the wire; :func:`serialize` and :func:`deserialize` convert where somebody
-wants to look inside. Layout: https://github.com/ros2/rosbag2 (metadata version 9) and the ``ros2`` profile of
-https://mcap.dev/spec/registry. All times are integer nanoseconds.
-
-Over 500 lines: reader, writer and metadata of one format, which must agree.
+Messages are CDR bytes; :func:`serialize` and :func:`deserialize` convert them. Layout: https://github.com/ros2/rosbag2
+(metadata version 9) and the ``ros2`` profile of https://mcap.dev/spec/registry. All times are integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -35,9 +32,9 @@ from body_tracking.recording.mcap_repair import finish
 
 METADATA = "metadata.yaml"
 MAX_WAITING_BYTES = 1 << 28
-"""Bytes of messages that wait for those of chunks that overlap with theirs in time."""
+"""Limit of the memory for messages of chunks that overlap in time, bytes."""
 _MESSAGE_BYTES = 250
-"""What a message that waits takes besides its content, about."""
+"""Approximate memory of a waiting message without its content."""
 METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
 MAX_TIME_NS = 2**63 - 1
@@ -49,14 +46,14 @@ BAG_MESSAGES = BagMessages(_STORE.types)
 
 
 def is_known(type_name: str) -> bool:
-    """Whether the definition of a message type, such as ``sensor_msgs/msg/PointCloud2``, is at hand."""
+    """Whether there is a definition of a message type, such as ``sensor_msgs/msg/PointCloud2``."""
     return type_name in _STORE.types
 
 
 def first_field(type_name: str) -> tuple[str, str, bool]:
     """Name and message type of the first field of a message type, and whether it is a sequence of these.
 
-    The type is empty for a number or a string, and for a message type that is unknown.
+    The type is empty for a number, a string, and an unknown message type.
     """
     fields: list[Any] = list(_STORE.fielddefs[type_name][1]) if is_known(type_name) else []
     if not fields:
@@ -71,7 +68,7 @@ def serialize(message: Any) -> bytes:
     """A message of :data:`BAG_MESSAGES` as CDR bytes, little-endian, with the encapsulation header.
 
     Raises:
-        BagError: a field holds what its type cannot.
+        BagError: a field's value does not fit its type.
     """
     try:
         return bytes(_STORE.serialize_cdr(message, message.__msgtype__))
@@ -83,7 +80,7 @@ def deserialize(type_name: str, cdr: bytes) -> Any:
     """The message in CDR bytes; its arrays are views of them.
 
     Raises:
-        BagError: the type is unknown, or the bytes are no such message.
+        BagError: an unknown type, or bytes that are no such message.
     """
     if not is_known(type_name):
         raise BagError(f"message type {type_name!r} is unknown")
@@ -99,7 +96,7 @@ def deserialize(type_name: str, cdr: bytes) -> Any:
 
 
 class BagWire:
-    """Serialisation by ``rosbags``, where there is no ROS."""
+    """Serialisation by ``rosbags``, without ROS."""
 
     types = BAG_MESSAGES
 
@@ -119,8 +116,8 @@ class TopicInfo:
 
     Attributes:
         type_name: such as ``sensor_msgs/msg/PointCloud2``.
-        count: messages.
-        offered: what each of its publishers offered.
+        count: of messages.
+        offered: QoS of each of its publishers.
     """
 
     type_name: str
@@ -129,7 +126,7 @@ class TopicInfo:
 
     @property
     def qos(self) -> Qos:
-        """The profile under which to publish it again."""
+        """The profile to publish it again."""
         return quality.offer_for(self.offered)
 
 
@@ -138,9 +135,9 @@ class RawMessage(NamedTuple):
 
     Attributes:
         topic: its name.
-        cdr: the serialised message, as it was received.
-        log_time_ns: when it was received.
-        publish_time_ns: when it was sent, as far as the recorder knew.
+        cdr: the serialised message.
+        log_time_ns: time of receipt.
+        publish_time_ns: time of publication, if the recorder knew it.
     """
 
     topic: str
@@ -155,14 +152,14 @@ class RawMessage(NamedTuple):
 class BagReader:
     """Reads a bag: a folder, also without its ``metadata.yaml``, or a single mcap file.
 
-    What is damaged or missing does not stop it: a line in :attr:`warnings` says what and where. A damaged chunk is only
-    noticed when it is read.
+    Damaged or missing parts are lines in :attr:`warnings`, not exceptions. A damaged chunk is only noticed when it is
+    read.
 
     Args:
         path: the folder or file.
 
     Raises:
-        BagError: nothing there can be read as a recording.
+        BagError: no readable recording.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -195,13 +192,12 @@ class BagReader:
         self.close()
 
     def close(self) -> None:
-        """Close the files."""
         for file in self.files:
             file.close()
 
     @property
     def warnings(self) -> list[str]:
-        """A line for each thing that is missing or damaged, as far as it was noticed yet."""
+        """Missing or damaged parts found so far, a line each."""
         return self._notes + [warning for file in self.files for warning in file.warnings]
 
     @property
@@ -210,7 +206,7 @@ class BagReader:
         return not self._notes and all(file.whole for file in self.files)
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None) -> Iterator[RawMessage]:
-        """The messages in the order of their log times, and as they were written where those are equal.
+        """The messages in the order of their log times; with equal log times in the order of writing.
 
         Args:
             topics: only these; None for all.
@@ -231,7 +227,7 @@ class BagReader:
             if (start_ns is None or block.end_ns >= start_ns)
             and (block.channels is None or not block.channels.isdisjoint(wanted[index]))
         )
-        # Blocks overlap in time where messages were written late: what is not earlier than the next block waits for it.
+        # Blocks overlap in time if messages were written late: messages wait until all earlier blocks are read.
         waiting: list[tuple[int, int, int, int, RawMessage]] = []
         for begin_ns, index, offset, block in blocks:
             ready = bisect_left(waiting, (begin_ns,))
@@ -259,13 +255,13 @@ class BagReader:
             return found
         missing = [path for path in listed if not path.exists()]
         self._notes += [f"{path.name}: listed in {METADATA}, but missing" for path in missing]
-        # A recorder that went on in the same folder and died leaves a file that is not listed yet.
+        # A recorder that resumed in the same folder and crashed leaves a file that is not listed yet.
         further = [path for path in found if path not in listed and (missing or _is_part(self.path, path))]
         self._notes += [f"{path.name}: not listed in {METADATA}: the recording was not closed" for path in further]
         return [path for path in listed if path not in missing] + further
 
     def _listed(self) -> list[Path] | None:
-        """The files that ``metadata.yaml`` lists; None where it is missing or unreadable."""
+        """The files listed in ``metadata.yaml``; None if it is missing or unreadable."""
         path = self.path / METADATA
         if not path.exists():
             self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
@@ -307,14 +303,14 @@ class BagReader:
 
 
 def _add(topics: dict[str, TopicInfo], name: str, more: TopicInfo) -> None:
-    """Add messages and publishers of a topic; its type is the one that it had first."""
+    """Add messages and publishers of a topic, which keeps its first type."""
     known = topics.get(name, TopicInfo(more.type_name, 0))
     offered = tuple(dict.fromkeys(known.offered + more.offered))
     topics[name] = TopicInfo(known.type_name, known.count + more.count, offered)
 
 
 def _natural(path: Path) -> tuple[str, int]:
-    """``name_10`` after ``name_9``."""
+    """Sort key with ``name_10`` after ``name_9``."""
     match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
     return (match[1], int(match[2])) if match else (path.stem, -1)
 
@@ -331,7 +327,7 @@ def _is_part(folder: Path, path: Path) -> bool:
 
 
 class _Sink:
-    """The file under the mcap writer: unbuffered, so that what failed to be written is known to the byte."""
+    """An unbuffered file for the mcap writer, so that its position is exact after a failed write."""
 
     def __init__(self, path: Path) -> None:
         self.file = path.open("xb", buffering=0)
@@ -345,32 +341,32 @@ class _Sink:
             view = view[self.file.write(view) :]
 
     def flush(self) -> None:
-        """For the mcap writer; nothing waits in here."""
+        """Required by the mcap writer."""
 
 
 class BagWriter:
     """Writes a bag.
 
-    Chunks are closed and written through to the disk at least every ``flush_interval_s`` while messages come, so that a
-    power failure loses about that much. Whoever has nothing to write for a while calls :meth:`flush` in between.
-    After a failure (disk full) the file ends with its last whole chunk, as after a power failure. ``rosbags`` can write
-    bags too, of one file, without checksums, and with nothing that a reader finds before they are closed.
+    Each write closes the chunk and syncs it to the disk if the last sync was ``flush_interval_s`` ago, so that a power
+    failure loses about that much; a caller without messages calls :meth:`flush`. After a failure (disk full) the file
+    ends with its last whole chunk. The writer of ``rosbags`` has no checksums, and its files are unreadable before they
+    are closed.
 
     Args:
         folder: of the bag; its files are called ``<folder>_<n>.mcap``.
-        overwrite: replace a bag that is there.
-        resume: go on in a bag that is there, in its next file; what its recorder left unclosed is closed as well.
+        overwrite: replace an existing bag.
+        resume: continue an existing bag in a new file; unclosed files are closed as well.
         chunk_bytes: a chunk is closed at this size, uncompressed.
         flush_interval_s: seconds; infinite for writing offline.
 
     Attributes:
-        path: of the file that is written.
+        path: of the current file.
         message_count: messages written by this writer.
-        failure: why nothing can be written any more; None while all is well.
+        failure: the error that ended writing; None for none.
 
     Raises:
         BagError: the folder exists and neither ``overwrite`` nor ``resume`` is given, is no bag, is being written by
-            somebody else, or cannot be written.
+            another process, or cannot be written.
     """
 
     def __init__(
@@ -409,15 +405,15 @@ class BagWriter:
         self.close()
 
     def add_topic(self, topic: str, type_name: str, qos: Qos | Sequence[Qos] = quality.RELIABLE) -> None:
-        """Announce a topic; once more with the same type changes nothing.
+        """Add a topic; repeated calls with the same type have no effect.
 
         Args:
             topic: its name.
             type_name: such as ``sensor_msgs/msg/PointCloud2``.
-            qos: what its publisher offers, or each of its publishers.
+            qos: of its publisher, or of each of its publishers.
 
         Raises:
-            BagError: the type is unknown, or the topic has another one already, or nothing can be written.
+            BagError: an unknown type, or another one than before, or the bag cannot be written.
         """
         self._check()
         if topic in self._channels:
@@ -442,11 +438,11 @@ class BagWriter:
         Args:
             topic: as added.
             cdr: the serialised message.
-            log_time_ns: when it was received.
-            publish_time_ns: when it was sent; as received if unknown.
+            log_time_ns: time of receipt.
+            publish_time_ns: time of publication; that of receipt if unknown.
 
         Raises:
-            BagError: the topic was not added, a time is negative, or nothing can be written (any more).
+            BagError: the topic was not added, a time is negative, or the bag cannot be written.
         """
         self._check()
         if topic not in self._channels:
@@ -465,7 +461,7 @@ class BagWriter:
         self.write(topic, serialize(message), log_time_ns)
 
     def flush(self) -> None:
-        """Write what is there through to the disk.
+        """Close the chunk and sync the file to the disk.
 
         Raises:
             BagError: it cannot be written.
@@ -477,7 +473,7 @@ class BagWriter:
         self._flushed_s = time.monotonic()
 
     def close(self) -> None:
-        """Finish the file and write ``metadata.yaml``; once more changes nothing.
+        """Finish the file and write ``metadata.yaml``; repeated calls have no effect.
 
         Raises:
             BagError: it cannot be written.
@@ -492,14 +488,12 @@ class BagWriter:
         _close_folder(self.folder)
 
     def discard(self) -> None:
-        """Stop, and delete the file that this writer made, and the folder if nothing else is in it."""
+        """Stop, and delete this writer's file, and the folder if it is empty."""
         self._shut()
         remove_file(self.path)
 
-    # --- inside
-
     def _prepare(self, overwrite: bool, resume: bool) -> int:
-        """Make the folder ready; the number of the file to write."""
+        """Prepare the folder; returns the number of the file to write."""
         if self.folder.exists() and not self.folder.is_dir():
             raise BagError(f"{self.folder}: exists and is no folder")
         if not self.folder.exists() or (resume and not any(self.folder.iterdir())):
@@ -512,7 +506,7 @@ class BagWriter:
             raise BagError(f"{self.folder}: exists and is no bag")
         for path in parts:
             _refuse_if_in_use(path)
-        # From here on the listing would be wrong; whoever reads meanwhile finds the files by themselves.
+        # The list of files is outdated from here on; readers find the files without it.
         (self.folder / METADATA).unlink(missing_ok=True)
         if overwrite:
             for path in parts:
@@ -545,19 +539,17 @@ class BagWriter:
 
 
 def remove_file(path: Path) -> None:
-    """Delete a file of a bag, and the folder if nothing else is in it."""
+    """Delete a file of a bag, and the folder if it is empty."""
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
         path.parent.rmdir()
 
 
 def recover(folder: Path | str) -> BagReader:
-    """Close a bag whose recorder died: give its files their endings and the folder its ``metadata.yaml``.
-
-    Every message that could be read before can be read afterwards, and ``ros2 bag`` opens the folder.
+    """Close the bag of a crashed recorder: complete its files and write ``metadata.yaml``, without losing messages.
 
     Returns:
-        A reader of the bag as it is now.
+        A reader of the closed bag.
 
     Raises:
         BagError: it is no bag, it is still being recorded, or it cannot be written.
@@ -576,7 +568,7 @@ def recover(folder: Path | str) -> BagReader:
 
 
 def _refuse_if_in_use(path: Path) -> None:
-    """A writer holds a lock on its file for as long as its process lives."""
+    """Raise if another process writes the file: a writer locks it while its process lives."""
     with open_regular(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -588,10 +580,10 @@ def _refuse_if_in_use(path: Path) -> None:
 
 
 def _close_folder(folder: Path) -> None:
-    """Close what recorders left open, as far as it can be read, and list the files in ``metadata.yaml``.
+    """Complete unclosed files as far as they are readable, and list the files in ``metadata.yaml``.
 
     Raises:
-        BagError: nothing in the folder can be read, or it cannot be written.
+        BagError: no file is readable, or the folder cannot be written.
     """
     parts: list[BagReader] = []
     for path in _files(folder):
@@ -607,7 +599,7 @@ def _close_folder(folder: Path) -> None:
             file.write(quality.dump_yaml({"rosbag2_bagfile_information": _information(parts)}))
             file.flush()
             os.fsync(file.fileno())
-        draft.replace(folder / METADATA)  # at once: it is whole at any time
+        draft.replace(folder / METADATA)  # atomic
     except OSError as error:
         raise BagError(f"{folder / METADATA}: {error.strerror}") from error
 
@@ -617,7 +609,7 @@ def _type_hash(type_name: str) -> str:
 
 
 def _information(parts: Sequence[BagReader]) -> dict[str, Any]:
-    """The content of ``metadata.yaml`` for these files; where there are no messages the start is the latest time."""
+    """The content of ``metadata.yaml`` for these files; without messages the start is ``MAX_TIME_NS``."""
     topics: dict[str, TopicInfo] = {}
     for part in parts:
         for name, topic in part.topics.items():

@@ -1,4 +1,4 @@
-"""A recording in place of a live sensor: its frames come when they came then, as if they were captured now."""
+"""The backend ``recording``: plays the frames of a recording in real time, as if they were captured now."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from body_tracking.recording.rosbag2 import BagError, deserialize
 from body_tracking.recording.stamps import RecordedClock
 
 LATE_NS = 500_000_000
-"""A frame this late is left out: a node that was started again goes on where the recording is by now."""
+"""A frame this late is skipped, so that a restarted node continues at the recording's present position."""
 
 LOOP_GAP_NS = 33_333_333
-"""Between the last frame and the first one of the next round."""
+"""Between the last frame and the first one of the next loop."""
 
 
 class RecordingSource:
@@ -37,7 +37,7 @@ class RecordingSource:
     it plays minus its delay then (see :mod:`body_tracking.recording.stamps`); in a loop, time goes on.
 
     Args:
-        settings: ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time`` count.
+        settings: uses ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time``.
 
     Raises:
         BodyTrackingError: the file cannot be read, or has no such sensor.
@@ -66,28 +66,25 @@ class RecordingSource:
 
     @property
     def ended(self) -> bool:
-        """Whether the last frame was read, and the recording does not begin again."""
         return self._next is None
 
     @property
     def counters(self) -> Mapping[str, object]:
-        """Frames left out because they were late."""
+        """Frames skipped because they were late."""
         return self._counters
 
     @property
     def problem(self) -> str:
-        """None, ever."""
         return ""
 
     def close(self) -> None:
-        """Let a ``read`` in another thread return."""
         self._closed.set()
 
     def read(self, timeout: float) -> RecordedFrame | None:
         """See :class:`body_tracking.kinect.live.SkeletonSource`."""
         deadline_ns = time.time_ns() + round(timeout * NANOSECONDS)
         while self._next is not None and not self._closed.is_set():
-            due_ns = self._due_ns(self._next)
+            due_ns = self._wall_ns(self._next.received_ns)
             now_ns = time.time_ns()
             if now_ns - due_ns > LATE_NS:
                 self._counters["left out, late"] += 1
@@ -103,27 +100,23 @@ class RecordingSource:
         self._closed.wait(timeout)
         return None
 
-    def _due_ns(self, frame: RecordedFrame) -> int:
-        """Wall time at which a frame of the present round plays."""
-        return self._wall_ns(frame.received_ns)
-
     def _wall_ns(self, recorded_ns: int) -> int:
-        """Wall time of an instant of the present round, nanoseconds."""
+        """Wall time of an instant of the present loop, nanoseconds."""
         assert self._zero_ns is not None
         elapsed = self._rounds_ns + recorded_ns - self._zero_ns
         return self._start_ns + round(elapsed / self._settings.rate)
 
     def _now(self, frame: RecordedFrame) -> RecordedFrame:
-        """A frame under the sensor's name, with its times as if it were captured and received now."""
+        """A frame with the sensor's name, and with times as if it were captured and received now."""
         name, stamp_ns = self._settings.sensor, frame.skeletons[0].stamp_ns
         if self._clock is not None:
             stamp_ns = self._clock.to_ros(stamp_ns, frame.received_ns)
         stamp_ns = self._wall_ns(stamp_ns)
         skeletons = [replace(each, stamp_ns=stamp_ns, frame_id=optical_frame(name)) for each in frame.skeletons]
-        return RecordedFrame(name, self._due_ns(frame), tuple(skeletons))
+        return RecordedFrame(name, self._wall_ns(frame.received_ns), tuple(skeletons))
 
     def _skip_rounds(self, late_ns: int) -> None:
-        """Leave out whole rounds at once, once it is known how long one takes."""
+        """Skip whole loops at once, after the first one has shown their length."""
         if self._rounds_ns and self._zero_ns is not None:
             length = self._last_ns - self._zero_ns + LOOP_GAP_NS
             self._rounds_ns += int(late_ns * self._settings.rate) // length * length
@@ -149,7 +142,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def _clock(frames: Iterator[tuple[int, RecordedFrame | None]]) -> RecordedClock | None:
-    """The clock of a sensor's stamps against that of receipt; None without frames."""
+    """The sensor's clock against that of receipt; None without frames."""
     times = sorted((received_ns, frame.skeletons[0].stamp_ns) for received_ns, frame in frames if frame is not None)
     if not times:
         return None
@@ -158,11 +151,11 @@ def _clock(frames: Iterator[tuple[int, RecordedFrame | None]]) -> RecordedClock 
 
 
 def _frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None]]:
-    """Receipt of every frame of a recording, and the frame itself if it is of the wanted sensor."""
+    """Receipt time of every frame of a recording, and the frame itself if it is of the wanted sensor."""
     if _is_bag(path):
         yield from _bag_frames(path, sensor)
         return
-    # What does not name its sensors itself is of the wanted one.
+    # A file without sensor names is of the wanted one.
     names_itself = path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and sensor_column(path)
     for frame in open_recording(path, None if names_itself else sensor):
         yield frame.received_ns, frame if frame.sensor == sensor else None
@@ -179,6 +172,6 @@ def _bag_frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | 
             try:
                 skeletons = cloud_to_skeletons(deserialize(type_name, message.cdr))
             except (BagError, MessageError):
-                continue  # as a sensor that missed a frame
+                continue  # counts as a lost frame
             yield message.log_time_ns, RecordedFrame(sensor, message.log_time_ns, skeletons)
         yield reader.end_ns, None

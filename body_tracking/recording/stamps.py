@@ -1,14 +1,14 @@
-"""Header stamps of a recording in ROS time, which is the time of its log.
+"""Converts the header stamps of a recording to ROS time, the time of its log.
 
-Where a sensor stamps by a clock of its own, log time minus stamp is the offset of the two clocks, which drifts, plus a
-delay. Delays are positive, so the clocks are related by the line that lies below all differences d and nearest to them,
-a linear program:
+If a sensor stamps by a clock of its own, log time minus stamp is the offset of the two clocks, which drifts, plus a
+delay. Delays are positive, so the clocks are related by the line below and nearest to all differences d, a linear
+program:
 
     min over a, b of sum(d_i - a - b stamp_i)  with  a + b stamp_i <= d_i for all i                                  (1)
 
 (Moon, Skelly and Towsley 1999, "Estimation and removal of clock skew from network delay measurements"). Its solution is
-the edge of the lower convex hull of the points over their mean. The least delay itself is not observable: the quickest
-message counts as captured when it was logged.
+the edge of the lower convex hull of the points over their mean. The least delay is unobservable and set to 0: the
+fastest message counts as captured when it was logged.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ SAME_CLOCK_NS: Final = NANOSECONDS // 10
 """Sensors whose median differences from the log are this close share a clock: their stamps keep their distances."""
 
 SET_NS: Final = NANOSECONDS
-"""A clock that steps by more than this was set, or its sensor was started again."""
+"""A greater step of a clock means that it was set, or its sensor was restarted."""
 
 MAX_DRIFT: Final = 1e-3
 """Seconds per second. Crystals drift by 1e-4, NTP slews the log's clock by up to 5e-4."""
 
 _HEADER = "std_msgs/msg/Header"
 _NEAR_NS = 5 * NANOSECONDS
-"""Results are logged within this of the capture that they are made of."""
+"""Results are logged within this time of their capture."""
 _SAMPLES = 100
 
 _RESULT = re.compile(
     r"(/\w+)*/(ground_truth|fused|filtered|humans|calibration|tf|tf_static|imu/(skeleton|\w+/orientation))(/.*)?"
 )
-"""Topics that are stamped by the reference sensor's clock; the others are sensors."""
+"""Topics stamped by the reference sensor's clock; the others are sensors'."""
 
 _TIMES: Final = {0: struct.Struct(">iI"), 1: struct.Struct("<iI")}
 """``builtin_interfaces/Time`` in CDR, by the second byte of the encapsulation."""
@@ -57,12 +57,12 @@ _Series = tuple[IntArray, IntArray]  # stamps and log times, nanoseconds
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A clock from one time at which it was set to the next: ROS time is stamp + offset + drift (stamp - anchor).
+    """A clock between two times at which it was set: ROS time is stamp + offset + drift (stamp - anchor).
 
     Attributes:
         log_ns: log time of its first message.
         anchor_ns: a stamp.
-        offset_ns: ROS time minus stamp, there.
+        offset_ns: ROS time minus stamp at the anchor.
         drift: seconds per second.
     """
 
@@ -73,21 +73,21 @@ class _Run:
 
 
 class RecordedClock:
-    """The clock by which a recording's stamps are, against the clock of its log.
+    """The clock of a recording's stamps against the clock of its log.
 
     Args:
         stamps_ns: (n,) of messages, n >= 1.
-        log_ns: (n,) when they were received, ascending.
+        log_ns: (n,) their log times, ascending.
 
     Attributes:
-        is_ros_time: stamps are ROS time, and stay as they are.
-        steady: it was never set.
+        is_ros_time: stamps are ROS time, and remain unchanged.
+        steady: the clock was never set.
     """
 
     def __init__(self, stamps_ns: IntArray, log_ns: IntArray) -> None:
         differences = log_ns - stamps_ns
         back = np.diff(stamps_ns) < -SET_NS
-        # Set ahead: earlier than any message before. After a hold-up the differences only fall to what they were.
+        # Set ahead: the difference falls below all earlier ones. After a stall it only falls back to its former level.
         ahead = (differences[1:] < np.minimum.accumulate(differences)[:-1] - SET_NS) & (np.diff(differences) < -SET_NS)
         edges = [0, *(np.flatnonzero(back | ahead) + 1).tolist(), len(stamps_ns)]
         self._runs = [
@@ -99,7 +99,7 @@ class RecordedClock:
         self.steady = len(self._runs) == 1
 
     def to_ros(self, stamp_ns: int, log_ns: int) -> int:
-        """ROS time of a stamp in a message of this log time, nanoseconds."""
+        """ROS time of a stamp in a message with this log time, nanoseconds."""
         run = self._runs[max(0, bisect_right(self._starts, log_ns) - 1)]
         ros_ns = stamp_ns + run.offset_ns + round(run.drift * (stamp_ns - run.anchor_ns))
         return min(max(0, ros_ns), MAX_STAMP_NS)
@@ -108,11 +108,11 @@ class RecordedClock:
 def _fitted(stamps_ns: IntArray, differences_ns: IntArray, log_ns: int) -> _Run:
     """Equation 1, with a drift of at most :data:`MAX_DRIFT`."""
     lasted_ns = int(np.ptp(stamps_ns))
-    # A log that was not kept while messages came, as some converters write it, tells nothing.
+    # Log times that were not recorded live, as some converters write them, carry no information.
     if np.abs(differences_ns).min() <= OTHER_CLOCK_NS or 2 * np.ptp(stamps_ns + differences_ns) < lasted_ns > SET_NS:
         return _Run(log_ns)
     anchor_ns, least_ns = int(stamps_ns.min()), int(differences_ns.min())
-    # Relative to these, because a float has no room for nanoseconds since 1970.
+    # Relative to these, because floats cannot represent nanoseconds since 1970.
     x, y = (stamps_ns - anchor_ns).astype(np.float64), (differences_ns - least_ns).astype(np.float64)
     drift = float(np.clip(_slope(x, y), -MAX_DRIFT, MAX_DRIFT))
     return _Run(log_ns, anchor_ns, least_ns + int(np.floor((y - drift * x).min())), drift)
@@ -136,11 +136,10 @@ def _slope(x: FloatArray, y: FloatArray) -> float:
 
 
 class RecordedStamps:
-    """Gives the messages of a recording header stamps in ROS time.
+    """Converts the header stamps of a recording's messages to ROS time.
 
-    The first stamp of each topic decides whether anything is to be done. Then each sensor's clock is fitted to all of
-    its messages; topics of one clock (of one device, or of devices that share a clock) are fitted together. A topic of
-    results goes by the sensor's clock to which its stamps are nearest.
+    If the first stamp of any topic is not ROS time, each sensor's clock is fitted to all of its messages; topics that
+    share a clock are fitted together. A topic of results gets the clock of the sensor with the nearest stamps.
 
     Args:
         files: of the recording.
@@ -162,7 +161,7 @@ class RecordedStamps:
             self._fit(_read(files, names, places, first=False))
 
     def in_ros_time(self, message: RawMessage) -> RawMessage:
-        """The same message with its stamps in ROS time; those that are 0 stay so."""
+        """The message with its stamps in ROS time; stamps of 0 remain 0."""
         clock = self._clocks.get(message.topic)
         form = _TIMES.get(message.cdr[1]) if len(message.cdr) >= 12 else None
         if clock is None or form is None:
@@ -180,10 +179,10 @@ class RecordedStamps:
             self._restamp(content, clock, log_ns)
             return message._replace(cdr=serialize(content))
         except BagError:
-            return message  # whoever reads it says what is wrong with it
+            return message  # malformed; reported by its reader
 
     def _restamp(self, content: Any, clock: RecordedClock, log_ns: int) -> None:
-        """Several stamps in one message."""
+        """Convert all stamps of a message in place."""
         name, _, sequence = first_field(content.__msgtype__)
         for each in getattr(content, name) if sequence else (content,):
             _set(each.header.stamp, clock, log_ns)
@@ -220,7 +219,7 @@ def _of_one_clock(found: Mapping[str, _Series]) -> list[list[str]]:
 
 
 def _age_ns(clock: RecordedClock, series: _Series) -> float:
-    """How far stamps are from the log by a clock, nanoseconds, the median of some."""
+    """Median distance of stamps from their log times by a clock, nanoseconds, over a sample."""
     step = max(1, len(series[0]) // _SAMPLES)
     stamps_ns, log_ns = (values[::step].tolist() for values in series)
     return float(np.median([abs(log - clock.to_ros(stamp, log)) for stamp, log in zip(stamps_ns, log_ns, strict=True)]))
@@ -229,13 +228,13 @@ def _age_ns(clock: RecordedClock, series: _Series) -> float:
 def _read(
     files: Iterable[McapFile], names: Mapping[str, str], places: Mapping[str, int], *, first: bool
 ) -> dict[str, _Series]:
-    """Stamps that are not 0, with their log times and in the order of these, by topic.
+    """Nonzero stamps and their log times by topic, in the order of log times.
 
     Args:
         files: to read.
         names: of the topics, by their names in the files.
-        places: where the stamp is, by topic.
-        first: only the block with the first one of each topic.
+        places: offset of the stamp, by topic.
+        first: only the block with the first stamp of each topic.
     """
     found: dict[str, list[tuple[int, int]]] = {}
     for file in files:
@@ -264,7 +263,7 @@ def _read(
 
 
 def _stamp_at(kind: str) -> int:
-    """Where the first header stamp is in a message of this type, behind the encapsulation; 0 where it has none."""
+    """Offset of the first header stamp in a serialised message of this type; 0 for none."""
     _, inner, sequence = first_field(kind)
     if not sequence:
         return 4 if inner == _HEADER else 0
@@ -277,7 +276,7 @@ def _stamp_of(cdr: bytes, place: int) -> int:
 
 
 def _nanoseconds(time: tuple[int, int]) -> int:
-    """0 for what is no time."""
+    """Nanoseconds of a time; 0 for an invalid one."""
     seconds, nanoseconds = time
     return seconds * NANOSECONDS + nanoseconds if nanoseconds < NANOSECONDS else 0
 

@@ -1,4 +1,4 @@
-"""Recordings: played in place of sensors, and made of whatever runs."""
+"""Playing recordings in place of sensors, and recording the graph."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     yield NodeSpec(
         "bag_player",
         "bag_player",
-        # Every message comes with the clock anyway; each node pays for every tick.
+        # Every message is preceded by the clock anyway, and each tick costs time in each node.
         defaults={"clock_rate": 20.0},
         parameters={
             "bag": options["bag"],

@@ -1,4 +1,4 @@
-"""How well the sensors are calibrated, as far as a robot needs to know: by what the node ``calibration`` says."""
+"""Checks the quality of the sensors' calibration, as the node ``calibration`` reports it, before a robot moves."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.robot.mapping import SafetyLimits
 
 SILENCE = 5.0
-"""Seconds after which what was said once a second is no longer taken to hold."""
+"""Seconds after which a report counts as outdated; ``calibration`` reports once a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationQuality:
-    """What is known of the sensors' poses.
+    """Certainty of the sensors' poses.
 
     Attributes:
         missing: sensors without a pose.
-        rotation_stddev: radians, of the least certain sensor; NaN where that is not said.
+        rotation_stddev: radians, of the least certain sensor; NaN where it is not reported.
         translation_stddev: metres, likewise.
     """
 
@@ -29,7 +29,7 @@ class CalibrationQuality:
 
     @classmethod
     def from_diagnostics(cls, values: Mapping[str, str], sensors: Iterable[str]) -> CalibrationQuality:
-        """By the values in the diagnostics of ``calibration``, for these sensors; the reference needs none."""
+        """From the diagnostics of ``calibration``, for these sensors; the reference needs no calibration."""
         others = [sensor for sensor in sensors if sensor != values.get("reference")]
 
         def worst(key: str) -> float:
@@ -48,36 +48,36 @@ def _number(text: str) -> float:
 
 
 class CalibrationWatch:
-    """Remembers what was last said of the calibration, and says what is wrong with it."""
+    """Keeps the last report on the calibration, and checks it against the limits."""
 
     def __init__(self) -> None:
         self._quality: CalibrationQuality | None = None
-        self._heard_ns = 0
+        self._received_ns = 0
         self._valid_from_ns: dict[str, int] = {}
 
-    def heard(self, quality: CalibrationQuality, steady_ns: int) -> None:
-        """Take note of the present quality."""
-        self._quality, self._heard_ns = quality, steady_ns
+    def receive_quality(self, quality: CalibrationQuality, steady_ns: int) -> None:
+        """Update the quality."""
+        self._quality, self._received_ns = quality, steady_ns
 
-    def pose(self, sensor: str, valid_from_ns: int) -> None:
-        """Take note of a sensor's pose, which holds from this stamp on; 0 for always."""
+    def receive_pose(self, sensor: str, valid_from_ns: int) -> None:
+        """Update the stamp from which a sensor's pose holds; 0 for always."""
         self._valid_from_ns[sensor] = valid_from_ns
 
     def fault(self, limits: SafetyLimits, stamp_ns: int, steady_ns: int) -> str:
-        """What is wrong; empty for nothing.
+        """Why the calibration does not suffice; empty if it does.
 
         Args:
-            limits: what is allowed.
-            stamp_ns: of the angles that are to be followed, in the clock of the poses' stamps.
+            limits: of the mapping.
+            stamp_ns: of the angles to follow, in the clock of the poses' stamps.
             steady_ns: now.
         """
         if not limits.calibration:
             return ""
         if self._quality is None:
-            return "calibration has not been heard of"
-        silent = (steady_ns - self._heard_ns) / NANOSECONDS
+            return "no diagnostics of calibration yet"
+        silent = (steady_ns - self._received_ns) / NANOSECONDS
         if silent > SILENCE:
-            return f"calibration has not been heard of for {silent:.0f} s"
+            return f"no diagnostics of calibration for {silent:.0f} s"
         if self._quality.missing:
             return f"calibration is missing: {', '.join(self._quality.missing)}"
         for what, value, most, unit in (

@@ -1,28 +1,27 @@
-"""A robot's joints follow a person's angles, and hold and stop where they should not.
+"""A state machine that lets a robot's joints follow a person's angles, and holds or stops them on a fault.
 
-States and what leads from one to the next (times by the mapping's ``SafetyLimits``)::
+States and transitions (times from the mapping's ``SafetyLimits``)::
 
     stopped ──good for recover_after──> approaching ──after approach──> following
        ^                                  ^    └──────any fault──────┐     │
        │                 good for recover_after                      v     v
        └───────────a fault after stop_after of holding───────────── holding
 
-- *stopped*: no commands. So it begins, too; where the robot does not say how it stands, until a person enables it.
-- *approaching*: follows, from where the robot stands; the rates grow from nothing to their limits, so that there is no
-  jump to where the person is.
-- *following*: each command is where the person is expected to be now, within the limits.
-- *holding*: the same command again and again; joints with a limit of acceleration come to rest first. Where the robot
-  did not go where it was sent, the command is where the robot stands.
+- *stopped*: no commands. The initial state; without a ``state_topic`` an operator has to enable the robot.
+- *approaching*: follows from where the robot stands; the rates grow from 0 to their limits, so that it does not jump.
+- *following*: each command is the person's predicted posture of now, within the limits.
+- *holding*: repeats the last command, after joints with a limit of acceleration have braked. Where the robot did not
+  follow its command, the command is the robot's measured position.
 
-A fault is any of: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although
-somebody goes on saying what is to be expected; angles older than ``max_age``, or stamped in the future; angles of
-another convention than the mapping's, or with other names; angles of two publishers; an angle that is not finite, that
-no body has, or that is less certain than allowed; no good calibration; a robot that is silent or not where it was sent;
-commands that came to a standstill themselves. Each is reported by name. These stop at once, without holding: another
-publisher of the commands, a robot beyond its limits, a standstill of ``STANDSTILL``.
+Faults: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although angles are
+still published (predicted ones); angles older than ``max_age`` or stamped in the future; angles of another convention
+or with other names than the mapping's; angles of two publishers; an angle that is not finite, anatomically impossible
+or less certain than allowed; no good calibration; a robot that is silent or off its command; a gap in the calls of
+:meth:`Follower.step`. Each is reported by name. Another publisher of the commands, a robot beyond its limits, and a gap
+of ``STANDSTILL`` stop at once, without holding.
 
-Nothing in here looks at a clock. Two times are given: ``now_ns`` in ROS time, as stamps are (it may stand still or
-jump), and ``steady_ns``, which never does. This is no safety-rated function.
+The caller passes two times: ``now_ns`` in ROS time, as stamps are (it may stand still or jump), and ``steady_ns``,
+which is monotonic. This is no safety-rated function.
 """
 
 from __future__ import annotations
@@ -42,22 +41,22 @@ from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
 
 ROBOT_SILENCE = 0.5
-"""Seconds without a word of the robot's own state after which it is taken to be away."""
+"""Seconds without joint states of the robot after which it counts as silent."""
 
 STANDSTILL = 2.0
-"""Seconds after which commands that stood still have ended: they do not go on with the one before."""
+"""Seconds between two steps after which the follower stops instead of continuing from its last command."""
 
 _AHEAD = 0.05
-"""Seconds by which stamps may be in the future: clocks that are kept together differ by less."""
+"""Seconds by which stamps may be in the future: synchronised clocks differ by less."""
 
 _OTHER_CLOCK = 10.0
-"""Seconds from now beyond which a stamp hardly is ROS time."""
+"""Seconds from now beyond which a stamp is hardly ROS time."""
 
 _SETTLING_NS = NANOSECONDS
-"""After ROS time jumped back, angles are not used for so long: some are still of the time before."""
+"""After ROS time jumped back, angles are discarded for this long: some still have the earlier time."""
 
 _AT_REST = 0.25
-"""Share of ``max_tracking_error`` that a robot may be off at rest. The rest of it is lag, which grows with the rate."""
+"""Share of ``max_tracking_error`` allowed at rest. The remainder is for lag, which grows with the rate."""
 
 _MAX_ANGLE = 4.0 * math.pi
 """Radians: no joint of a body turns further."""
@@ -67,11 +66,11 @@ _MAX_RATE = 50.0
 
 
 class FollowerError(BodyTrackingError):
-    """A follower that cannot do what its mapping says, or a state that is not of its robot."""
+    """Raised when the mapping cannot be followed at this period, or the robot's state does not fit the mapping."""
 
 
 class State(StrEnum):
-    """What the robot is told to do."""
+    """States of the follower."""
 
     STOPPED = "stopped"
     APPROACHING = "approaching"
@@ -85,7 +84,7 @@ class Transition:
 
     Attributes:
         before, after: the states.
-        reason: what caused it, by name.
+        reason: its cause.
     """
 
     before: State
@@ -98,15 +97,15 @@ class Transition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """What to tell the robot now.
+    """The result of one step.
 
     Attributes:
         state: of the follower.
         reason: why it is in that state, or what it waits for.
         position: (n,) radians by the mapping's joints; None where nothing is to be published.
-        kept: joints that keep their place alone, because their angles are unknown.
-        age: seconds from capture to now of the angles that it is made of; NaN where there are none.
-        margin: radians from the joint nearest to one of its limits to that limit.
+        kept: joints that hold alone because their angles are unknown.
+        age: seconds since the capture of the angles; NaN without angles.
+        margin: radians from a joint to its limit, the least of all joints.
         nearest: the name of that joint.
     """
 
@@ -120,14 +119,14 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Expected:
-    """What is expected of the person now.
+class _Prediction:
+    """The angles, predicted to now.
 
     Attributes:
         age: seconds since capture; NaN without angles.
         angle, stddev: (m,) radians of the person.
         target: (n,) radians of the robot.
-        known: (n,) whether all of a joint's angles are known well enough.
+        known: (n,) whether all angles of a joint are certain enough.
     """
 
     age: float
@@ -138,19 +137,19 @@ class _Expected:
 
 
 class Follower:
-    """Takes what is heard, and answers with commands.
+    """Receives angles and states, and computes commands.
 
     Args:
         mapping: of the robot.
-        period: seconds between two commands. A fault that would be one by the next command is one now.
+        period: seconds between two commands. A fault that would occur before the next command counts now.
 
     Attributes:
-        state: what it does now.
-        enabled: whether a person has said that the robot stands where commands begin; true where it says so itself.
-        transitions: those that nobody has taken away yet, the oldest first.
+        state: the present state.
+        enabled: whether an operator has confirmed where the robot stands; always true with a ``state_topic``.
+        transitions: since the caller last cleared the list, the oldest first.
 
     Raises:
-        FollowerError: ``silence`` is not longer than the period, or the point of a trajectory nearer than that.
+        FollowerError: ``silence`` or a trajectory's ``time_from_start`` is shorter than the period.
     """
 
     def __init__(self, mapping: RobotMapping, period: float) -> None:
@@ -171,32 +170,32 @@ class Follower:
         self._limiter = Limiter(mapping.lower, mapping.upper, mapping.rate, mapping.acceleration, mapping.home)
         self._ros_ns = self._settled_ns = 0
         self._angles: JointAngles | None = None
-        self._heard_ns = 0
-        self._wrong = "no angles yet"
-        self._refused = ""
-        self._places: IntArray = np.array([mapping.names.index(name) for name in mapping.angles], dtype=np.intp)
+        self._received_ns = 0
+        self._angle_fault = "no angles yet"
+        self._refusal = ""
+        self._columns: IntArray = np.array([mapping.names.index(name) for name in mapping.angles], dtype=np.intp)
         self._watched: tuple[str, ...] = ()
         self._sensors: dict[str, tuple[int, int]] = {}
-        self._others = ""
+        self._other_publishers = ""
         self._robot: FloatArray | None = None
         self._robot_ns = 0
-        self._robot_wrong = self._astray = ""
+        self._robot_state_fault = self._tracking_fault = ""
         self._stepped_ns: int | None = None
         self._since_ns = self._approached_ns = 0
         self._good_since_ns: int | None = None
-        self._reason = self._wrong
-        self._last_fault = self._wrong
+        self._reason = self._angle_fault
+        self._last_fault = self._angle_fault
         n = len(mapping.joints)
         self._known_since_ns: IntArray = np.full(n, -1, dtype=np.intp)
         self._used = mapping.matrix != 0.0
 
-    # --- what is heard
+    # --- inputs
 
-    def hear_angles(self, angles: JointAngles, convention: str, now_ns: int, steady_ns: int) -> bool:
-        """Take note of angles and of the convention that they name; of a message that came late, nothing.
+    def receive_angles(self, angles: JointAngles, convention: str, now_ns: int, steady_ns: int) -> bool:
+        """Receive angles and their convention; messages out of order are ignored.
 
         Returns:
-            Whether time jumped back, which forgets what was heard before.
+            Whether time jumped back, which discards everything received before.
         """
         jumped = self._ros_time(now_ns, steady_ns)
         if steady_ns < self._settled_ns:
@@ -210,19 +209,19 @@ class Follower:
             jumped = True
             self.time_jumped_back()
         elif last_ns is not None and angles.stamp_ns <= last_ns:
-            return jumped  # late, or the same again: no news
-        self._wrong = ""
+            return jumped  # out of order or repeated
+        self._angle_fault = ""
         columns = (angles.position, angles.velocity, angles.position_stddev, angles.velocity_stddev)
-        self._angles = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._places] for each in columns))
-        self._heard_ns = steady_ns
+        self._angles = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._columns] for each in columns))
+        self._received_ns = steady_ns
         return jumped
 
     def refuse_angles(self, reason: str) -> None:
-        """Angles came that must not be followed: a fault until others come, and for one command at least."""
-        self._wrong = self._refused = reason
+        """Report angles that must not be followed: a fault until valid angles arrive, and for one command at least."""
+        self._angle_fault = self._refusal = reason
 
     def _foreign(self, names: tuple[str, ...], convention: str) -> str:
-        """Why these are not the angles that the mapping is about; empty if they are."""
+        """Why these angles do not match the mapping; empty if they do."""
         mapping = self.mapping
         if convention != mapping.convention:
             said = f"the convention {convention!r}" if convention else "no convention (an empty frame_id)"
@@ -236,21 +235,21 @@ class Follower:
         what = f"{missing[0]} is missing" if missing else f"{unknown[0]} is none of them"
         return f"these are not the angles of {mapping.convention}: {what}"
 
-    def hear_sensor(self, sensor: str, stamp_ns: int, steady_ns: int) -> None:
-        """Take note of a sensor's frame; a stamp that stands still is none."""
+    def receive_frame(self, sensor: str, stamp_ns: int, steady_ns: int) -> None:
+        """Receive a sensor's frame; a repeated stamp does not count."""
         if sensor not in self._sensors or self._sensors[sensor][0] != stamp_ns:
             self._sensors[sensor] = stamp_ns, steady_ns
 
     def watch_sensors(self, sensors: tuple[str, ...]) -> None:
-        """Hold where none of these is heard of; of none at all, that does not matter."""
+        """Hold while none of these sensors sends frames; with no sensors given, never for that reason."""
         self._watched = sensors
 
-    def hear_publishers(self, problem: str) -> None:
-        """Take note of who else publishes commands for this robot, or that this is not known yet; empty for nobody."""
-        self._others = problem
+    def report_publishers(self, problem: str) -> None:
+        """Report other publishers of this robot's commands, or that they are not known yet; empty for none."""
+        self._other_publishers = problem
 
     def enable(self) -> None:
-        """A person says that the robot may move: it stands at ``home``, or where it was left.
+        """Allow the robot to move: an operator confirms that it stands at ``home`` or where it was left.
 
         Raises:
             FollowerError: the robot is not stopped.
@@ -259,38 +258,38 @@ class Follower:
             raise FollowerError(f"the robot is not stopped: {self.state}")
         self.enabled = True
 
-    def hear_robot(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
-        """Take note of how the robot stands.
+    def receive_robot_state(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
+        """Receive the robot's joint states.
 
         Args:
-            joints: names, in any order, others among them.
+            joints: names, in any order; other joints are ignored.
             position: radians of each.
             steady_ns: now.
 
         Raises:
-            FollowerError: a joint is missing, or stands nowhere.
+            FollowerError: a joint is missing or its position is not finite.
         """
-        self._robot, self._robot_ns, self._robot_wrong = None, steady_ns, ""
+        self._robot, self._robot_ns, self._robot_state_fault = None, steady_ns, ""
         missing = [name for name in self.mapping.joints if name not in joints]
         if missing:
-            self._robot_wrong = f"the robot's joint states: {missing[0]} is not among them"
+            self._robot_state_fault = f"the robot's joint states: {missing[0]} is not among them"
         elif len(position) != len(joints):
-            self._robot_wrong = f"the robot's joint states: {len(position)} positions of {len(joints)} joints"
+            self._robot_state_fault = f"the robot's joint states: {len(position)} positions of {len(joints)} joints"
         elif not np.isfinite(found := position[[joints.index(name) for name in self.mapping.joints]]).all():
-            self._robot_wrong = "the robot's joint states are not finite"
+            self._robot_state_fault = "the robot's joint states are not finite"
         else:
             self._robot = found
             return
-        raise FollowerError(self._robot_wrong)
+        raise FollowerError(self._robot_state_fault)
 
     def time_jumped_back(self) -> None:
-        """The stamps jumped back: what was heard before is of another time."""
-        self._angles, self._wrong = None, "time jumped back"
+        """Discard everything received before the jump."""
+        self._angles, self._angle_fault = None, "time jumped back"
         self._good_since_ns = None
         self._known_since_ns[:] = -1
 
     def _ros_time(self, now_ns: int, steady_ns: int) -> bool:
-        """Whether ROS time jumped back, as where a recording begins again."""
+        """Whether ROS time jumped back, as when a recording restarts."""
         jumped = jumped_back(now_ns, self._ros_ns)
         self._ros_ns = now_ns
         if jumped:
@@ -298,21 +297,21 @@ class Follower:
             self._settled_ns = steady_ns + _SETTLING_NS
         return jumped
 
-    # --- what follows from it
+    # --- commands
 
     def step(self, now_ns: int, steady_ns: int) -> Command:
-        """The next command; to be called once per period, late or not."""
+        """The next command; to be called once per period, also when late."""
         elapsed = self._period if self._stepped_ns is None else (steady_ns - self._stepped_ns) / NANOSECONDS
-        # Never more than two periods at once: after a standstill the robot must not make up for it.
+        # At most two periods: after a gap the robot must not catch up.
         dt = min(max(elapsed, 0.0), 2.0 * self._period)
         self._stepped_ns = steady_ns
         self._ros_time(now_ns, steady_ns)
-        expected = self._expected(now_ns)
-        known = expected.known
+        prediction = self._predicted(now_ns)
+        known = prediction.known
         fault = self._fatal(elapsed, steady_ns)
         fatal = bool(fault)
-        fault = fault or self._fault(steady_ns, elapsed, expected)
-        self._refused = ""
+        fault = fault or self._fault(steady_ns, elapsed, prediction)
+        self._refusal = ""
         if fault:
             self._good_since_ns, self._last_fault = None, fault
         elif self._good_since_ns is None:
@@ -325,7 +324,7 @@ class Follower:
             share = self._shares(steady_ns)
             free = share >= 0.0
             kept = tuple(name for name, moves in zip(self.mapping.joints, free, strict=True) if not moves)
-            self._limiter.step(np.where(free, expected.target, self._limiter.position), dt, np.maximum(share, 0.0))
+            self._limiter.step(np.where(free, prediction.target, self._limiter.position), dt, np.maximum(share, 0.0))
         elif self.state == State.HOLDING:
             self._limiter.brake(dt)
         position = self._limiter.position
@@ -336,25 +335,24 @@ class Follower:
             self._reason,
             None if self.state == State.STOPPED else position.copy(),
             kept,
-            expected.age,
+            prediction.age,
             float(margins[nearest]),
             self.mapping.joints[nearest],
         )
 
-    def _expected(self, now_ns: int) -> _Expected:
-        """Where the person's angles put the joints now."""
+    def _predicted(self, now_ns: int) -> _Prediction:
         angles, mapping, n = self._angles, self.mapping, len(self.mapping.joints)
         if angles is None:
             unknown = np.full(len(mapping.angles), np.inf)
-            return _Expected(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
+            return _Prediction(math.nan, unknown, unknown, self._limiter.position, np.zeros(n, dtype=bool))
         age = (now_ns - angles.stamp_ns) / NANOSECONDS
         wait = max(age, 0.0)
         ahead = min(wait, self._limits.prediction)
-        with np.errstate(invalid="ignore"):  # infinite and NaN say that something is not known
+        with np.errstate(invalid="ignore"):  # unknown values are infinite or NaN
             possible = (np.abs(angles.position) <= _MAX_ANGLE) & (np.abs(angles.velocity) <= _MAX_RATE)
             predicted = np.where(possible, angles.position + ahead * angles.velocity, np.nan)
-            # How errors of angle and velocity go together is not told; this is the most that any correlation makes of
-            # them. Beyond the horizon the velocity itself is the error.
+            # An upper bound over all correlations of angle and velocity, which the message does not carry. Beyond the
+            # horizon of the prediction the velocity itself is the error.
             stddev = angles.position_stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
             stddev[~((angles.position_stddev >= 0.0) & (angles.velocity_stddev >= 0.0))] = np.nan
             sound = possible & np.isfinite(stddev)
@@ -362,35 +360,35 @@ class Follower:
         known = (~self._used | (sound & (stddev <= most))).all(axis=1)
         turned = np.remainder(np.where(sound, predicted, 0.0) + np.pi, 2.0 * np.pi) - np.pi
         target = mapping.matrix @ turned + mapping.offset
-        # Of the values that mean the same, the one nearest to where the joint is.
+        # Of the equivalent positions, the one nearest to the joint.
         turns = np.divide(self._limiter.position - target, mapping.period, out=np.zeros(n), where=mapping.period > 0.0)
-        return _Expected(age, predicted, stddev, target + np.round(turns) * mapping.period, known)
+        return _Prediction(age, predicted, stddev, target + np.round(turns) * mapping.period, known)
 
     def _fatal(self, elapsed: float, steady_ns: int) -> str:
-        """What is so wrong that not even the same command may be repeated; empty for nothing."""
-        if self._others:
-            return self._others
+        """A fault that stops the robot at once, without holding; empty for none."""
+        if self._other_publishers:
+            return self._other_publishers
         if elapsed > STANDSTILL:
             return f"the commands themselves stood still for {elapsed:.2f} s"
         return self._check_tracking(steady_ns)
 
-    def _fault(self, steady_ns: int, elapsed: float, expected: _Expected) -> str:
-        """What is wrong now, or would be by the next command; empty for nothing."""
-        limits, angles, age = self._limits, self._angles, expected.age
+    def _fault(self, steady_ns: int, elapsed: float, prediction: _Prediction) -> str:
+        """A fault of now or before the next command; empty for none."""
+        limits, angles, age = self._limits, self._angles, prediction.age
         allowed_ns = round((limits.silence - self._period) * NANOSECONDS)
         if not self.enabled:
             return "waits for a person: call its service enable once the robot stands at home"
-        if self._refused or self._wrong or angles is None:
-            return self._refused or self._wrong or "no angles yet"
-        if steady_ns - self._heard_ns >= allowed_ns:
-            return f"no new angles for {(steady_ns - self._heard_ns) / NANOSECONDS:.2f} s"
+        if self._refusal or self._angle_fault or angles is None:
+            return self._refusal or self._angle_fault or "no angles yet"
+        if steady_ns - self._received_ns >= allowed_ns:
+            return f"no new angles for {(steady_ns - self._received_ns) / NANOSECONDS:.2f} s"
         if self._watched:
-            heard = [self._sensors[sensor][1] for sensor in self._watched if sensor in self._sensors]
+            received = [self._sensors[sensor][1] for sensor in self._watched if sensor in self._sensors]
             listed = ", ".join(self._watched)
-            if not heard:
+            if not received:
                 return f"no frame of {listed} yet"
-            if steady_ns - max(heard) >= allowed_ns:
-                return f"no frame of {listed} for {(steady_ns - max(heard)) / NANOSECONDS:.2f} s"
+            if steady_ns - max(received) >= allowed_ns:
+                return f"no frame of {listed} for {(steady_ns - max(received)) / NANOSECONDS:.2f} s"
         if elapsed > limits.silence:
             return f"the commands themselves stood still for {elapsed:.2f} s"
         if age > limits.max_age or age < -_AHEAD:
@@ -398,40 +396,40 @@ class Follower:
                 f"{age:.2f} s old, limit {limits.max_age:g} s" if age > 0.0 else f"stamped {-age:.2f} s in the future"
             )
             return f"angles are {said}" + (", or not in ROS time" if abs(age) > _OTHER_CLOCK else "")
-        needed = ~expected.known & ~self.mapping.alone
+        needed = ~prediction.known & ~self.mapping.alone
         if needed.any():
-            return self._unknown(int(needed.argmax()), angles, expected)
+            return self._unknown(int(needed.argmax()), angles, prediction)
         return self.calibration.fault(limits, angles.stamp_ns, steady_ns) or self._robot_fault(steady_ns)
 
-    def _unknown(self, joint: int, angles: JointAngles, expected: _Expected) -> str:
-        """What is wrong with the angles of a joint."""
+    def _unknown(self, joint: int, angles: JointAngles, prediction: _Prediction) -> str:
+        """Why an angle of this joint cannot be followed."""
         for place in np.flatnonzero(self._used[joint]):
             name, most = self.mapping.angles[place], self.mapping.max_stddev[joint]
             angle, rate = angles.position[place], angles.velocity[place]
             if not np.isfinite([angle, rate]).all():
                 return f"{name} is not finite, or its velocity is not known"
-            if not np.isfinite(expected.angle[place]):
+            if not np.isfinite(prediction.angle[place]):
                 return f"{name} is {angle:.3g} rad at {rate:.3g} rad/s, which no body does"
-            if not expected.stddev[place] <= most:
-                return f"standard deviation of {name} is {expected.stddev[place]:.2f} rad, limit {most:g}"
+            if not prediction.stddev[place] <= most:
+                return f"standard deviation of {name} is {prediction.stddev[place]:.2f} rad, limit {most:g}"
         raise AssertionError(f"nothing is wrong with {self.mapping.joints[joint]}")
 
     def _robot_fault(self, steady_ns: int) -> str:
-        """What is wrong with the robot itself, where it says how it stands."""
+        """A fault of the robot itself, where it reports its joint states; empty for none."""
         if not self.mapping.output.state_topic:
             return ""
-        if self._robot_wrong:
-            return self._robot_wrong
-        if self._robot_now(steady_ns) is None:
-            return "the robot does not say how it stands"
-        return self._astray or (self._beyond() if self.state == State.STOPPED else "")
+        if self._robot_state_fault:
+            return self._robot_state_fault
+        if self._measured(steady_ns) is None:
+            return "no joint states of the robot"
+        return self._tracking_fault or (self._limit_fault() if self.state == State.STOPPED else "")
 
-    def _robot_now(self, steady_ns: int) -> FloatArray | None:
-        """(n,) how the robot stands; None where it has not said so lately."""
+    def _measured(self, steady_ns: int) -> FloatArray | None:
+        """(n,) the robot's measured position; None if it is older than ``ROBOT_SILENCE``."""
         return self._robot if steady_ns - self._robot_ns <= ROBOT_SILENCE * NANOSECONDS else None
 
-    def _beyond(self) -> str:
-        """Which of the robot's joints stands beyond its limits; empty for none."""
+    def _limit_fault(self) -> str:
+        """Names the first of the robot's joints beyond its limits; empty for none."""
         robot, mapping = self._robot, self.mapping
         if robot is None or not (beyond := (robot < mapping.lower) | (robot > mapping.upper)).any():
             return ""
@@ -439,14 +437,14 @@ class Follower:
         return f"the robot's {mapping.joints[joint]} is at {robot[joint]:.3f} rad, beyond its limits"
 
     def _check_tracking(self, steady_ns: int) -> str:
-        """Take the command back to where the robot stands, where it did not go where it was sent.
+        """Reset the command to the measured position where the robot is off its command.
 
-        So it does not jump when what keeps it (an emergency stop, a hand) lets it go.
+        So the robot does not jump when an emergency stop or an obstacle releases it.
 
         Returns:
-            Why no command can say so: the robot stands too far beyond its limits. Empty where one can.
+            The fault if the robot stands too far beyond its limits for that; else empty.
         """
-        robot = self._robot_now(steady_ns)
+        robot = self._measured(steady_ns)
         if self.state == State.STOPPED or robot is None:
             return ""
         share = np.ones(len(robot)) if self.state == State.HOLDING else np.abs(self._shares(steady_ns))
@@ -455,9 +453,9 @@ class Follower:
         if (errors <= allowed).all():
             return ""
         worst = int((errors - allowed).argmax())
-        self._astray = f"the robot's {self.mapping.joints[worst]} is {errors[worst]:.2f} rad from its command"
+        self._tracking_fault = f"the robot's {self.mapping.joints[worst]} is {errors[worst]:.2f} rad from its command"
         self._limiter.reset(robot)
-        return self._beyond() if (np.abs(robot - self._limiter.position) > allowed).any() else ""
+        return self._limit_fault() if (np.abs(robot - self._limiter.position) > allowed).any() else ""
 
     def _next_state(self, fault: str, fatal: bool, steady_ns: int) -> None:
         limits = self._limits
@@ -467,13 +465,13 @@ class Follower:
         since = (steady_ns - self._since_ns) / NANOSECONDS
         if self.state in (State.STOPPED, State.HOLDING):
             if good >= limits.recover_after:
-                robot = self._robot_now(steady_ns)
+                robot = self._measured(steady_ns)
                 if robot is not None:
                     self._limiter.reset(robot)
                 self._enter(State.APPROACHING, f"everything was good for {good:.2f} s", steady_ns)
             elif fault and self.state == State.HOLDING and (fatal or since >= limits.stop_after):
                 self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
-                self._astray = ""
+                self._tracking_fault = ""
             else:
                 waits = f"good for {good:.2f} of {limits.recover_after:g} s"
                 self._reason = fault or (f"{waits} since: {self._last_fault}" if self._last_fault else waits)
@@ -487,7 +485,7 @@ class Follower:
         self.state, self._reason, self._since_ns = state, reason, steady_ns
 
     def _shares(self, steady_ns: int) -> FloatArray:
-        """(n,) of its rate that each joint may use; negative for one that keeps its place."""
+        """(n,) usable part of each joint's rate; negative for a joint that holds."""
         limits = self._limits
         ready_ns = self._known_since_ns + round(limits.recover_after * NANOSECONDS)
         begun_ns = np.maximum(ready_ns, self._approached_ns)

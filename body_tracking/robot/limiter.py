@@ -1,4 +1,4 @@
-"""Motion of joints toward a target that may jump, within limits of position, rate and acceleration."""
+"""Motion of joints towards a target that may jump, within limits of position, rate and acceleration."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from body_tracking.core.skeleton import FloatArray
 
 
 class Limiter:
-    """Moves n joints, one step of time after the other; the steps need not be equal.
+    """Moves n joints in time steps of any length.
 
-    In a step of ``dt`` a joint moves by ``v dt``. Without a limit of acceleration ``v`` is what is needed, up to the
-    rate. With one, ``v`` changes by at most ``a dt``, and is kept so low that the joint can still come to rest before
-    its target: a joint that moves by ``v dt`` and then slows down, in steps however long, goes no further than
-    ``v dt + v^2 / 2a``; that must be no more than the distance ``d``, so ``v <= a (sqrt(dt^2 + 2 d / a) - dt)``. Where
-    the target has come closer than that, the joint overshoots it, but not a limit: from where it could rest before the
-    limit it still can after slowing down for one more step.
+    In a step of ``dt`` a joint moves by ``v dt``. Without a limit of acceleration, ``v`` takes the joint to its target,
+    up to the rate. With one, ``v`` changes by at most ``a dt``, and is kept so low that the joint can still stop at its
+    target: a joint that moves by ``v dt`` and then slows down goes no further than ``v dt + v^2 / 2a``, which must not
+    exceed the distance ``d``, so ``v <= a (sqrt(dt^2 + 2 d / a) - dt)``. Where the target came closer than that, the
+    joint overshoots it, but never a limit: a joint that could stop before the limit still can after braking for one
+    more step.
 
     Args:
         lower, upper: (n,) radians.
@@ -35,17 +35,17 @@ class Limiter:
         self.reset(position)
 
     def reset(self, position: FloatArray) -> None:
-        """Stand at (n,) radians, or at the limit that they are beyond."""
+        """Stand still at (n,) radians, clipped to the limits."""
         self.position: FloatArray = np.clip(position, self._lower, self._upper)
         self.velocity: FloatArray = np.zeros_like(position)
 
     def step(self, target: FloatArray, dt: float, share: FloatArray | float = 1.0) -> FloatArray:
-        """Go on for some time.
+        """Move towards the target.
 
         Args:
-            target: (n,) radians; a target beyond a limit is taken for the limit.
+            target: (n,) radians, clipped to the limits.
             dt: seconds, at least 0.
-            share: of the rates that may be used, 0 to 1, per joint; a joint that is faster slows down as it may.
+            share: usable part of the rates, 0 to 1, per joint; a faster joint slows down within its acceleration.
 
         Returns:
             (n,) the new positions.
@@ -57,16 +57,15 @@ class Limiter:
         change = self._acceleration * dt
         speeds = np.clip(wanted, self.velocity - change, self.velocity + change)
         moved = np.clip(self.position + speeds * dt, self._lower, self._upper)
-        # rounding alone: what was clipped is no more than that
-        self.velocity, self.position = (moved - self.position) / dt, moved
+        self.velocity, self.position = (moved - self.position) / dt, moved  # the last clip removes rounding only
         return self.position
 
     def brake(self, dt: float) -> FloatArray:
-        """Come to rest, as fast as the acceleration allows; (n,) the new positions."""
+        """Brake as hard as the acceleration allows; (n,) the new positions."""
         return self.step(self.position, dt, 0.0)
 
     def _toward(self, away: FloatArray, dt: float) -> FloatArray:
-        """(n,) velocities that get there, or as near as a joint may get that must be able to rest there."""
+        """(n,) velocities that cover the distance ``away``, or as much of it as leaves room to stop."""
         straight = away / dt
         limited = np.isfinite(self._acceleration)
         if not limited.any():

@@ -1,15 +1,15 @@
-"""Mapping files: which joint of a robot follows which of the person's angles, and how far it may be trusted.
+"""Mapping files: which joint of a robot follows which of the person's angles, within which limits.
 
 A mapping is a YAML file; ``docs/robots.md`` explains it, ``config/robots/`` has two. Radians, seconds, metres::
 
-    robot: two_joint_arm            # a name, for people
-    convention: isb                 # whose angle names these are
+    robot: two_joint_arm            # a name, for messages
+    convention: isb                 # of the angles below
     output:
       kind: joint_trajectory        # or float64_multi_array
       topic: /arm_controller/joint_trajectory
       time_from_start: 0.02         # joint_trajectory: how long the controller takes to get there
       stamped: true                 # joint_trajectory: stamp with the present time, not with 0 ("now")
-      state_topic: /arm/joint_states    # optional: where the robot says how it stands
+      state_topic: /arm/joint_states    # optional: the robot's own joint states
       order: [shoulder, elbow]      # as in the controller's own configuration
     joints:                         # in the same order
       - name: shoulder
@@ -20,12 +20,11 @@ A mapping is a YAML file; ``docs/robots.md`` explains it, ``config/robots/`` has
         upper: 2.8
         rate: 2.0                   # rad/s
         acceleration: 20.0          # rad/s^2; optional: without it speed may change at once
-        home: 0.0                   # where the robot stands at the start, if nothing says so
+        home: 0.0                   # where the robot stands at the start, without a state_topic
         max_stddev: 0.4             # of the person's angle; optional
-        when_uncertain: hold_robot  # or hold_joint: this joint alone keeps its place
+        when_uncertain: hold_robot  # or hold_joint: only this joint holds its position
     safety: {...}                   # the fields of SafetyLimits
 
-Everything that is wrong is refused with its name: see :func:`load`.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ HOLD_ROBOT, HOLD_JOINT = "hold_robot", "hold_joint"
 
 
 class MappingError(BodyTrackingError):
-    """A mapping file that cannot be read, or that says something that cannot be."""
+    """Raised when a mapping file cannot be read or its content is invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyLimits:
-    """When to hold, when to stop, and how to begin again; the fields' ``doc`` says what each is."""
+    """When to hold, when to stop, and how to resume."""
 
     silence: float = number_field(
         0.1,
@@ -89,7 +88,8 @@ class SafetyLimits:
     )
     stop_after: float = number_field(2.0, "after holding for this long, publish nothing any more", "s", 0.1, 600.0)
     calibration: bool = field(
-        default=True, metadata={"doc": "hold where the sensors are not calibrated, or the node that tells is not heard"}
+        default=True,
+        metadata={"doc": "hold while the sensors are not calibrated, or their calibration is not reported"},
     )
     max_rotation_stddev: float = number_field(
         0.06, "hold where a sensor's orientation in world is less certain than this", "rad", 0.0001, 3.2
@@ -123,7 +123,7 @@ class Output:
         kind: ``TRAJECTORY`` or ``ARRAY``.
         topic: of the commands.
         time_from_start: seconds, of a trajectory's only point.
-        stamped: whether a trajectory says the time at which it was made.
+        stamped: whether a trajectory is stamped with its time; else with 0.
         state_topic: ``sensor_msgs/JointState`` of the robot; empty for none.
     """
 
@@ -146,15 +146,15 @@ class RobotMapping:
         joints: n names.
         names: of all angles of the convention, in their order.
         angles: m names of the angles that are used, each once.
-        matrix: (n, m) a joint's change per change of an angle: scale times weight; zeros for a constant joint.
+        matrix: (n, m) derivative of a joint's position by an angle: scale times weight; zeros for a constant joint.
         offset: (n,) radians.
-        period: (n,) radians by which a joint's value is ambiguous because angles are so by a whole turn; 0 where the
-            angles of a sum have different weights and so no common period.
+        period: (n,) radians that a whole turn of an angle adds to the joint; 0 where the angles of a sum have
+            different weights and so no common period.
         lower, upper, home: (n,) radians.
         rate: (n,) rad/s.
         acceleration: (n,) rad/s^2; infinite where not limited.
         max_stddev: (n,) radians, for each of a joint's angles.
-        alone: (n,) whether the joint holds by itself while its angles are unknown, and the others go on.
+        alone: (n,) whether only this joint holds while its angles are unknown, and the others go on.
     """
 
     robot: str
@@ -207,7 +207,7 @@ _TOP = ("robot", "convention", "output", "joints", "safety")
 
 
 class _Loader(files.SafeLoader):  # type: ignore[misc]
-    """YAML in which a key may not come twice: the second would silently replace the first."""
+    """YAML that refuses duplicate keys, of which the second would silently replace the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -226,10 +226,10 @@ def load(path: Path, angle_names: Mapping[str, Sequence[str]]) -> RobotMapping:
         angle_names: the angles of each convention.
 
     Raises:
-        MappingError: no such file, not YAML; a key that is unknown, missing or there twice; a value that is no number,
-            not finite or out of its range; an unknown convention, angle or joint; a joint or angle twice; limits that
-            are empty or inverted, a home or constant beyond them; joints in another order than the controller has
-            them; a time to stop in which the joints cannot brake. The text names the file and what it is.
+        MappingError: no such file, not YAML; an unknown, missing or duplicate key; a value that is no number, not
+            finite or out of its range; an unknown convention, angle or joint; a joint or angle twice; empty or inverted
+            limits, a home or constant beyond them; another joint order than the controller's; a stopping time too
+            short to brake. The text names the file and the item.
     """
     try:
         content = files.read_yaml(path, _Loader)
@@ -242,11 +242,7 @@ def load(path: Path, angle_names: Mapping[str, Sequence[str]]) -> RobotMapping:
 
 
 def parse(content: object, angle_names: Mapping[str, Sequence[str]]) -> RobotMapping:
-    """The mapping that the content of a file says; see :func:`load`.
-
-    Raises:
-        MappingError, ParameterError: as there, without the file's name.
-    """
+    """Parse the content of a mapping file; errors as of :func:`load`, without the file's name."""
     top = _section(content, "the file", "robot", "convention", "output", "joints", known=_TOP)
     robot, convention = (_text(top[key], key) for key in ("robot", "convention"))
     if convention not in angle_names:
@@ -389,7 +385,7 @@ def _check_motion(joint: dict[str, Any], safety: SafetyLimits) -> None:
 
 
 def _section(content: object, what: str, *required: str, known: Sequence[str] = ()) -> Mapping[str, object]:
-    """Names and values, with those that are required and, where any are given, no others than the known ones."""
+    """Check that the content is a mapping with all required keys and, if ``known`` is given, no unknown ones."""
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise MappingError(f"{what}: expected names and values")
     for key in content:

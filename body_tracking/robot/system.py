@@ -34,17 +34,17 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def convention_of(mapping: Path, asked: str) -> str:
-    """The convention whose angles a robot's mapping file is about.
+    """The convention of the angles that a mapping file names.
 
     Args:
         mapping: the file.
-        asked: the convention that somebody asks for; empty or ``graph.AUTO`` for any.
+        asked: the requested convention; empty or ``graph.AUTO`` for any.
 
     Raises:
-        MappingError: the file is none.
-        GraphError: another convention is asked for.
+        MappingError: not a mapping file.
+        GraphError: another convention is requested.
     """
-    # only who drives a robot pays for these
+    # imported here: only a graph with a robot needs them
     from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
     from body_tracking.robot.mapping import load
 
@@ -74,8 +74,8 @@ SYSTEM = System(
         Service(
             "robot_commands/enable",
             "robot_commands",
-            "a person says that the robot stands at `home` or where it was left, and may move; below the node's own "
-            "name",
+            "an operator confirms that the robot stands at `home` or where it was left, and may move; below the node's "
+            "own name",
         ),
     ),
 )

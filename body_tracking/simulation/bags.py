@@ -59,22 +59,22 @@ _Message = tuple[int, str, bytes]
 
 
 def shipped(name: str, seed: int = SEED) -> Setup:
-    """What a recording in ``bags/`` shows, or one like it with another seed: another person, seen with other errors.
+    """The setup of a recording in ``bags/``; another seed gives another person and other errors.
 
     Args:
         name: one of :data:`SHIPPED`.
-        seed: of all chance.
+        seed: of the random generators.
     """
     motion = SHIPPED[name]
-    # a turn less than usual: the demo runs in real time
+    # one turn less than usual: the demo runs in real time
     return Setup(motion, seconds=22.0 if motion == "torso_twist" else None, seed=seed, standard=True)
 
 
 def write_bag(recording: SimulatedRecording, folder: Path, *, overwrite: bool = False) -> None:
-    """Write a recording as a bag, showing how far it is.
+    """Write a recording as a bag, with progress on stderr.
 
     Raises:
-        BagError: the folder exists and is not to be overwritten, or cannot be written.
+        BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
     """
     topics: dict[str, tuple[str, Qos]] = {}
     for sensor in recording.sensors:
@@ -107,19 +107,18 @@ def _mag_topic(imu: SimulatedImu) -> str:
 
 
 def _messages(recording: SimulatedRecording) -> Iterator[_Message]:
-    """Everything, in no order."""
+    """All messages, in no order."""
     for sensor in recording.sensors:
         transform = pose_to_transform(sensor.pose, WORLD, BAG_MESSAGES)
         yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(transform)
     for frame in recording.frames:
         yield frame.received_ns, graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons)
     for imu, samples in recording.imus:
-        yield from _felt(imu, samples)
+        yield from _imu_messages(imu, samples)
     yield from _truth(recording)
 
 
-def _felt(imu: SimulatedImu, samples: ImuSamples) -> Iterator[_Message]:
-    """What an inertial sensor said."""
+def _imu_messages(imu: SimulatedImu, samples: ImuSamples) -> Iterator[_Message]:
     for k, (stamp_ns, received_ns) in enumerate(
         zip(samples.stamps_ns.tolist(), samples.received_ns.tolist(), strict=True)
     ):
@@ -150,7 +149,7 @@ def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
     for k, stamp_ns in enumerate(first.stamps_ns.tolist()):
         log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS
         skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
-        # positions only, as a sensor's
+        # positions only, as from a sensor
         yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
         state = estimate_to_joint_state(first.estimate(k), MODEL, BAG_MESSAGES)
         yield log_ns, graph.TRUE_MODEL_STATE, serialize(state)
@@ -169,8 +168,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking simulate`` and ``body_tracking make-bags``."""
     command = subparsers.add_parser(
         "simulate",
-        description="Simulates people in front of Kinect v2 sensors that err like real ones, with inertial sensors on "
-        "them if asked, and writes what the sensors say and what is true into a bag. The same arguments give the same "
+        description="Simulates people in front of Kinect v2 sensors with realistic errors, optionally with inertial "
+        "sensors on them, and writes measurements and ground truth into a bag. The same arguments give the same "
         "numbers.",
         epilog=f"motions: {', '.join(MOTIONS)}. segments: {', '.join(MODEL.segment_names)}.",
     )
@@ -179,7 +178,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--motion",
         default="torso_twist",
         metavar="NAME",
-        help="what they do (default: %(default)s)",
+        help="their motion (default: %(default)s)",
     )
     where = command.add_mutually_exclusive_group()
     where.add_argument(
@@ -202,16 +201,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument(
         "--imus", default="", metavar="SEGMENT,...", help="segments of the first person with an inertial sensor"
     )
-    command.add_argument("--raw", action="store_true", help="inertial sensors do not tell their orientation")
+    command.add_argument("--raw", action="store_true", help="inertial sensors report no orientation")
     command.add_argument("--imu-rate", type=float, default=100.0, metavar="HZ", help="of each (default: 100)")
     command.add_argument("--no-magnetometer", action="store_true", help="inertial sensors have none")
     command.add_argument(
         "--seconds",
         type=float,
         metavar="S",
-        help="of the recording, by more repetitions (default: what the motion takes)",
+        help="of the recording, by more repetitions (default: the motion's own length)",
     )
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all chance (default: 0)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the random generators (default: 0)")
     command.add_argument("--dark", action="store_true", help="without light a sensor takes 15 frames a second")
     command.add_argument(
         "--config",
@@ -229,7 +228,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     bags.add_argument(
         "-o", "--output", type=Path, default=Path("bags"), metavar="FOLDER", help="where the bags go (default: bags)"
     )
-    bags.add_argument("--seed", type=int, default=SEED, help=f"of all chance (default: {SEED})")
+    bags.add_argument("--seed", type=int, default=SEED, help=f"of the random generators (default: {SEED})")
     bags.add_argument("--motion", choices=sorted(SHIPPED), help="only this one")
     bags.set_defaults(run=make_bags)
 
@@ -249,12 +248,12 @@ def run(args: argparse.Namespace) -> int:
     )
     recording = simulate(replace(setup, imus=tuple(_imus(args))))
     write_bag(recording, args.output, overwrite=args.overwrite)
-    _tell(recording, args.output)
+    _print_summary(recording, args.output)
     return 0
 
 
 def _imus(args: argparse.Namespace) -> Iterator[SimulatedImu]:
-    """Those that are asked for, each with a clock of its own."""
+    """The requested inertial sensors, each with a clock of its own."""
     segments = [segment for segment in args.imus.split(",") if segment]
     twice = sorted({segment for segment in segments if segments.count(segment) > 1})
     if twice:
@@ -287,12 +286,12 @@ def make_bags(args: argparse.Namespace) -> int:
         if args.motion in (None, name):
             recording = simulate(shipped(name, args.seed))
             write_bag(recording, args.output / name, overwrite=True)
-            _tell(recording, args.output / name)
+            _print_summary(recording, args.output / name)
     return 0
 
 
-def _tell(recording: SimulatedRecording, folder: Path) -> None:
+def _print_summary(recording: SimulatedRecording, folder: Path) -> None:
     size = sum(path.stat().st_size for path in folder.iterdir())
-    samples = sum(len(said.stamps_ns) for _, said in recording.imus)
-    inertial = f", {samples} inertial samples" if samples else ""
+    count = sum(len(samples.stamps_ns) for _, samples in recording.imus)
+    inertial = f", {count} inertial samples" if count else ""
     print(f"{folder}: {recording.duration:.1f} s, {len(recording.frames)} frames{inertial}, {size / 1e6:.2f} MB")

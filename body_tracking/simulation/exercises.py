@@ -1,4 +1,4 @@
-"""The exercises of the repertoire, as key postures and what a repetition adds to them."""
+"""The exercises of the repertoire, as key postures and periodic additions to them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exercise:
-    """A motion on the spot between two T-poses: either one period of a swing over and over, or a round of postures.
+    """A motion on the spot between two T-poses: a periodic swing, or a round of postures.
 
     Attributes:
-        start: (35,) the posture from which it is done.
+        start: (35,) the posture at its beginning.
         repetitions: of the standard performance.
         period: seconds of a repetition; 0 for a round.
-        out: (35,) added in the middle of the period, (1 - cos) / 2.
-        sine: (35,) added by the sine.
-        left, right: (35,) added in the first and in the second half, by the cube of the sine, which begins gently.
-        round: postures one after the other, with the seconds to get to each and to stay there; it ends in ``start``.
+        out: (35,) amplitude of (1 - cos) / 2.
+        sine: (35,) amplitude of the sine.
+        left, right: (35,) amplitudes of the cube of the sine in the first and in the second half.
+        round: postures in order, each with the seconds to reach it and to hold it; it ends in ``start``.
     """
 
     start: FloatArray
@@ -44,7 +44,7 @@ class Exercise:
         return self.period or sum(move + stay for _, move, stay in self.round)
 
     def at(self, phase: FloatArray) -> FloatArray:
-        """(n, 35) what the swing adds at phases (n, 35), in periods."""
+        """(n, 35) the swing's additions at phases (n, 35), in periods."""
         turn = 2.0 * np.pi * phase
         sine = np.sin(turn)
         result: FloatArray = (
@@ -57,7 +57,7 @@ class Exercise:
 
 
 def normal(rng: np.random.Generator, size: int | None = None) -> FloatArray:
-    """Standard normal numbers, none beyond 2.2."""
+    """Standard normal numbers, clipped to 2.2."""
     return np.clip(rng.normal(size=size), -2.2, 2.2)
 
 
@@ -104,7 +104,7 @@ _OTHER_ARM = posture(
 
 
 def _reaching(rng: np.random.Generator | None) -> Exercise:
-    """To five places with one arm after the other."""
+    """To five targets, with alternating arms."""
     targets = [target + _OTHER_ARM for target in _TARGETS]
     targets = [target if number % 2 == 0 else mirrored(target) for number, target in enumerate(targets)]
     if rng is not None:
@@ -131,7 +131,7 @@ def _hair_combing(rng: np.random.Generator | None) -> Exercise:
 def _forearm_rolling() -> Exercise:
     """Both forearms before the chest, rolling about each other."""
     centre = posture(elevation=48.0, plane=46.0, twist=54.0, elbow=111.0, pronation=40.0)
-    # what takes a left hand 9 cm forward, and up
+    # these move a left hand 9 cm forward, and up
     forward = posture(plane_left=4.0, twist_left=-7.5, elbow_left=-12.5)
     up = posture(plane_left=1.6, twist_left=-10.5, elbow_left=8.5)
     forward, up = forward - mirrored(forward), up - mirrored(up)
@@ -220,7 +220,7 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
     # both shoulders up and down, the arms hanging
     "shoulder_lifts": Exercise(HANGING, 6, 1.8, out=posture(shrug=26.0, elevation=3.0, elbow=6.0)),
 }
-"""By name; those with chance in them as functions of a generator, or of None for the standard performance.
+"""By name; random ones are functions of a generator, or of None for the standard performance.
 
 The first six are the thesis's (Schlagenhauf 2017, sections 4.3.3-4.3.4 with figures 4.14 and 4.18, section 5.6.1,
 section 5.8 with figure 5.16). Arm raises, hair combing, forearm rolling, punching and shoulder lifts are among those of

@@ -1,4 +1,4 @@
-"""Feet that stand, rise and step, and the pelvis that they carry."""
+"""Feet that stand, rise and step, and the height of the pelvis above them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from body_tracking.simulation.people import Person
 from body_tracking.simulation.postures import PELVIS_QUATERNION, at
 
 _STANCE = 0.055
-"""Of the stature: half the distance of the ankles of somebody who stands."""
+"""Half the distance of the ankles when standing, as a share of the stature."""
 _TOE_OUT = np.radians(8.0)
 _BEHIND = 0.03
-"""Of the stature: how far the ankles are behind the point above which the hips are."""
+"""Distance of the ankles behind the hips when standing, as a share of the stature."""
 _STRAIGHT = 0.998
 """Share of a leg's length to which a knee straightens."""
 _SOFTNESS = 0.006
@@ -45,7 +45,7 @@ class Feet:
 
 
 def _footprints(person: Person, places: FloatArray, yaw: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of somebody who stands at places (n, 2) and faces yaw (n,): (n, 2, 3) FOOT points, (n, 2) headings."""
+    """(n, 2, 3) FOOT points and (n, 2) headings of a person who stands at places (n, 2) with yaw (n,)."""
     out = np.array([_TOE_OUT, -_TOE_OUT])
     heading = yaw[:, None] + out
     length = np.sqrt(person.foot**2 - (person.ankle_height - person.toe_height) ** 2)
@@ -64,14 +64,14 @@ def _footprints(person: Person, places: FloatArray, yaw: FloatArray) -> tuple[Fl
 
 
 def standing(person: Person, postures: FloatArray) -> Feet:
-    """Feet that stand, but for heels that rise and for pivoting on the toes."""
+    """Feet on the spot, with rising heels and pivoting on the toes."""
     toes, heading = _footprints(person, np.zeros((1, 2)), np.zeros(1))
     inward = np.radians(postures[:, at("pivot")]) * [-1.0, 1.0]
     return Feet(np.tile(toes, (len(postures), 1, 1)), heading + inward, np.radians(postures[:, at("heel")]))
 
 
 def carried(person: Person, q: FloatArray, ankles: FloatArray, drop: FloatArray) -> FloatArray:
-    """(n,) metres: how high the pelvis is whose hips both legs reach, ``drop`` (n,) metres below the highest."""
+    """(n,) metres, height of the pelvis: ``drop`` (n,) metres below the greatest height that both legs reach."""
     hips = np.array(
         [
             [0.0, sign * person.length(f"hip_width_{side}"), -person.length("hip_drop")]
@@ -82,16 +82,16 @@ def carried(person: Person, q: FloatArray, ankles: FloatArray, drop: FloatArray)
     away = q[:, None, :2] + local[..., :2] - ankles[..., :2]
     reach = np.sqrt((_STRAIGHT * person.legs) ** 2 - (away**2).sum(axis=-1))
     heights = ankles[..., 2] + reach - local[..., 2]
-    # below the lower one of the two, smoothly
+    # a smooth minimum of the two
     lowest: FloatArray = -_SOFTNESS * np.logaddexp(-heights[:, 0] / _SOFTNESS, -heights[:, 1] / _SOFTNESS)
     return lowest - drop
 
 
 class Steps:
-    """Feet that follow a path: one foot after the other swings to where it stands best half a stance later.
+    """Feet that follow a path: in turn, each foot swings to the path's place of half a stance later.
 
     Args:
-        person: who walks.
+        person: the body.
         path: (n,) seconds to places (n, 2), metres, and headings (n,), radians.
         begin, end: seconds between which steps begin.
         step_s: seconds from a step to the next one's.
@@ -100,7 +100,7 @@ class Steps:
     _SWING = 0.84
     """Seconds that a foot is in the air, per step: 42 % of a stride."""
     _HIGH, _TIPTOE = 0.05, np.radians(52.0)
-    """Metres to which a foot is lifted, and the pitch with which it leaves the floor, of long steps."""
+    """Height of a swinging foot, metres, and its pitch when it leaves the floor, for long steps."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Where the sensors stand round a person: the nine layouts of the dual-Kinect thesis, and any others."""
+"""Places of the sensors round a person: the nine layouts of the dual-Kinect thesis, and any others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NUMBERS: Final = (*_GAMMA, *_DELTA)
 
 
 class LayoutError(BodyTrackingError):
-    """Sensors that cannot stand like this."""
+    """Raised for an unknown or impossible layout."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ def around(
     distances: float | Sequence[float] = DISTANCE,
     heights: float | Sequence[float] = HEIGHT,
 ) -> Layout:
-    """Sensors anywhere round a person, each turned towards that person.
+    """Sensors round a person, each facing that person.
 
     Args:
         azimuths: radians from the person's front to each sensor, positive to the person's left.

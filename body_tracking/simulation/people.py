@@ -1,4 +1,4 @@
-"""People of the simulator: bodies from anthropometric tables, how one is placed over time, and where its joints are.
+"""People of the simulator: bodies from anthropometric tables, their configuration over time, and their joints.
 
 A body is that of ``upper_body`` on two legs. The legs hang on the hips and stand on ankles that a motion places; a knee
 follows from the lengths of thigh and shank. Sources: stature, mass and breadths by Gordon et al., "2012 anthropometric
@@ -25,12 +25,12 @@ MODEL: Final = UpperBody()
 
 
 class PeopleError(BodyTrackingError):
-    """A person is asked to stand where no leg reaches."""
+    """Raised when an ankle is out of the leg's reach."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """What is known of one sex.
+    """Anthropometry of one sex.
 
     Attributes:
         stature: metres, mean and standard deviation.
@@ -76,9 +76,9 @@ _THIGH, _SHANK, _ANKLE_HEIGHT, _FOOT = 0.245, 0.246, 0.039, 0.093
 _TOE_HEIGHT = 0.4
 """Of the FOOT point over the floor, where the sole is flat on it, as a share of the ankle's."""
 _UPRIGHT = ("lower_trunk", "upper_trunk", "neck", "head", "hip_drop")
-"""Lengths that stand one upon the other, with the legs below them."""
+"""Lengths that add up to the stature, together with the legs."""
 _PROPORTION_STDDEV = 0.04
-"""Of a length of somebody of known stature."""
+"""Of a length, given the stature."""
 _ASYMMETRY_STDDEV = 0.008
 """Of left against right."""
 
@@ -122,10 +122,10 @@ class Person:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, sex: str | None = None) -> Person:
-        """Somebody of a sex, or of any: stature and build by the tables, proportions 4 % off the average.
+        """Draw a person of a sex, or of any: stature and build by the tables, proportions 4 % off the average.
 
-        The body mass index is lognormal; nothing is further off than 2.5 standard deviations. The lengths that stand
-        one upon the other keep their sum, so that the stature is the person's.
+        The body mass index is lognormal; all deviations are clipped to 2.5 standard deviations. The upright lengths
+        are scaled so that they add up to the stature.
         """
         chosen = sex if sex is not None else SEXES[rng.integers(len(SEXES))]
         table = _TABLES[chosen]
@@ -142,7 +142,7 @@ class Person:
 
     @classmethod
     def _of(cls, sex: str, stature: float, mass: float, factors: dict[str, float], apart: dict[str, float]) -> Person:
-        """Somebody whose lengths are the average ones times ``factors``, left and right apart by ``apart``."""
+        """A person with the average lengths times ``factors``; left and right differ by ``apart``."""
         table = _TABLES[sex]
         breadths = {"clavicle": table.shoulders, "hip_width": table.hips}
         lengths = MODEL.default_lengths(stature)
@@ -180,11 +180,11 @@ class Person:
         return float(self.lengths[MODEL.length_names.index(name)])
 
     def capsules(self) -> Capsules:
-        """The flesh, for self-occlusion: each segment has the volume of its share of the mass (de Leva 1996)."""
+        """Capsules for self-occlusion: each segment has the volume of its share of the mass (de Leva 1996)."""
         masses = _TABLES[self.sex].masses
         trunk = self.length("lower_trunk") + self.length("upper_trunk")
         depth = _radius(masses["trunk"] * self.mass / _TRUNK_ASPECT, trunk)
-        # heads grow with the mass, but not by as much as the rest
+        # heads grow less than in proportion to the mass
         skull = 0.5 * (_ball(masses["head"] * self.mass) + _SKULL * self.stature)
         parts: list[tuple[Joint, Joint, float]] = [
             (Joint.HEAD, Joint.HEAD, skull),
@@ -222,9 +222,9 @@ _LEGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """How a body is placed over n instants, in the frame it is told in.
+    """A body's configurations and feet at n instants, in one frame.
 
-    In a person's own frame the origin is on the floor between the feet as they stand at first, x forward, z up.
+    A person's own frame has its origin on the floor between the initial places of the feet, x forward, z up.
 
     Attributes:
         times: (n,) seconds.
@@ -239,7 +239,7 @@ class Course:
     toes: FloatArray
 
     def placed(self, position: FloatArray, yaw: float) -> Course:
-        """The same in a frame where this one's origin is at (3,) metres, turned about the vertical by yaw (radians)."""
+        """Transformed into a frame in which this frame's origin is at (3,) metres, with a yaw in radians."""
         turn = so3.exp(np.array([0.0, 0.0, yaw]))
         matrix = so3.quat_to_matrix(turn)
         q = self.q.copy()
@@ -250,7 +250,7 @@ class Course:
 
 
 def joints(person: Person, course: Course) -> FloatArray:
-    """Where the 25 joints are.
+    """The 25 joints.
 
     Returns:
         (n, 25, 3) metres in the course's frame, in the order of :class:`~body_tracking.core.skeleton.Joint`.
@@ -268,10 +268,10 @@ def joints(person: Person, course: Course) -> FloatArray:
 
 
 def _forward(course: Course, pelvis: FloatArray) -> FloatArray:
-    """(n, 2, 3) where the knees bend to: between where the pelvis and where the foot points, horizontally."""
+    """(n, 2, 3) directions in which the knees bend: halfway between those of pelvis and foot, horizontal."""
     feet = (course.toes - course.ankles) * [1.0, 1.0, 0.0]
     feet /= np.linalg.norm(feet, axis=-1, keepdims=True)
-    # the pelvis' left, turned by a quarter: its own x is vertical when somebody bends down
+    # the pelvis' left axis, turned by 90 degrees: its x axis is vertical when the person bends down
     left = pelvis[:, None, :, 1]
     ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
     result: FloatArray = feet + ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)

@@ -1,11 +1,10 @@
-"""Postures in the angles of people, and the configurations of the body model that they are.
+"""Postures in clinical angles, and their conversion to configurations of the body model.
 
-A posture tells where an upper arm points against the chest (elevation, and the plane that it is raised in: 0 sideways,
-90 forward) and how far it is turned about itself against the shortest way there from hanging; how far the trunk is bent
-and turned as a whole. Shoulder girdle and spine share these as they do in people: a clavicle rises by a third of the
-arm's elevation beyond 30 degrees (Inman et al., J. Bone Joint Surg. 26 (1944) 1) and comes forward with the arm, lumbar
-and thoracic joints divide a bend by their ranges. No angle leaves the ranges of ``kinematics.ranges``: close to a limit
-it is bent away from it.
+A posture gives the direction of an upper arm against the chest (elevation, and its plane: 0 sideways, 90 forward), its
+twist relative to the shortest rotation there from hanging, and the bend and rotation of the whole trunk. Shoulder
+girdle and spine share these: a clavicle rises by a third of the arm's elevation beyond 30 degrees (Inman et al., J.
+Bone Joint Surg. 26 (1944) 1) and protracts with the arm; lumbar and thoracic joints divide a bend by their ranges.
+Close to a limit of ``kinematics.ranges``, angles are compressed so that none exceeds it.
 """
 
 from __future__ import annotations
@@ -46,15 +45,15 @@ SIDED = (
     "heel",
     "pivot",
 )
-"""Shrug and reach are elevation and protraction of a clavicle beyond what the arm asks of it; a swing moves an
+"""Shrug and reach are elevation and protraction of a clavicle beyond its share of the arm's elevation; a swing moves an
 arm forward whatever its plane; a twist is inwards; a heel rises about the toes; a foot pivots on them inwards."""
 NAMES: Final = (*_MIDDLE, *(f"{name}_{side}" for name in SIDED for side in ("left", "right")))
-"""Degrees, signs as those of the model's angles; ``forward``, ``left`` and ``drop`` of the pelvis from where it is
+"""Degrees, with the signs of the model's angles; ``forward``, ``left`` and ``drop`` displace the pelvis from its place
 above standing feet, as shares of the length of the legs."""
 
 
 def posture(**quantities: float) -> FloatArray:
-    """(35,) a posture; a name without its side means both sides, one that is missing 0."""
+    """(35,) a posture; a name without its side sets both sides, a missing name is 0."""
     result = np.zeros(len(NAMES))
     for name, value in quantities.items():
         result[at(name)] = value
@@ -62,16 +61,16 @@ def posture(**quantities: float) -> FloatArray:
 
 
 def at(name: str) -> IntArray:
-    """Where postures hold a quantity: left and right, or the one."""
+    """Indices of a quantity in a posture: left and right, or one."""
     both = (f"{name}_left", f"{name}_right") if name in SIDED else (name,)
     return np.array([NAMES.index(one) for one in both], dtype=np.intp)
 
 
-def mirrored(told: FloatArray) -> FloatArray:
-    """(35,) the same with left and right exchanged."""
-    result = told.copy()
+def mirrored(original: FloatArray) -> FloatArray:
+    """(35,) the posture with left and right swapped."""
+    result = original.copy()
     for name in SIDED:
-        result[at(name)] = told[at(name)[::-1]]
+        result[at(name)] = original[at(name)[::-1]]
     for name in ("pelvis_lateral", "pelvis_yaw", "left", "trunk_lateral", "trunk_axial", "neck_lateral"):
         result[at(name)] *= -1.0
     return result
@@ -93,7 +92,7 @@ FROM_CENTRE: Final = so3.quat_inverse(
 """(2, 4) the upper arms at the centres of their reach, in the clavicles' frames."""
 
 _SPINE_SHARES = {"flexion": 0.58, "lateral": 0.5, "axial": 0.3}
-"""The lumbar joint's part of a bend, the rest is the thoracic one's: as their ranges."""
+"""The lumbar joint's share of a bend; the rest is thoracic. In proportion to their ranges."""
 _RHYTHM = 1.0 / 3.0
 _RHYTHM_FROM, _RHYTHM_SOFTNESS = 30.0, 8.0
 """Degrees of an arm's elevation from which the clavicle rises, and how gradually it begins to."""
@@ -102,11 +101,11 @@ _CLAVICLE_REST = -10.0
 _PROTRACTION = 14.0
 """Degrees by which a clavicle comes forward with an arm that points forward."""
 _ROOM = 0.9
-"""Share of half a range within which an angle is what the motion says; beyond it bends away from the limit."""
+"""Share of half a range up to which an angle is unchanged; beyond, it is compressed."""
 
 
 def _bounded(share: FloatArray) -> FloatArray:
-    """Itself up to 0.9, then ever less of it and always below 1; twice continuously differentiable, odd."""
+    """The identity up to 0.9, then saturating below 1; twice continuously differentiable, odd."""
     size = np.abs(share)
     bent = _ROOM + (1.0 - _ROOM) * np.tanh((size - _ROOM) / (1.0 - _ROOM))
     result: FloatArray = np.sign(share) * np.where(size > _ROOM, bent, size)
@@ -114,12 +113,12 @@ def _bounded(share: FloatArray) -> FloatArray:
 
 
 def _turns(angle: FloatArray, axis: tuple[float, float, float]) -> FloatArray:
-    """(..., 4) quaternions of turns by (...) radians about an axis."""
+    """(..., 4) quaternions of rotations by (...) radians about an axis."""
     return so3.exp(angle[..., None] * np.array(axis))
 
 
 def configuration(postures: FloatArray) -> FloatArray:
-    """(n, 35) configurations, the base at the origin, of postures (n, 35) of which only the heights are missing."""
+    """(n, 35) configurations of (n, 35) postures, with the base at the origin."""
     angles = np.radians(postures)
     value = {name: angles[:, number] for number, name in enumerate(NAMES)}
     scalars: dict[str, FloatArray] = {name: value[name] for name in ("neck_flexion", "neck_lateral")}
@@ -141,8 +140,8 @@ def configuration(postures: FloatArray) -> FloatArray:
         scalars[f"forearm_pronation_{side}"] = value[f"pronation_{side}"]
         scalars[f"wrist_flexion_{side}"] = value[f"wrist_flexion_{side}"]
         scalars[f"wrist_deviation_{side}"] = value[f"wrist_deviation_{side}"]
-    told = np.stack([scalars[name] for name in _SCALAR_NAMES], axis=1)
-    bounded = _SCALAR_CENTRE + _SCALAR_HALF * _bounded((told - _SCALAR_CENTRE) / _SCALAR_HALF)
+    free = np.stack([scalars[name] for name in _SCALAR_NAMES], axis=1)
+    bounded = _SCALAR_CENTRE + _SCALAR_HALF * _bounded((free - _SCALAR_CENTRE) / _SCALAR_HALF)
 
     q = np.tile(MODEL.neutral(), (len(postures), 1))
     q[:, MODEL.scalar_q] = bounded
@@ -164,7 +163,7 @@ def configuration(postures: FloatArray) -> FloatArray:
 
 
 def _within_reach(q: FloatArray) -> FloatArray:
-    """Shoulders bent away from the limits of their swing and twist."""
+    """Compress the shoulders' swing and twist into their limits, in place."""
     values = _RANGES.soft_coordinates(q).values[:, _SHOULDERS[:, None] + np.arange(3)]
     size = np.linalg.norm(values[..., :2], axis=-1, keepdims=True) / np.radians(SHOULDER_SWING)
     values[..., :2] *= _bounded(size) / np.maximum(size, 1e-12)

@@ -1,10 +1,9 @@
-"""Random people who move at random, the truth about them, and white-noise measurements of them.
+"""Random people with random motions, their ground truth, and white-noise measurements of them.
 
-What the filters of the body model are tested with: everything is drawn from the model's own world (``upper_body`` with
-its ranges of motion), so that whatever a filter gets wrong is the filter's. All chance comes from a generator that the
-caller seeds. A motion is a closed function of time: a whole-body timetable of rests and activity, in which trunk, neck,
-arms and base make minimum-jerk moves (Flash and Hogan 1985) between random postures, with slow waves (0.05 to 0.8 Hz)
-on top. Every angle stays inside its range at every instant.
+Test data for the filters of the body model: everything obeys the model (``upper_body`` with its ranges of motion), so
+that every error is the filter's. The caller passes a seeded generator. A motion is a closed function of time: phases of
+rest and activity, in which trunk, neck, arms and base make minimum-jerk moves (Flash and Hogan 1985) between random
+postures, with slow waves (0.05 to 0.8 Hz) added. Every angle stays inside its range at every instant.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ STATURES = (1.5, 2.0)
 """Metres: least and greatest."""
 _PROPORTION_STDDEV = 0.06
 _ASYMMETRY = (0.01, 0.02)
-"""By how much left and right differ, as a share of the length."""
+"""Difference of left and right, as a share of the length."""
 
 TEMPI = (0.4, 1.6)
 """Calm and brisk: greatest angular rates of a move are those below times this, shortest durations divided by it."""
@@ -57,12 +56,12 @@ _SHORTEST_MOVE = np.radians(90.0)
 _WAVE_SHARE = 0.25
 """Amplitude of the waves as a share of half the range, in its middle; at its ends there are none."""
 _RESTLESSNESS = 0.04
-"""What remains of the waves in a rest."""
+"""Share of the waves that remains at rest."""
 
 _SWAY = np.array([0.006, 0.006, 0.002, *np.radians([1.0, 1.0, 1.5])])
 """Amplitude of a standing person's base: metres, then radians about its own axes."""
 _PELVIS = np.radians([4.0, 6.0, 0.0])
-"""Amplitude by which an active person's pelvis tilts besides."""
+"""Amplitude of an active person's additional tilt of the pelvis."""
 
 _DIRECTIONS = {
     "arms_up": (0.0, 0.0, 1.0),
@@ -70,7 +69,7 @@ _DIRECTIONS = {
     "arms_forward": (1.0, 0.0, 0.0),
     "t_pose": (0.0, 1.0, 0.0),
 }
-"""Of the left arm, the right one mirrored, in special postures: straight arms, upright trunk."""
+"""Direction of the left arm in special postures, the right one mirrored: straight arms, upright trunk."""
 POSTURES: Final = tuple(_DIRECTIONS)
 
 
@@ -173,11 +172,11 @@ def _draw_posture(rng: np.random.Generator, name: str) -> FloatArray:
 
 
 class RandomMotion:
-    """How somebody moves, as a function of time.
+    """A person's motion as a function of time.
 
     Args:
-        rng: where all chance comes from.
-        duration: seconds that are choreographed; afterwards the person rests.
+        rng: random generator.
+        duration: seconds of motion; afterwards the person rests.
         tempo: 0.4 calm to 1.6 brisk; drawn (log-uniformly) where it is None.
         postures: special postures (:data:`POSTURES`) to take, in this order, each held for 1 to 2 s.
         full_turns: how many full turns of the body to make at least.
@@ -217,7 +216,7 @@ class RandomMotion:
         waves[:, _TWIST[0]] = 0.7 * waves[:, _TWIST[1]] + 0.3 * waves[:, _TWIST[0]]
         swing = _SHOULDERS[:, :2]
         waves[:, swing] /= np.sqrt(2.0)
-        # |u| + a (1 - u^2) <= 1 for |u| <= 1 and a <= 1/2, so that nothing leaves its range; a swing is one quantity
+        # |u| + a (1 - u^2) <= 1 for |u| <= 1 and a <= 1/2, so that no angle leaves its range; a swing is one quantity
         room = 1.0 - goal**2
         room[:, swing] = 1.0 - (goal[:, swing] ** 2).sum(axis=-1, keepdims=True)
         soft = _CENTRE + _HALF * (goal + _WAVE_SHARE * activity * waves * room)
@@ -262,7 +261,7 @@ class RandomMotion:
             time = max(time, self._base.end) + rng.uniform(0.4, 1.6)
 
     def _act(self, rng: np.random.Generator, begin: float, end: float) -> float:
-        """Trunk, neck and arms move between two instants; when all are done."""
+        """Move trunk, neck and arms between two instants; returns when all have ended."""
         ramp = 0.5 / self.tempo
         self._activity.move(begin, ramp, np.ones(1))
         together = rng.random() < 0.35
@@ -288,7 +287,7 @@ class RandomMotion:
         return self._activity.end
 
     def _pose(self, rng: np.random.Generator, begin: float, name: str) -> float:
-        """Take a special posture; when it is reached."""
+        """Take a special posture; returns when it is reached."""
         shares = _draw_posture(rng, name)
         slower = rng.uniform(1.0, 1.5)
         for course, where in ((self._trunk, _TRUNK), (self._neck, _NECK), *zip(self._arms, _ARMS, strict=True)):
@@ -296,7 +295,7 @@ class RandomMotion:
         return max(self._trunk.end, self._neck.end, *(arm.end for arm in self._arms))
 
     def _turn(self, rng: np.random.Generator, begin: float, full: bool) -> float:
-        """Turn on the spot; when it is done."""
+        """Turn on the spot; returns when the turn ends."""
         angle = 2.0 * np.pi if full else np.radians(rng.uniform(30.0, 180.0))
         slowest = 3.5 if full else 0.8
         duration = max(slowest, angle / np.radians(120.0)) * rng.uniform(0.8, 1.4) / np.sqrt(self.tempo)
@@ -304,7 +303,7 @@ class RandomMotion:
         return self._base.end
 
     def _walk(self, rng: np.random.Generator, begin: float) -> None:
-        """One to three steps of 0.2 to 0.6 m, towards some place, the knees giving a little."""
+        """One to three steps of 0.2 to 0.6 m towards random places, with slightly bent knees."""
         for _ in range(rng.integers(1, 4)):
             way = self._draw_place(rng) - self._base.target[:2]
             way *= min(1.0, rng.uniform(0.2, 0.6) / float(np.linalg.norm(way)))
@@ -317,7 +316,7 @@ class RandomMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is true of a person at n instants.
+    """Ground truth of a person at n instants.
 
     Attributes:
         times: (n,) seconds.
@@ -337,17 +336,17 @@ class Truth:
 
 
 def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0, jitter: float = 0.001) -> FloatArray:
-    """(n,) seconds at which a sensor takes its frames: in its rate, with a jitter of this standard deviation."""
+    """(n,) seconds of a sensor's captures, ascending, at a rate in Hz and with a standard deviation of the jitter."""
     times = np.arange(0.0, duration, 1.0 / rate)
-    # a stamp has whole nanoseconds, and no frame comes before the one ahead of it
+    # stamps are whole nanoseconds
     moved = times + np.clip(rng.normal(scale=jitter, size=len(times)), -0.3 / rate, 0.3 / rate)
     result: FloatArray = np.round(moved * NANOSECONDS) / NANOSECONDS
     return result
 
 
 def truth_of(person: RandomPerson, motion: RandomMotion, times: FloatArray) -> Truth:
-    """What is true of a person who moves like this, at (n,) seconds."""
-    # central differences of the closed form, good to 1e-5
+    """The ground truth at (n,) seconds."""
+    # central differences of the closed form, accurate to 1e-5
     before, q, after = (motion.configuration(times + step) for step in (-1e-4, 0.0, 1e-4))
     velocity = MODEL.difference(before, after) / 2e-4
     linear = MODEL.linearise(q, person.lengths)
@@ -377,12 +376,7 @@ _LOSABLE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Dropout:
-    """Joints that are not tracked for a time.
-
-    Attributes:
-        begin, end: seconds.
-        joints: which.
-    """
+    """Joints that are not tracked from ``begin`` to ``end``, seconds."""
 
     begin: float
     end: float
@@ -399,11 +393,11 @@ def draw_dropouts(
     """Dropouts of a limb, of the head, of a part of the trunk, or of a few joints.
 
     Args:
-        rng: where all chance comes from.
-        count: how many.
+        rng: random generator.
+        count: of dropouts.
         between: seconds within which they lie.
         longest: seconds; the shortest is 0.1 s.
-        everything: probability that a dropout is one of all joints.
+        everything: probability that a dropout affects all joints.
     """
     dropouts = []
     for _ in range(count):
@@ -422,13 +416,13 @@ def draw_dropouts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementErrors:
-    """How the truth is measured.
+    """Errors of the measurements.
 
     Attributes:
         noise: metres, standard deviation per axis of the white Gaussian noise.
         factors: (25,) of the noise per joint, or None for 1.
-        dropouts: joints that are not tracked for a time.
-        gaps: (begin, end) seconds of which no frame arrives at all.
+        dropouts: of joints.
+        gaps: (begin, end) seconds without any frame.
         outliers: share of the joint samples that are displaced in a random direction.
         outlier_size: metres, greatest displacement; uniform from 0.
         outliers_between: seconds within which there are outliers.
@@ -445,11 +439,11 @@ class MeasurementErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What was measured of n instants.
+    """Measurements of n instants.
 
     Attributes:
         skeletons: of the frames that arrived, in frame ``world``.
-        frames: for each of them, which instant of the truth it is.
+        frames: for each of them, the index of its instant in the truth.
         seen: (n, 19) which points of the model were measured; none in a gap.
         outlier: (n, 19) which of them are outliers.
     """
@@ -461,10 +455,7 @@ class Observation:
 
 
 def observe(truth: Truth, errors: MeasurementErrors, rng: np.random.Generator) -> Observation:
-    """Skeletons as a fusion would hand them out that knows nothing of their noise (no covariances).
-
-    The joints of the legs, which the model does not have, are NOT_TRACKED.
-    """
+    """Skeletons without covariances; the joints of the legs, which the model lacks, are NOT_TRACKED."""
     times, points = truth.times, MODEL.joints
     shape = (len(times), len(points))
     seen: BoolArray = np.ones(shape, dtype=np.bool_)

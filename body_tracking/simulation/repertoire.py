@@ -1,11 +1,8 @@
-"""What people do before the sensors: the thesis's test motions (Schlagenhauf 2017, 4.3.3-4.3.4, 5.6.1), others of daily
-life and of exercise, and random ones.
-
-The ``exercises`` are key ``postures``. The pelvis is as high as bent or straight legs carry it; feet stand, pivot on
-their toes, rise on them, or walk.
+"""Motions of people: the thesis's test motions (Schlagenhauf 2017, 4.3.3-4.3.4, 5.6.1), others of daily life and
+exercise, and random ones.
 
 Every movement is a closed function of time with continuous accelerations, made of minimum-jerk moves, sinusoids that
-are taken up and given back smoothly, and the slow waves of somebody who cannot stand like a statue.
+fade in and out, and slow sway.
 """
 
 from __future__ import annotations
@@ -41,11 +38,11 @@ END_S = 1.5
 _ENTRY_S = 1.2
 """Seconds from the T-pose to the first posture, and back."""
 _RAMP_S = 0.5
-"""Seconds in which a repeated motion is taken up, and in which it is given back."""
+"""Seconds in which a repeated motion fades in, and in which it fades out."""
 
 
 class RepertoireError(BodyTrackingError):
-    """Something was asked for that nobody here performs."""
+    """Raised for an unknown motion, or too short a duration."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -54,12 +51,12 @@ class RepertoireError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Movement:
-    """How somebody moves.
+    """A person's movement.
 
     Attributes:
         name: of :data:`MOTIONS`.
         duration: seconds.
-        tpose_s: seconds of T-pose at the beginning; 0 where there is none.
+        tpose_s: seconds of T-pose at the beginning; 0 for none.
     """
 
     name: str
@@ -68,21 +65,21 @@ class Movement:
     _course: Callable[[FloatArray], Course] = field(repr=False)
 
     def course(self, times: FloatArray) -> Course:
-        """How the body is placed at (n,) seconds, in the person's own frame: origin on the floor, x forward."""
+        """The body at (n,) seconds, in the person's own frame: origin on the floor, x forward."""
         return self._course(np.asarray(times, dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Manner:
-    """How somebody performs what others perform too.
+    """A person's individual manner of performing a motion.
 
     Attributes:
         tempo: factor of all rates.
-        amplitude: (35,) factors of what a motion moves.
-        habit: (35,) degrees and shares, what is always added.
-        lag: (2,) seconds by which the sides come late.
-        restless: (35,) amplitudes of the waves.
-        waves, effort: the waves, and those by which one repetition differs from the next.
+        amplitude: (35,) factors of the motion's amplitudes.
+        habit: (35,) degrees and shares, constant offsets.
+        lag: (2,) seconds, delays of left and right.
+        restless: (35,) amplitudes of the sway.
+        waves, effort: the sway, and the variation between repetitions.
     """
 
     tempo: float
@@ -95,7 +92,7 @@ class _Manner:
 
     @classmethod
     def of(cls, rng: np.random.Generator | None) -> _Manner:
-        """Somebody's; without a generator that of the standard performance, which only sways."""
+        """Draw a manner; without a generator that of the standard performance, which only sways."""
         restless = posture(**{name: wave for name, (wave, _) in _MANNERS.items()})
         size = len(NAMES)
         if rng is None:
@@ -113,7 +110,7 @@ class _Manner:
         return cls(tempo, amplitude, habit, lag, restless, Waves(rng, size, 0.5), Waves(rng, 1, 0.4))
 
     def added(self, times: FloatArray) -> FloatArray:
-        """(n, 35) what is added to the postures of a motion."""
+        """(n, 35) offsets and sway, to be added to the postures of a motion."""
         result: FloatArray = self.habit + self.restless * self.waves.at(times)
         return result
 
@@ -139,8 +136,7 @@ _MANNERS = {
     "wrist_flexion": (4.0, 5.0),
     "wrist_deviation": (2.0, 3.0),
 }
-"""Amplitude of the waves (who stands sways by millimetres), and standard deviation of habits; degrees and shares of the
-legs."""
+"""Amplitude of the sway, and standard deviation of habits; degrees and shares of the legs."""
 
 
 def _perform(name: str, person: Person, manner: _Manner, exercise: Exercise, seconds: float | None) -> Movement:
@@ -160,7 +156,7 @@ def _perform(name: str, person: Person, manner: _Manner, exercise: Exercise, sec
     time = begin
     for _ in range(0 if swings else repetitions):
         for target, move, stay in exercise.round:
-            # as far from the start as this person goes
+            # scaled by this person's amplitude
             moves.move(time, move / manner.tempo, exercise.start + manner.amplitude * (target - exercise.start))
             time += (move + stay) / manner.tempo
     if swings:
@@ -183,7 +179,6 @@ def _perform(name: str, person: Person, manner: _Manner, exercise: Exercise, sec
 
 
 def _stand(person: Person, times: FloatArray, postures: FloatArray) -> Course:
-    """Somebody on the spot."""
     return _compose(
         person, times, postures, standing(person, postures), np.zeros((len(times), 2)), np.zeros(len(times))
     )
@@ -192,7 +187,7 @@ def _stand(person: Person, times: FloatArray, postures: FloatArray) -> Course:
 def _compose(
     person: Person, times: FloatArray, postures: FloatArray, feet: Feet, places: FloatArray, yaw: FloatArray
 ) -> Course:
-    """Postures on feet; the pelvis is off its places (n, 2) and headings (n,) by what the postures say."""
+    """Postures on feet; the postures displace the pelvis from its places (n, 2) and headings ``yaw`` (n,)."""
     turned = postures.copy()
     turned[:, at("pelvis_yaw")[0]] += np.degrees(yaw)
     q = configuration(turned)
@@ -210,7 +205,7 @@ def _compose(
 
 
 def _standing_still(name: str, person: Person, rng: np.random.Generator | None, seconds: float | None) -> Movement:
-    """Arms hanging, swaying as people do."""
+    """Arms hanging, with sway."""
     manner = _Manner.of(rng)
     return Movement(
         name,
@@ -221,15 +216,15 @@ def _standing_still(name: str, person: Person, rng: np.random.Generator | None, 
 
 
 _WALK_RATE = 0.85
-"""Metres per second of somebody with legs of 0.86 m in a room."""
+"""Metres per second, with legs of 0.86 m."""
 _STEP_S = 0.55
 _TURN_RATE = np.radians(95.0)
 _WITHIN = 0.9
-"""Metres: how far from the origin people walk."""
+"""Greatest distance from the origin when walking, metres."""
 
 
 def _walking_and_turning(name: str, person: Person, rng: np.random.Generator | None, seconds: float | None) -> Movement:
-    """To and fro in a room, turning towards where to go next; the standard walk goes from side to side."""
+    """Walks between random targets, turning towards each; the standard walk goes from side to side."""
     manner = _Manner.of(rng)
     duration = 20.0 if seconds is None else seconds
     speed = _WALK_RATE * manner.tempo * float(np.sqrt(person.legs.mean() / 0.86))
@@ -281,7 +276,7 @@ def _walking_and_turning(name: str, person: Person, rng: np.random.Generator | N
 
 
 _OVER = posture(left=-0.022, pelvis_lateral=-3.0, trunk_lateral=2.5)
-"""Of walking, while the left foot is in the air: over the right one."""
+"""Of walking, while the left foot is in the air: weight on the right one."""
 _LANDING = posture(
     pelvis_yaw=-4.0,
     trunk_axial=8.0,
@@ -296,7 +291,7 @@ _PACE = posture(trunk_flexion=3.0, pelvis_flexion=2.0, elbow=8.0)
 
 
 def _random(name: str, person: Person, rng: np.random.Generator | None, seconds: float | None) -> Movement:
-    """Anything within the ranges of motion (``random_people``), on feet that follow."""
+    """A random motion (``random_people``), on feet that follow it."""
     chance = np.random.default_rng(0) if rng is None else rng
     duration = 20.0 if seconds is None else seconds
     motion = RandomMotion(chance, duration, tempo=float(0.4 * 2.5 ** chance.random()))
@@ -343,22 +338,22 @@ MOTIONS: dict[str, _Builder] = {
     "standing_still": _standing_still,
     "random": _random,
 }
-"""What people can do, by name."""
+"""By name."""
 
 
 def make_movement(
     name: str, person: Person, rng: np.random.Generator | None = None, seconds: float | None = None
 ) -> Movement:
-    """Somebody's way of doing something.
+    """A person's performance of a motion.
 
     Args:
         name: of :data:`MOTIONS`.
-        person: who does it.
-        rng: where tempo, amplitude, asymmetry and sway come from; without it the standard performance.
-        seconds: how long it takes, reached by more repetitions or fewer; as usual without it.
+        person: the body.
+        rng: for tempo, amplitude, asymmetry and sway; None for the standard performance.
+        seconds: its duration, reached by the number of repetitions; None for the usual one.
 
     Raises:
-        RepertoireError: an unknown name, or too few seconds for what is to be done.
+        RepertoireError: an unknown name, or too few seconds.
     """
     if name not in MOTIONS:
         raise RepertoireError(f"unknown motion {name!r}, expected one of {', '.join(MOTIONS)}")

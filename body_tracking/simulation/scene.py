@@ -1,4 +1,4 @@
-"""People who move in front of sensors: everything that is true, and everything that the sensors said of it."""
+"""Simulates people who move in front of sensors: the ground truth and the sensors' measurements."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ from body_tracking.simulation.repertoire import Movement, make_movement
 
 WORLD: Final = "world"
 START_NS: Final = 40 * NANOSECONDS
-"""What the reference sensor's clock shows at the start."""
+"""The reference sensor's clock at the start."""
 RECEIVED_FROM_NS: Final = 1_750_000_000 * NANOSECONDS
-"""What the receiver's clock shows at the start."""
+"""The receiver's clock at the start."""
 MAX_PEOPLE: Final = 6
 """As many bodies as a Kinect v2 tracks."""
 APART: Final = 0.9
-"""Metres from one person to the next, side by side."""
+"""Metres between people side by side."""
 LANE: Final = 0.7
-"""Metres from one person to the next, who walk past each other."""
+"""Metres between the lanes of people who walk past each other."""
 _CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM = 2.0, 50.0
 """Greatest offset and drift of a sensor's clock against the reference sensor's."""
 _STEP = 1e-4
-"""Seconds to either side, of the central differences that velocities are; good to 1e-6 m/s."""
+"""Half step of the central differences for velocities, seconds; accurate to 1e-6 m/s."""
 
 
 class SceneError(BodyTrackingError):
-    """A scene that cannot be."""
+    """Raised for an impossible scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where somebody stands at first, from where the layout puts a single person.
+    """A person's initial place, relative to that of a single person in the layout.
 
     Attributes:
-        ahead: metres in the direction in which that one faces.
-        left: metres to that one's left.
-        turn: radians by which this one faces further to the left.
+        ahead: metres forward.
+        left: metres to the left.
+        turn: radians, turned to the left.
     """
 
     ahead: float
@@ -62,33 +62,33 @@ class Place:
     turn: float = 0.0
 
 
-def beside(number: int) -> tuple[Place, ...]:
-    """Side by side: the first where the layout says, the others 1, -1, 2, -2, ... places to the left."""
+def side_by_side(number: int) -> tuple[Place, ...]:
+    """The first at the layout's place, the others 1, -1, 2, -2, ... places to the left."""
     return tuple(Place(0.0, APART * ((k + 1) // 2 * (1 if k % 2 else -1))) for k in range(number))
 
 
 def lanes(number: int, apart: float = LANE) -> tuple[Place, ...]:
-    """One behind the other, every second one turned about: who walks from side to side then passes the next."""
+    """One behind the other, every second one facing backwards, so that people who walk sideways pass each other."""
     return tuple(Place(apart * (0.5 * (number - 1) - k), 0.0, np.pi * (k % 2)) for k in range(number))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """What is to be simulated.
+    """Parameters of a simulation.
 
     Attributes:
-        motion: one of ``repertoire.MOTIONS``; everybody does the same, each in their own way.
-        layout: where the sensors stand.
-        people: who is there; drawn where there is None.
-        number: of people that are drawn.
+        motion: one of ``repertoire.MOTIONS``; performed by all people, each in their own manner.
+        layout: places of the sensors.
+        people: drawn at random where None.
+        number: of people to draw.
         imus: worn by the first person.
         seconds: of the recording; the motion's own length where None.
-        seed: of all chance.
-        standard: the motion as the thesis shows it, without a person's own way.
+        seed: of the random generators.
+        standard: the motion as the thesis shows it, without an individual manner.
         errors: of the cameras.
-        dark: no light: a Kinect takes 15 frames a second.
-        places: where each stands at first; side by side where there is None.
-        surroundings: what inertial sensors feel of the place.
+        dark: without light a Kinect takes 15 frames a second.
+        places: initial places; side by side where None.
+        surroundings: of the inertial sensors.
     """
 
     motion: str
@@ -121,7 +121,7 @@ class Truth:
     """One person, in ``world``, at the captures of the reference sensor and in its clock.
 
     Attributes:
-        person: who it is.
+        person: the body.
         stamps_ns: (n,) nanoseconds.
         positions: (n, 25, 3) metres.
         velocities: (n, 25, 3) m/s.
@@ -137,7 +137,7 @@ class Truth:
     rates: FloatArray
 
     def skeleton(self, instant: int, body: int = 0) -> Skeleton:
-        """The joints at one of the instants, all Tracked."""
+        """The joints at an instant, all Tracked."""
         tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
         return Skeleton(
             int(self.stamps_ns[instant]),
@@ -149,7 +149,7 @@ class Truth:
         )
 
     def estimate(self, instant: int, body: int = 0) -> ModelEstimate:
-        """The state of the body model at one of the instants; nothing about it is uncertain."""
+        """The state of the body model at an instant, with zero covariance."""
         zero = np.zeros((2 * MODEL.nv, 2 * MODEL.nv))
         return ModelEstimate(
             int(self.stamps_ns[instant]),
@@ -165,15 +165,15 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedRecording:
-    """What was true and what the sensors said.
+    """Ground truth and measurements.
 
     Attributes:
-        setup: what was asked for.
+        setup: its parameters.
         duration: seconds.
         sensors: the cameras, the reference first.
         frames: of all cameras, in the order of receipt.
         truths: of each person.
-        imus: what each inertial sensor said.
+        imus: inertial sensors with their samples.
     """
 
     setup: Setup
@@ -186,7 +186,7 @@ class SimulatedRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Actor:
-    """Somebody who does something somewhere, and whom all sensors misread alike."""
+    """A person with a movement, an initial pose, and the misreading that all sensors share."""
 
     person: Person
     misreading: Misreading
@@ -203,8 +203,8 @@ class _Actor:
         return joints(self.person, self.course(times))
 
     def truth(self, times: FloatArray) -> Truth:
-        """Everything about the person at (n,) seconds."""
-        # a movement is known from its beginning to its end
+        """The ground truth at (n,) seconds."""
+        # movements are defined from 0 to their duration
         inside = np.clip(times, _STEP, self.movement.duration - _STEP)
         before, after = self.course(inside - _STEP), self.course(inside + _STEP)
         velocities = (joints(self.person, after) - joints(self.person, before)) / (2.0 * _STEP)
@@ -221,10 +221,10 @@ class _Actor:
 
 
 def simulate(setup: Setup) -> SimulatedRecording:
-    """One recording; the same setup gives the same numbers.
+    """Simulate a recording; the same setup gives the same numbers.
 
-    Chance is told apart: of the people, of their movements, of each sensor's clock and of each sensor's errors. Another
-    sensor, or another error, changes nothing of the rest.
+    People, movements, each sensor's clock and each sensor's errors have generators of their own, so that another sensor
+    or another error changes nothing else.
 
     Raises:
         RepertoireError: an unknown motion, or too few seconds for it.
@@ -248,7 +248,12 @@ def simulate(setup: Setup) -> SimulatedRecording:
         frames += sensor.deliver(times, _numbered(seen), START_NS, RECEIVED_FROM_NS, rng)
     frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
     imus = tuple(
-        (imu, _felt(imu, actors[0], setup.surroundings, duration, np.random.default_rng([setup.seed, name, 4, number])))
+        (
+            imu,
+            _samples(
+                imu, actors[0], setup.surroundings, duration, np.random.default_rng([setup.seed, name, 4, number])
+            ),
+        )
         for number, imu in enumerate(setup.imus)
     )
     return SimulatedRecording(setup, duration, sensors, tuple(frames), truths, imus)
@@ -259,7 +264,7 @@ _Seen = tuple[FloatArray, NDArray[np.uint8]]
 
 
 def _numbered(seen: Sequence[_Seen]) -> dict[int, _Seen]:
-    """What a sensor sees of each person by its own numbers: who appears gets the lowest that is free."""
+    """Each person's measurements by the sensor's body numbers: a person who appears gets the lowest free number."""
     if len(seen) == 1:
         return {0: seen[0]}
     there = np.stack([states.any(axis=1) for _, states in seen], axis=1)
@@ -278,19 +283,18 @@ def _numbered(seen: Sequence[_Seen]) -> dict[int, _Seen]:
 
 
 def draw_clock(rng: np.random.Generator) -> ClockModel:
-    """The clock of a sensor that nobody set."""
+    """The clock of an unsynchronised sensor."""
     offset, drift = rng.uniform(-1.0, 1.0, 2) * [_CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM]
     return ClockModel(round(offset * NANOSECONDS), float(drift), START_NS)
 
 
 def _actors(setup: Setup, name: int) -> tuple[_Actor, ...]:
-    """Each at their place."""
     rng = np.random.default_rng([setup.seed, 1])
     people: Sequence[Person] = setup.people or [Person.draw(rng) for _ in range(setup.number)]
     yaw = setup.layout.yaw
     ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     actors = []
-    for number, (person, place) in enumerate(zip(people, setup.places or beside(len(people)), strict=True)):
+    for number, (person, place) in enumerate(zip(people, setup.places or side_by_side(len(people)), strict=True)):
         own = None if setup.standard else np.random.default_rng([setup.seed, name, 2, number])
         movement = make_movement(setup.motion, person, own, setup.seconds)
         misreading = Misreading.draw(np.random.default_rng([setup.seed, 6, number]))
@@ -300,7 +304,7 @@ def _actors(setup: Setup, name: int) -> tuple[_Actor, ...]:
 
 
 def _sensors(setup: Setup) -> tuple[SimulatedKinect, ...]:
-    """The cameras with their clocks; the first one's is the reference."""
+    """The cameras with their clocks; the first one is the reference."""
     sensors = []
     for number, pose in enumerate(setup.layout.poses):
         rng = np.random.default_rng([setup.seed, 5, number])
@@ -310,15 +314,15 @@ def _sensors(setup: Setup) -> tuple[SimulatedKinect, ...]:
     return tuple(sensors)
 
 
-def _felt(
+def _samples(
     imu: SimulatedImu, actor: _Actor, surroundings: Surroundings, duration: float, rng: np.random.Generator
 ) -> ImuSamples:
-    """What an inertial sensor on somebody says."""
+    """The samples of an inertial sensor that a person wears."""
     segment = MODEL.segment_names.index(imu.segment)
     latest: list[tuple[FloatArray, Posture]] = []
 
     def posture(times: FloatArray) -> Posture:
-        # a segment and its parent are asked for at the same times, one after the other
+        # a segment and its parent are requested at the same times, one after the other
         if not latest or not np.array_equal(latest[0][0], times):
             latest[:] = [(times, MODEL.forward(actor.course(times).q, actor.person.lengths))]
         return latest[0][1]

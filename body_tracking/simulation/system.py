@@ -1,4 +1,4 @@
-"""Simulated people before simulated sensors."""
+"""The commands of the simulator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SYSTEM = System(
         Command(
             "simulate",
             "body_tracking.simulation.bags",
-            "people who move before simulated sensors, as a bag with the truth",
+            "simulate people in front of sensors, as a bag with the ground truth",
         ),
         Command(
             "make-bags", "body_tracking.simulation.bags", "make the simulated recordings that are shipped in bags/"

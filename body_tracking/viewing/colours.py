@@ -1,6 +1,6 @@
-"""Which colour things have: sensors each its own, and joints that are not well seen red.
+"""Colours: one per sensor; Inferred joints are red, joints that are not tracked dark red.
 
-As in Schlagenhauf (2017), section 5.9: a joint is red whose position is lost, or whose tracking state is Inferred.
+As in Schlagenhauf (2017), section 5.9, figures 5.18-5.19.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PALETTE: Final[tuple[Colour, ...]] = (
     (0, 160, 170),
     (150, 110, 70),
 )
-"""Of the sensors, in their order; none of them is red."""
+"""Of the sensors, in their order; none is red."""
 FUSED: Final[Colour] = (120, 125, 130)
 FILTERED: Final[Colour] = (25, 30, 40)
 BODY: Final[Colour] = (196, 206, 220)
@@ -39,14 +39,7 @@ def sensor_colours(sensors: Sequence[str]) -> dict[str, Colour]:
 
 
 def joint_colours(states: NDArray[np.uint8], own: Colour) -> ColourArray:
-    """(n, 3) RGB of joints: their own where tracked, else red, and darker where not tracked at all.
-
-    Schlagenhauf 2017, section 5.9, figures 5.18-5.19.
-
-    Args:
-        states: (n,) of ``TrackingState``.
-        own: of tracked joints.
-    """
+    """(n, 3) RGB of joints with (n,) ``TrackingState``; ``own`` is the colour of tracked joints."""
     table = np.empty((len(TrackingState), 3), np.uint8)
     table[[TrackingState.NOT_TRACKED, TrackingState.INFERRED, TrackingState.TRACKED]] = NOT_TRACKED, INFERRED, own
     colours: ColourArray = table[states]
@@ -54,7 +47,7 @@ def joint_colours(states: NDArray[np.uint8], own: Colour) -> ColourArray:
 
 
 def linear(colours: Colour | ColourArray) -> ColourArray:
-    """(..., 3) intensities of sRGB colours (IEC 61966-2-1), as viser takes the colours of many meshes."""
+    """(..., 3) intensities of sRGB colours (IEC 61966-2-1), as viser expects for batched meshes."""
     shares = np.asarray(colours, dtype=np.float64) / 255.0
     intensities = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * intensities).astype(np.uint8)

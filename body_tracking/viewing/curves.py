@@ -1,4 +1,4 @@
-"""Joint angles over the last seconds as curves with their 95 % bands, with no more points than a plot can show."""
+"""Joint angles over the last seconds as curves with 95 % bands, reduced to the points that a plot can show."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from body_tracking.core.clocks import jumped_back
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
 
 BAND: Final = 1.959963984540054
-"""Half the width of a band with 95 % of a normal distribution, in standard deviations."""
+"""Half width of the 95 % band of a normal distribution, in standard deviations."""
 WIDEST: Final = 60.0
-"""A band is drawn no farther than this from its angle, degrees; with an infinite deviation it goes that far."""
+"""Limit of a band's half width, degrees, also for infinite standard deviations."""
 _PREFERRED: Final = ("elbow_flexion", "shoulder_elevation", "shoulder_flexion", "trunk_flexion", "p_shoulder", "elbow")
 
 
@@ -25,10 +25,10 @@ class Curve:
 
     Attributes:
         times: (n,) seconds before the newest, ascending to 0.
-        values: (n,) degrees; the last known one where the angle is not known.
+        values: (n,) degrees; the last known one where the angle is unknown.
         low: (n,) degrees, the band's lower edge.
         high: (n,) degrees, its upper edge.
-        latest_stddev: degrees; infinite where nothing observes the angle now.
+        latest_stddev: degrees; infinite if the angle is unobserved now.
     """
 
     times: FloatArray
@@ -43,7 +43,7 @@ class AngleHistory:
 
     Args:
         window: seconds.
-        capacity: messages that are kept at most.
+        capacity: messages kept at most.
     """
 
     def __init__(self, window: float, capacity: int = 4096) -> None:
@@ -52,14 +52,13 @@ class AngleHistory:
         self._rows: deque[tuple[int, FloatArray]] = deque(maxlen=capacity)
 
     def clear(self) -> None:
-        """Forget everything."""
         self._rows.clear()
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def add(self, stamp_ns: int, names: Sequence[str], positions: FloatArray, stddevs: FloatArray) -> None:
-        """Take one message; late ones are left out, and other names or a jump back in time start anew.
+        """Add a message; messages out of order are ignored, and other names or a jump back in time clear the history.
 
         Args:
             stamp_ns: capture time.
@@ -78,11 +77,11 @@ class AngleHistory:
             self._rows.popleft()
 
     def curve(self, name: str, count: int) -> Curve | None:
-        """The curve of one angle, with at most ``count`` points; None where there is none."""
+        """The curve of one angle, with at most ``count`` points; None without known values."""
         if name not in self.names or not len(self):
             return None
         index = self.names.index(name)
-        rows = list(self._rows)  # at once: others append meanwhile
+        rows = list(self._rows)  # a copy: another thread may append meanwhile
         stamps = np.array([stamp_ns for stamp_ns, _ in rows])
         values, stddevs = np.array([row[:, index] for _, row in rows]).T
         known = np.isfinite(values)
@@ -99,17 +98,17 @@ class AngleHistory:
 
 
 def extremes(series: FloatArray, count: int) -> IntArray:
-    """Which samples to draw so that nobody sees that others were left out: the first, the last and the extremes.
+    """Samples to draw so that the others are not missed: the first, the last and the extremes.
 
-    The samples are split into stretches of equal length, and of each stretch the least and the greatest value of every
-    series are kept.
+    The samples are split into intervals of equal length, of which the least and the greatest value of every series are
+    kept.
 
     Args:
         series: (k, n) finite numbers, all over the same times.
-        count: at most so many are kept; at least 2 + 2 k.
+        count: of samples kept at most; at least 2 + 2 k.
 
     Returns:
-        (m,) ascending indices, m at most ``count``; all of them where n is.
+        (m,) ascending indices, m at most ``count``; all of them if n is at most ``count``.
     """
     k, n = series.shape
     if n <= count:
@@ -117,7 +116,7 @@ def extremes(series: FloatArray, count: int) -> IntArray:
     stretches = max(1, (count - 2) // (2 * k))
     length = -(-n // stretches)
     begin = np.arange(0, n, length, dtype=np.intp)
-    # the last stretch is filled up with its last sample
+    # the last interval is padded with its last sample
     padded = np.pad(series, ((0, 0), (0, len(begin) * length - n)), mode="edge").reshape(k, len(begin), length)
     found = np.concatenate([padded.argmin(axis=2), padded.argmax(axis=2)]) + begin
     kept: IntArray = np.unique(np.concatenate([[0, n - 1], np.minimum(found, n - 1).ravel()])).astype(np.intp)
@@ -125,7 +124,7 @@ def extremes(series: FloatArray, count: int) -> IntArray:
 
 
 def first_choice(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """The angles that are plotted before anybody has chosen: elbows and shoulders first, where there are any."""
+    """The angles that are plotted before the user has chosen: elbows and shoulders first."""
 
     def rank(name: str) -> int:
         return next((place for place, word in enumerate(_PREFERRED) if word in name), len(_PREFERRED))

@@ -1,4 +1,4 @@
-"""Skeletons and many equal meshes in a viser scene, which are drawn anew in place."""
+"""Skeletons and batches of equal meshes in a viser scene, updated in place."""
 
 from __future__ import annotations
 
@@ -28,11 +28,9 @@ class Drawn:
         self._lines: Any = None
 
     def hide(self) -> None:
-        """Show nothing."""
         self.draw(Seen(), False)
 
     def draw(self, seen: Seen, visible: bool) -> None:
-        """Show what is seen."""
         drawn = figure(seen.skeletons if visible else (), self._colour)
         colours: Any = STALE if seen.stale else drawn.joint_colours
         count = len(drawn.joints)
@@ -43,7 +41,7 @@ class Drawn:
             self._lines = self._scene.add_line_segments(
                 f"{self._name}/bones", np.zeros((room, 2, 3)), colour, thickness=self._thickness
             )
-        # what is not there has no length
+        # unused lines have length 0
         points = np.zeros_like(self._lines.points)
         points[: len(drawn.bones)] = drawn.bones
         if len(drawn.bones):
@@ -54,7 +52,7 @@ class Drawn:
 
 
 class Shapes:
-    """Any number of one mesh, turned, stretched and placed."""
+    """Any number of one mesh, each scaled, rotated and placed."""
 
     def __init__(
         self, scene: viser.SceneApi, name: str, mesh: trimesh.Trimesh, colour: Colour, opacity: float | None = None
@@ -70,7 +68,7 @@ class Shapes:
         scales: FloatArray,
         colour: Colour | ColourArray | None = None,
     ) -> None:
-        """Show these.
+        """Update all instances.
 
         Args:
             positions: (n, 3) metres.
@@ -86,7 +84,7 @@ class Shapes:
         if count > self._room:
             self._make(max(25, count))
         room = self._room
-        # those that are not there have no size
+        # unused instances have size 0
         batch, wxyz, sizes = (np.zeros((room, size), np.float32) for size in (3, 4, 3))
         wxyz[:, 0] = 1.0
         batch[:count], sizes[:count] = positions, scales

@@ -1,4 +1,4 @@
-"""Pictures for RViz and the like, and transforms."""
+"""Markers for RViz and Foxglove, and transforms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from body_tracking.viewing.shapes import Ellipsoids, Figure
 # visualization_msgs/Marker types
 _SPHERE, _LINE_LIST, _SPHERE_LIST, _TEXT = 2, 5, 7, 9
 MARKER_LIFETIME_NS = NANOSECONDS // 2
-"""Markers vanish by themselves when nobody sends them anew for so long."""
+"""Markers vanish after this time unless they are published again."""
 
 
 class Markers:
@@ -46,7 +46,7 @@ class Markers:
         self._add(f"{name}/bones", 0, _LINE_LIST, width, self._colour(colour), points=ends)
 
     def ellipsoids(self, name: str, shape: Ellipsoids, colour: Colour, opacity: float) -> None:
-        """Each an ellipsoid of its own."""
+        """One marker per ellipsoid."""
         quats = so3.matrix_to_quat(shape.rotations)
         for number, (centre, quat, radii) in enumerate(zip(shape.centres, quats, shape.radii, strict=True)):
             size = to_vector(2.0 * np.maximum(radii, 1e-4), self._types)

@@ -1,7 +1,6 @@
-"""The page itself: a viser server with scene, curves and buttons. It shows what it is given, and decides nothing.
+"""The page: a viser server with scene, curves and buttons.
 
-All methods but :attr:`Page.watched` are for one thread; what people press is handed to the controls in threads of
-the server's own.
+All methods but :attr:`Page.watched` must be called from one thread; the server calls the controls from its own threads.
 """
 
 from __future__ import annotations
@@ -46,17 +45,17 @@ from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
 from body_tracking.viewing.status import table
 
 PLOTS: Final = 4
-"""Angles that are plotted at a time."""
+"""Number of plots."""
 _STOP_S: Final = 2.0
-"""Time that the server has to stop, seconds."""
+"""Time limit for stopping the server, seconds."""
 
 POINTS: Final = 200
 """Points of a plotted curve at most: about one per two pixels."""
 
-_HEAD_START: Final = np.array([2.2, 0.0, 0.0])
-"""Where a person is looked for before one is seen: in front of the reference sensor, metres in world."""
-_BEHIND: Final = np.array([-3.3, 1.5, 0.9])
-"""From there to where people look from at first: behind the sensor and beside it, and from above, metres."""
+_INITIAL_TARGET: Final = np.array([2.2, 0.0, 0.0])
+"""Point at which the camera looks before a person is seen: in front of the reference sensor, metres in world."""
+_CAMERA_OFFSET: Final = np.array([-3.3, 1.5, 0.9])
+"""From the target to the camera's initial position, metres: behind the sensor, to its side and above it."""
 
 LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
     "sensors": ("skeletons of sensors", True),
@@ -68,31 +67,31 @@ LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
     "frames": ("frames of segments", False),
     "floor": ("floor", True),
 }
-"""What can be shown: name, what people read, and whether it is shown at first."""
+"""Layers of the scene by name: label, and whether it is visible at first."""
 
 BUTTONS: Final[Mapping[str, Mapping[str, str]]] = {
     "calibration": {"calibrate": "calibration/start", "reset": "calibration/reset"},
     "recording": {"record": "recorder/start", "stop": "recorder/stop"},
     "bag": {"pause": "bag_player/pause", "resume": "bag_player/resume"},
 }
-"""What can be pressed, and the service that it calls."""
+"""Groups of buttons, and the service that each button calls."""
 
 
 class Page:
     """Serves the page.
 
     Args:
-        host: address to listen at.
-        port: the first that is tried; the next ones where it is taken.
+        host: address to listen on.
+        port: the first one to try; the next ones are tried where it is in use.
         sensors: their names.
-        controls: takes what people press.
-        filters: that can be chosen.
-        conventions: likewise.
+        controls: called when a user presses a button or chooses an option.
+        filters: options.
+        conventions: options.
         window: seconds that the plots show.
-        layers: what systems show beside the skeletons.
+        layers: further layers of the scene, by other systems.
 
     Raises:
-        PageError: the address is not one of this machine, or pages of other sites could not be kept out.
+        PageError: the address is not one of this machine, or the same-origin check could not be installed.
     """
 
     def __init__(
@@ -107,31 +106,31 @@ class Page:
         layers: Sequence[Layer] = (),
     ) -> None:
         _check_address(host)
-        with same_origin(), redirect_stdout(StringIO()):  # it has much to say
+        with same_origin(), redirect_stdout(StringIO()):  # viser prints a banner
             self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
         self._controls = controls
         self._choices = {**LAYERS, **{each.name: (each.text, each.shown) for each in layers}}
         self._layers = [(each.name, load(each.draw)) for each in layers]
         self._visible = {name: shown for name, (_, shown) in self._choices.items()}
         self._floor: float | None = None
-        self._looked_at = _HEAD_START
+        self._target = _INITIAL_TARGET
         self._scene(sensors)
         self._panels(filters, conventions, window)
         self._server.on_client_connect(self._look_at_person)
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """URL of the page."""
         host = self._server.get_host()
         return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
 
     @property
     def watched(self) -> int:
-        """How many browsers show it."""
+        """Number of connected browsers."""
         return len(self._server.get_clients())
 
     def close(self) -> None:
-        """Stop serving; a server that does not stop is left behind, its threads are daemons."""
+        """Stop serving; a server that does not stop in time is abandoned, its threads are daemons."""
         with redirect_stdout(StringIO()):
             stopping = threading.Thread(target=self._server.stop, daemon=True)
             stopping.start()
@@ -142,8 +141,8 @@ class Page:
     def _scene(self, sensors: Sequence[str]) -> None:
         scene = self._server.scene
         scene.set_up_direction("+z")
-        self._server.initial_camera.position = tuple(_HEAD_START + _BEHIND)
-        self._server.initial_camera.look_at = tuple(_HEAD_START)
+        self._server.initial_camera.position = tuple(_INITIAL_TARGET + _CAMERA_OFFSET)
+        self._server.initial_camera.look_at = tuple(_INITIAL_TARGET)
         self._server.initial_camera.fov = float(np.radians(45.0))
         self._grid = scene.add_grid(
             "/floor",
@@ -188,7 +187,7 @@ class Page:
         )
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show what is there now."""
+        """Update the scene."""
         scene = self._server.scene
         with self._server.atomic():
             standing: list[Skeleton] = []
@@ -217,7 +216,7 @@ class Page:
         if bodies:
             points = np.concatenate([each.positions[each.valid] for each in bodies])
             if len(points):
-                self._looked_at = np.median(points, axis=0)
+                self._target = np.median(points, axis=0)
 
     def _draw_body(self, seen: Seen) -> None:
         shapes = capsules(seen.skeletons if self._visible["body"] else ())
@@ -229,7 +228,7 @@ class Page:
         self._ends.draw(shapes.ends.reshape(-1, 3), None, np.repeat(radii, 2)[:, None].repeat(3, axis=1), colour=colour)
 
     def _draw_uncertainty(self, snapshot: Snapshot) -> None:
-        """Of the filtered skeleton, or of the fused one where only that is shown."""
+        """Ellipsoids of the filtered skeleton, or of the fused one if only that is visible."""
         seen = snapshot.filtered if self._visible["filtered"] or not self._visible["fused"] else snapshot.fused
         shapes = ellipsoids(seen.skeletons if self._visible["uncertainty"] and not seen.stale else ())
         self._clouds.draw(shapes.centres, so3.matrix_to_quat(shapes.rotations), shapes.radii)
@@ -245,9 +244,9 @@ class Page:
         show(self._axes, bool(there))
 
     def _look_at_person(self, client: viser.ClientHandle) -> None:
-        target = self._looked_at
+        target = self._target
         with client.atomic():
-            client.camera.position = target + _BEHIND
+            client.camera.position = target + _CAMERA_OFFSET
             client.camera.look_at = target
 
     # --- panels
@@ -273,7 +272,7 @@ class Page:
         angles.dock_left()
         angles.set_width(330)
         with gui.add_folder("Nodes"):
-            self._table = gui.add_html("nothing heard yet")
+            self._table = gui.add_html("no diagnostics yet")
 
     def _legend_text(self) -> str:
         entries = [*self._colours.items(), ("filtered", FILTERED), ("inferred or not tracked", INFERRED)]
@@ -297,7 +296,7 @@ class Page:
 
         @dropdown.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:  # not we ourselves, who show what it is
+            if event.client is not None:  # None for updates by draw_status and draw_bodies
                 self._answer(label, lambda: choose(dropdown.value))
 
         return dropdown
@@ -310,7 +309,7 @@ class Page:
             self._visible[layer] = checkbox.value
 
     def _answer(self, what: str, ask: Callable[[], str]) -> None:
-        """Show everybody that somebody asked, and what came of it."""
+        """Show all clients the request, and then its answer or the reason of its refusal."""
         clients = self._server.get_clients().values()
         notes = [client.add_notification(what, "waits for an answer", loading=True) for client in clients]
         try:
@@ -321,7 +320,7 @@ class Page:
             note.body, note.color = text, "red" if refused else "teal"
             note.loading, note.auto_close_seconds = False, 8.0
 
-    # --- what changes slowly
+    # --- slow updates
 
     def draw_curves(self, history: AngleHistory) -> None:
         """Show the chosen angles."""
@@ -330,7 +329,7 @@ class Page:
                 plot.draw(history, name)
 
     def draw_status(self, statuses: Mapping[str, NodeStatus], now: float) -> None:
-        """Show what the nodes say, and which filter and which angles run."""
+        """Show the nodes' diagnostics, and the running filter and convention."""
         self._table.content = table(statuses, now)
         for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
             running = statuses[node].text.partition(" ")[0] if node in statuses else ""
@@ -338,7 +337,7 @@ class Page:
                 dropdown.value = running
 
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
-        """Show which persons' angles there are."""
+        """Update the list of persons with angles."""
         options = tuple(bodies) or (_NONE,)
         if self._body.options != options:
             self._body.options = options
@@ -347,10 +346,10 @@ class Page:
 
 
 class _Plot:
-    """One angle with its band; which one, people choose.
+    """A plot of one angle with its band, which the user chooses.
 
     Args:
-        gui: where it is added.
+        gui: to add it to.
         window: seconds.
     """
 
@@ -381,7 +380,7 @@ class _Plot:
             self._chosen = self._chosen or event.client is not None
 
     def draw(self, history: AngleHistory, usual: str) -> None:
-        """Show the chosen angle, or the usual one while nobody has chosen."""
+        """Show the chosen angle, or ``usual`` before the user has chosen one."""
         if self._choice.options != history.names:
             kept = self._choice.value if self._chosen else usual
             self._chosen = self._chosen and kept in history.names
@@ -399,7 +398,7 @@ _NONE: Final = "none yet"
 
 
 def _check_address(host: str) -> None:
-    """The server tries one port after the other, forever, where the address is not of this machine."""
+    """Refuse an address of another machine, for which viser would try port after port forever."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.bind((host, 0))

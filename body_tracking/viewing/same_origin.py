@@ -1,9 +1,8 @@
-"""Keeps pages of other sites from pressing the viewer's buttons, and from showing it in a frame of theirs.
+"""Protects the viewer from pages of other sites: cross-site websockets and clickjacking.
 
-Browsers let any page open a websocket to any address, also to one of this machine, and say in ``Origin`` whose page it
-is (RFC 6455, section 10.2). viser does not look at it, and has no place to put a look in: so the server that it makes
-is given one here. What is shown in a frame of another page can be laid under what people press there (clickjacking), so
-every answer forbids that, too (RFC 7034; Content Security Policy Level 3, section 6.4.2).
+Browsers let any page open a websocket to any address, including this machine's, with the page's site in ``Origin`` (RFC
+6455, section 10.2). viser neither checks it nor has a hook for a check, so its websocket server is patched here. Every
+answer also forbids to embed the page in a frame (RFC 7034; Content Security Policy Level 3, section 6.4.2).
 """
 
 from __future__ import annotations
@@ -25,26 +24,26 @@ _NO_FRAMES = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ances
 
 
 def is_own(origin: str | None, host: str | None) -> bool:
-    """Whether a websocket is asked for by a page that this server has served, or by no browser at all.
+    """Whether a websocket request comes from a page of this server, or not from a browser.
 
     Args:
-        origin: header of the request: scheme, name and port of whose page asks; None where no page does.
-        host: header of the request: name and port of who is asked.
+        origin: header of the request: scheme, name and port of the requesting page; None for a program.
+        host: header of the request: name and port of the requested server.
     """
     if origin is None:
         return True
     try:
-        asking, asked = urlsplit(origin).netloc, urlsplit(f"//{host or ''}")
-        name = asked.hostname or ""
-    except ValueError:  # brackets that hold no address
+        page, server = urlsplit(origin).netloc, urlsplit(f"//{host or ''}")
+        name = server.hostname or ""
+    except ValueError:  # invalid address in brackets
         return False
-    # a name that somebody else's DNS makes this machine's address of would be the same in both headers
-    return asking.lower() == asked.netloc.lower() and _is_mine(name)
+    # equal headers do not suffice: a foreign name can be resolved to this machine (DNS rebinding)
+    return page.lower() == server.netloc.lower() and _is_mine(name)
 
 
 def _is_mine(name: str) -> bool:
-    """Whether a name cannot be somebody else's: an address, or what this machine calls itself."""
-    own = socket.gethostname().lower()  # no longer name: to look that up would hold the server up
+    """Whether the name is an address or this machine's own name, which no foreign DNS can define."""
+    own = socket.gethostname().lower()  # not the full name, whose lookup could block the server
     if name in ("localhost", own, f"{own}.local"):
         return True
     try:
@@ -56,10 +55,10 @@ def _is_mine(name: str) -> bool:
 
 @contextmanager
 def same_origin() -> Iterator[None]:
-    """Websocket servers that begin meanwhile refuse the pages of others, with 403, and frames in pages of others.
+    """Patch websocket servers that start in this context to refuse other origins with 403, and to forbid frames.
 
     Raises:
-        PageError: none began in the way that is known here.
+        PageError: no server was started through the patched function.
     """
     serve = websockets.asyncio.server.serve
     guarded = 0
@@ -68,7 +67,7 @@ def same_origin() -> Iterator[None]:
         nonlocal guarded
         guarded += 1
 
-        async def look(connection: Any, request: Any) -> Any:
+        async def check(connection: Any, request: Any) -> Any:
             if "Upgrade" in request.headers and not is_own(request.headers.get("Origin"), request.headers.get("Host")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "a page of another site\n")
             answer = process_request(connection, request) if process_request is not None else None
@@ -79,7 +78,7 @@ def same_origin() -> Iterator[None]:
                     answer.headers[name] = value
             return answer
 
-        return serve(*args, process_request=look, **kwargs)
+        return serve(*args, process_request=check, **kwargs)
 
     websockets.asyncio.server.serve = guarding  # type: ignore[assignment, misc]
     try:

@@ -1,6 +1,6 @@
 """Shapes in space, as arrays: joints and bones of skeletons, capsules, ellipsoids of uncertainty, views of sensors.
 
-What is not known is left out, so that every number here is finite.
+Unknown joints are left out; all results are finite.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from body_tracking.core.skeleton import BONES, MAX_RANGE, BoolArray, FloatArray,
 from body_tracking.viewing.colours import Colour, ColourArray, joint_colours
 
 ELLIPSOID_RADIUS: Final = 2.7954834829151074
-"""Of an ellipsoid with 95 % of a normal distribution in space, in standard deviations: the square root of chi-square's
-95 % quantile with 3 degrees of freedom."""
+"""Radius of the 95 % ellipsoid of a normal distribution in space, in standard deviations: the square root of the 95 %
+quantile of chi-square with 3 degrees of freedom."""
 LARGEST_RADIUS: Final = 1.0
-"""An ellipsoid is drawn no longer than this to each side, metres: beyond, it would hide everything else."""
+"""Limit of an ellipsoid's radii, metres: a larger one would hide everything else."""
 
 KINECT_VIEW: Final = (np.radians(70.6), np.radians(60.0))
-"""Horizontal and vertical angle that a Kinect v2's depth camera sees."""
+"""Horizontal and vertical angle of a Kinect v2's depth camera, radians."""
 
 _PARENTS: Final[IntArray] = np.array([parent for parent, _ in BONES], dtype=np.intp)
 _CHILDREN: Final[IntArray] = np.array([child for _, child in BONES], dtype=np.intp)
@@ -47,7 +47,7 @@ _RADII: Final = {
 BONE_RADII: Final[FloatArray] = np.array(
     [_RADII[child.name.removesuffix("_LEFT").removesuffix("_RIGHT")] for _, child in BONES]
 )
-"""(24,) metres: how thick a person's segments are drawn, in the order of ``BONES``."""
+"""(24,) metres, radii of the segments, in the order of ``BONES``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ class Figure:
     Attributes:
         joints: (n, 3) metres.
         joint_colours: (n, 3) RGB.
-        bones: (m, 2, 3) metres, from end to end.
+        bones: (m, 2, 3) metres, their ends.
     """
 
     joints: FloatArray
@@ -91,7 +91,7 @@ class Capsules:
 
     @property
     def quats_xyzw(self) -> FloatArray:
-        """(n, 4) unit quaternions that turn z into the capsule's axis, by the shorter way."""
+        """(n, 4) unit quaternions of the shortest rotation from z to the capsule's axis."""
         axis = (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-9)[:, None]
         x, y, z = axis.T
         quats = np.stack([-y, x, np.zeros_like(x), 1.0 + z], axis=1)
@@ -103,7 +103,7 @@ class Capsules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipsoids:
-    """Where something is with some probability.
+    """Confidence regions of points.
 
     Attributes:
         centres: (n, 3) metres.
@@ -117,7 +117,7 @@ class Ellipsoids:
 
 
 def in_world(skeleton: Skeleton, pose: SensorPose) -> Skeleton:
-    """What a sensor sees, placed by the sensor's pose."""
+    """A sensor's skeleton, transformed by the sensor's pose."""
     placed = pose.apply(skeleton.positions)
     return Skeleton(skeleton.stamp_ns, "world", placed, skeleton.states, skeleton.body)
 
@@ -125,7 +125,7 @@ def in_world(skeleton: Skeleton, pose: SensorPose) -> Skeleton:
 def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
     """The joints that have a position, and the bones between them.
 
-    Joints that are not tracked are drawn where the source still gives them a place.
+    Joints that are not tracked are drawn where the source still gives a position.
 
     Args:
         skeletons: any number, in one frame.
@@ -141,7 +141,7 @@ def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
 
 
 def capsules(skeletons: Sequence[Skeleton]) -> Capsules:
-    """A capsule for each segment both ends of which are known."""
+    """A capsule for each segment with both ends known."""
     ends, radii = [np.empty((0, 2, 3))], [np.empty(0)]
     for skeleton in skeletons:
         bones, there = _bones(skeleton, skeleton.valid)
@@ -151,24 +151,23 @@ def capsules(skeletons: Sequence[Skeleton]) -> Capsules:
 
 
 def _placed(skeleton: Skeleton) -> BoolArray:
-    """(25,) which joints have a place, in whatever state."""
+    """(25,) which joints have a position, in any tracking state."""
     placed: BoolArray = np.all(np.abs(skeleton.positions) < MAX_RANGE, axis=1)
     return placed
 
 
 def _bones(skeleton: Skeleton, known: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """(m, 2, 3) of the bones between known joints, and (24,) which these are."""
+    """(m, 2, 3) ends of the bones between known joints, and the (24,) mask of these bones."""
     there = np.logical_and(known[_PARENTS], known[_CHILDREN])
     ends = np.stack([skeleton.positions[_PARENTS[there]], skeleton.positions[_CHILDREN[there]]], axis=1)
     return ends, there
 
 
 def ellipsoids(skeletons: Sequence[Skeleton]) -> Ellipsoids:
-    """For each joint with a covariance the ellipsoid in which it is with 95 % probability.
+    """The 95 % ellipsoid of each joint with a finite covariance.
 
     With the covariance ``C = R diag(s) R'`` its points are ``c + k R sqrt(s) u`` for unit vectors u, and k is
-    :data:`ELLIPSOID_RADIUS`. A covariance that is not finite has none; one with a negative eigenvalue, by rounding, is
-    flat there.
+    :data:`ELLIPSOID_RADIUS`. Negative eigenvalues, by rounding, count as 0.
     """
     centres, covariances = [np.empty((0, 3))], [np.empty((0, 3, 3))]
     for skeleton in skeletons:
@@ -183,7 +182,7 @@ def ellipsoids(skeletons: Sequence[Skeleton]) -> Ellipsoids:
 
 
 def frustum(depth: float, view: tuple[float, float] = KINECT_VIEW) -> FloatArray:
-    """(8, 2, 3) the edges of what a camera sees up to a depth, in its optical frame (x right, y down, z forward).
+    """(8, 2, 3) edges of a camera's view up to a depth, in its optical frame (x right, y down, z forward).
 
     Four edges from the camera to the corners, then four around.
 
@@ -205,15 +204,15 @@ _FLOOR_STEP: Final = 0.03
 
 
 def floor_height(skeletons: Sequence[Skeleton], before: float | None) -> float | None:
-    """Where the floor is drawn: under the feet, but not moved by every tremor.
+    """The height at which the floor is drawn: below the feet, robust to jitter.
 
     Args:
         skeletons: in world, z up.
-        before: metres; None where it is not known.
+        before: the previous height, metres; None for none.
 
     Returns:
-        The height of the lowest tracked ankle or foot if that is lower than before by 3 cm, else what it was before,
-        raised slowly (1 mm a call) while the feet are higher by more than that; None while no foot was ever seen.
+        The lowest tracked ankle or foot if that is more than 3 cm below ``before``; else ``before``, raised by 1 mm
+        while the feet are more than 3 cm above it; None until a foot is seen.
     """
     feet = [each.positions[_FEET, 2][each.valid[_FEET] & (each.states[_FEET] == 2)] for each in skeletons]
     heights = np.concatenate([np.empty(0), *feet])

@@ -1,4 +1,4 @@
-"""What the page is given to show, and what it hands on of what people press; needs no viser."""
+"""Input and callbacks of the page, without viser."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from body_tracking.core.skeleton import FloatArray, Skeleton
 
 
 class PageError(BodyTrackingError):
-    """The page cannot be served, or what was pressed cannot be done."""
+    """Raised when the page cannot be served, or a request cannot be carried out."""
 
 
 class Controls(Protocol):
-    """What people can ask for; each answer is one line to show.
+    """Callbacks for the user's requests; each blocks until it returns one line to show.
 
-    Every method takes as long as its answer, and raises a :class:`BodyTrackingError` with the reason of a refusal.
+    Raises:
+        BodyTrackingError: the request was refused; the text is the reason.
     """
 
     def call(self, service: str) -> str:
         """Call a ``std_srvs/Trigger``."""
 
     def choose_filter(self, name: str) -> str:
-        """Another filter."""
+        """Switch the filter."""
 
     def choose_convention(self, name: str) -> str:
-        """Other angles."""
+        """Switch the convention of the angles."""
 
     def choose_body(self, name: str) -> str:
-        """Another person's angles."""
+        """Switch to another person's angles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +40,8 @@ class Seen:
     """Skeletons of one source.
 
     Attributes:
-        skeletons: those of one instant; none where nothing has come yet.
-        stale: nothing has come for a while.
+        skeletons: of one instant; empty before the first message.
+        stale: the last message is old.
     """
 
     skeletons: tuple[Skeleton, ...] = ()
@@ -49,11 +50,11 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """What is to be shown at one moment.
+    """The content of the scene at one moment.
 
     Attributes:
-        sensors: what each sensor sees, in its own optical frame.
-        poses: of those that are calibrated.
+        sensors: each sensor's skeletons, in its own optical frame.
+        poses: of calibrated sensors.
         fused: in world.
         filtered: in world.
         origins: (n, 3) metres, of the model's segments in world.

@@ -1,4 +1,4 @@
-"""What nodes say of themselves, as a small table for a page."""
+"""The nodes' diagnostics as an HTML table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from body_tracking.messages.node_status import NodeStatus
 
 FRESH: Final = 3.0
-"""Seconds for which what a node said of itself counts; it says so once a second."""
+"""Seconds after which a node counts as silent; nodes publish diagnostics once a second."""
 
 _COLOURS: Final = {0: "#2f9e44", 1: "#f08c00", 2: "#e03131"}
 _SILENT: Final = "#adb5bd"
@@ -27,8 +27,8 @@ def _milliseconds(value: float | None) -> str:
 
 
 def table(statuses: Mapping[str, NodeStatus], now: float) -> str:
-    """HTML: per node its state, its output's rate, delay (from the input's sending), latency (from capture), the last
-    two in the median, and what it says; silent nodes are pale.
+    """HTML: per node its state, output rate, median delay (from the sending of its input), median latency (from
+    capture), and text; silent nodes are pale.
 
     Args:
         statuses: by node name.

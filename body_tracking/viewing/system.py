@@ -1,4 +1,4 @@
-"""What shows the graph: a page in a browser, and markers for RViz and Foxglove."""
+"""The viewers of the graph: a page in a browser, and markers for RViz and Foxglove."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinect.csv_recording import CsvRecording
-from body_tracking.recording.calibrate import WHOLE, relative_yaw
+from body_tracking.recording.calibrate import HISTORY_S, relative_yaw
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
 from draws import draws, some
@@ -70,7 +70,7 @@ def between(result: CalibrationResult) -> tuple[FloatArray, FloatArray]:
 def test_real_pairs_are_calibrated_to_the_taped_marks(shared_data: Path, name: str) -> None:
     """Within 2 degrees in the end; within 3 after at most 15 s of movement, and staying there."""
     path = shared_data / "kinect_pairs" / f"{name}.csv.gz"
-    calibration, updates = run(recording(path), history=WHOLE)
+    calibration, updates = run(recording(path), history=HISTORY_S)
     nominal = NOMINAL[name.split("_")[1]]
     assert np.degrees(relative_yaw(calibration.finish(), "kinect2")) == pytest.approx(nominal, abs=2.0)
     # Task 2, the first with movement, starts after the first long gap.
@@ -92,8 +92,8 @@ def test_a_known_motion_and_clock_are_recovered(shared_data: Path, name: str, of
         stamp = round(seen.stamp_ns * (1.0 + 1e-6 * ppm) + offset * NANOSECONDS)
         return Skeleton(stamp, seen.frame_id, seen.positions @ turn.T + shift, seen.states)
 
-    plain = run(frames, history=WHOLE)[0].finish()
-    moved = run(frames, change, history=WHOLE)[0].finish()
+    plain = run(frames, history=HISTORY_S)[0].finish()
+    moved = run(frames, change, history=HISTORY_S)[0].finish()
     rotation, translation = between(plain)
     found, placed = between(moved)
     expected = rotation @ turn.T

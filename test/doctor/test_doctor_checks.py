@@ -25,7 +25,7 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("variables", "level", "said"),
+    ("variables", "level", "reported"),
     [
         ({}, OK, "ROS domain 0, discovery range SUBNET, other machines: those of the network"),
         ({"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, OK, "7, discovery range LOCALHOST"),
@@ -38,10 +38,10 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
         ({"ROS_DISCOVERY_SERVER": "10.0.0.1:11811"}, WARNING, "10.0.0.1"),
     ],
 )
-def test_variables_that_part_nodes_are_named(variables: dict[str, str], level: str, said: str) -> None:
+def test_variables_that_separate_nodes_are_named(variables: dict[str, str], level: str, reported: str) -> None:
     found = worst(environment.environment(variables))
     assert found[0] == level
-    assert said in found[1]
+    assert reported in found[1]
 
 
 def test_missing_libraries_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +92,7 @@ def test_gaps_and_missing_sensors_of_a_bag_are_named(tmp_path: Path) -> None:
     assert "no skeletons" in found
 
 
-def test_the_exit_code_says_whether_there_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_exit_code_is_nonzero_for_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["doctor", "--bag", str(BAG)]) == 0
     assert "0 problems, 0 warnings" in capsys.readouterr().out
     assert cli.main(["doctor", "--bag", str(tmp_path)]) == 1

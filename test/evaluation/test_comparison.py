@@ -47,7 +47,7 @@ def truth() -> Recorded:
 
 
 def estimate(delay: float = 0.0, noise: float = 0.0, **changed: object) -> Recorded:
-    """What an estimator without bias would say between the truth's frames."""
+    """Unbiased estimates between the truth's frames."""
     stamps_ns = truth().stamps_ns[10:-1:2] + 7_000_000
     zero = int(truth().stamps_ns[0])
     positions = Curve(truth().seconds(zero), truth().positions).at((stamps_ns - zero) / NANOSECONDS - delay)
@@ -115,7 +115,7 @@ def test_frames_that_are_left_out_are_off_track() -> None:
     assert_allclose(evaluate(ended, truth()).comparisons[0].off_track, 0.5, atol=0.05)
 
 
-def test_gaps_of_the_truth_are_told_and_not_filled() -> None:
+def test_gaps_of_the_truth_are_reported_and_not_filled() -> None:
     gappy = truth().positions.copy()
     gappy[100:160, Joint.WRIST_LEFT] = np.nan
     gappy[:, Joint.HEAD] = np.nan
@@ -184,7 +184,7 @@ def test_a_truth_with_a_clock_and_a_frame_of_its_own_is_found_by_its_movement() 
     assert_allclose(aligned.alignment.rotation, TURN, atol=5e-3)
 
 
-def test_who_stands_still_is_aligned_in_space_only_and_needs_a_common_clock() -> None:
+def test_without_motion_alignment_is_in_space_only_and_needs_a_common_clock() -> None:
     still = np.broadcast_to(truth().positions[0], truth().positions.shape)
     mine = estimate(noise=0.01, positions=np.broadcast_to(still[0], (120, N_JOINTS, 3)))
     result = evaluate(mine, replace(truth(), positions=still))
@@ -211,7 +211,7 @@ def test_calibration_is_judged_where_the_person_is() -> None:
     assert_allclose(two.poses.displacement, 0.01 * np.linalg.norm(base[:2]), rtol=1e-3)
 
 
-def test_what_cannot_be_compared_is_told_with_what_was_found() -> None:
+def test_errors_of_a_comparison_name_the_data() -> None:
     late = estimate()
     late = replace(late, stamps_ns=late.stamps_ns + 60 * NANOSECONDS)
     with pytest.raises(

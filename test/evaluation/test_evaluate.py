@@ -1,4 +1,4 @@
-"""``body_tracking evaluate``: what it prints and writes is what is in the bags."""
+"""``body_tracking evaluate``: its output agrees with the bags."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind
     return folder
 
 
-def test_the_table_says_what_was_found(
+def test_the_table_holds_the_results(
     replayed_wave: Path, wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", str(replayed_wave), "--truth", str(wave)]) == 0
@@ -63,12 +63,12 @@ def test_csv_json_and_tables_agree(
 ) -> None:
     numbers = tmp_path / "new" / "numbers.csv"
     assert main(["evaluate", str(replayed_wave), "--csv", str(numbers), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     with numbers.open(encoding="utf-8") as file:
         rows = {(row["table"], row["row"], row["column"]): (row["unit"], row["value"]) for row in csv.DictReader(file)}
-    expected = {("recording", "all", "delay"): ("ms", said["delay_ms"])} | {
+    expected = {("recording", "all", "delay"): ("ms", reported["delay_ms"])} | {
         (key, name, column): (table["units"][column], value)
-        for key, table in said["tables"].items()
+        for key, table in reported["tables"].items()
         for name, columns in table["rows"].items()
         for column, value in columns.items()
     }
@@ -77,7 +77,7 @@ def test_csv_json_and_tables_agree(
         assert rows[where][0] == unit
         assert (value is None) == (rows[where][1] == "")
         assert value is None or float(rows[where][1]) == pytest.approx(value, rel=1e-4, abs=1e-5)
-    assert set(said["tables"]) == {table.key for table in tables(result)}
+    assert set(reported["tables"]) == {table.key for table in tables(result)}
 
 
 def test_the_report_has_every_table_and_picture_in_one_file(
@@ -134,7 +134,7 @@ def test_a_joint_is_off_track_by_the_distance_that_is_given(
         (["{wave}", "--measurements", "{text}"], r"--measurements: of a C3D file; the truth is .*wave"),
     ],
 )
-def test_bad_input_is_told_in_one_line(
+def test_bad_input_is_reported_in_one_line(
     arguments: list[str], message: str, replayed_wave: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = tmp_path / "notes.txt"
@@ -155,15 +155,15 @@ def test_bad_input_is_told_in_one_line(
     assert not captured.out
 
 
-def test_of_several_people_it_is_said_that_the_first_is_compared(
+def test_a_note_says_that_only_the_first_of_several_people_is_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = str(tmp_path / "three")
     assert main(["simulate", "-o", made, "--motion", "standing_still", "--seconds", "2", "--people", "3"]) == 0
     assert main(["evaluate", made, "--topic", "/kinect1/skeleton", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out.partition("\n")[2])["notes"]
+    reported = json.loads(capsys.readouterr().out.partition("\n")[2])["notes"]
     for topic in ("/kinect1/skeleton", "/ground_truth/skeleton"):
-        assert f"{made}: {topic} holds 3 people, only the first is compared" in said
+        assert f"{made}: {topic} holds 3 people, only the first is compared" in reported
 
 
 def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,7 +172,7 @@ def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.C
     assert f"/filtered/skeleton holds {JOINT_STATE}, expected {POINT_CLOUD}" in capsys.readouterr().err
 
 
-def test_markers_are_a_truth_whose_clock_and_frame_are_their_own(
+def test_markers_have_a_clock_and_a_frame_of_their_own(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An estimate that is the markers' own joint centres, elsewhere, at another time, 30 times a second, with noise."""
@@ -191,9 +191,9 @@ def test_markers_are_a_truth_whose_clock_and_frame_are_their_own(
             skeleton = Skeleton(10**12 + number * 33_333_333, "world", positions, states)
             bag.write_message("/filtered/skeleton", skeletons_to_cloud((skeleton,), BAG_MESSAGES), number)
     assert main(["evaluate", str(tmp_path / "estimate"), "--truth", str(file), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert set(said["tables"]) == {"joints_aligned", "angles_aligned", "lengths"} and said["delay_ms"] is None
-    rows = said["tables"]["joints_aligned"]["rows"]
+    reported = json.loads(capsys.readouterr().out)
+    assert set(reported["tables"]) == {"joints_aligned", "angles_aligned", "lengths"} and reported["delay_ms"] is None
+    rows = reported["tables"]["joints_aligned"]["rows"]
     # 10 mm of noise along each axis, less by the lines between the frames; every joint within its own scatter
     assert 10.0 < next(row for name, row in rows.items() if name.startswith("all"))["rms"] < 20.0
     assert rows["WristLeft"]["jitter"] == pytest.approx(10.0, rel=0.3)

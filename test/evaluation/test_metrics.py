@@ -99,7 +99,7 @@ def test_an_estimate_is_interpolated_linearly_and_not_across_gaps() -> None:
 
 @settings(deadline=None, max_examples=12)
 @given(delay=st.floats(-0.3, 0.3), turn=st.floats(-3.0, 3.0), seed=st.integers(0, 1000))
-def test_delay_and_place_are_recovered_whatever_the_frames_and_offsets(delay: float, turn: float, seed: int) -> None:
+def test_delay_and_transform_are_recovered_for_any_frames_and_offsets(delay: float, turn: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, truth().span[1], 400))
     shift = Rotation.from_euler("zyx", [turn, 0.3, -0.2]).as_matrix()
@@ -122,7 +122,7 @@ def test_noise_and_missing_joints_do_not_bias_the_delay() -> None:
     assert find_delay(Trajectory(times, positions), truth()) == pytest.approx(0.02, abs=0.004)
 
 
-def test_who_stands_still_or_is_later_than_searched_shows_no_delay() -> None:
+def test_no_delay_without_motion_or_beyond_the_search_window() -> None:
     times, positions = samples()
     still = np.broadcast_to(positions[0], positions.shape)
     assert np.isnan(find_delay(Trajectory(times, still + noise(still.shape, 0.01)), Curve(times, still)))
@@ -143,7 +143,7 @@ def test_points_on_a_line_have_no_alignment() -> None:
 # --- joints
 
 
-def test_errors_are_what_was_added() -> None:
+def test_added_errors_are_measured() -> None:
     _, true = samples()
     added = noise(true.shape, 0.02)
     errors = joint_errors(true + added, true)
@@ -169,7 +169,7 @@ def test_an_offset_that_turns_with_the_segment_is_taken_off_and_one_of_the_room_
 
 
 @given(st.floats(0.0, 0.9), st.integers(0, 100))
-def test_only_what_both_know_is_compared(share: float, seed: int) -> None:
+def test_only_positions_known_in_both_are_compared(share: float, seed: int) -> None:
     true = samples()[1][::10]
     rng = np.random.default_rng(seed)
     found = true + noise(true.shape, 0.02, seed)
@@ -206,7 +206,7 @@ def test_jitter_is_the_white_noise_that_was_added_and_nothing_else() -> None:
     assert jitter(times, late, true).max() < 4e-4
 
 
-def test_jitter_leaves_out_what_lies_across_a_gap() -> None:
+def test_jitter_ignores_differences_across_a_gap() -> None:
     times = grid(0.0, 10.0, 30.0)
     kept = np.random.default_rng(0).random(len(times)) < 0.8
     position = np.broadcast_to((50.0 * np.sin(3.0 * times))[:, None, None], (len(times), 1, 3))
@@ -220,7 +220,7 @@ def test_a_joint_is_off_track_where_it_is_missing_or_far() -> None:
     found = true.copy()
     found[:3, 0] = np.nan
     found[3:5, 0, 2] = 0.2
-    true[0, 1] = np.nan  # nothing to say there
+    true[0, 1] = np.nan  # unknown
     found[1:4, 1] = np.nan
     assert_allclose(off_track(found, true, 0.15), [0.5, 3 / 9])
 

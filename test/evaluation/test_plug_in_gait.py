@@ -69,7 +69,7 @@ def at_angle(axis: FloatArray, towards: FloatArray, component: float, hint: Floa
 def arm_markers(
     side: int, shoulder: FloatArray, elbow: FloatArray, wrist: FloatArray, hand: FloatArray
 ) -> dict[str, FloatArray]:
-    """Where the markers of an arm are whose joint centres are these, from what the chord function demands of them.
+    """Markers of an arm with these joint centres, by inverting the chord function.
 
     The thorax stands at the origin of the world, with its axes.
     """
@@ -387,7 +387,7 @@ def assert_same_joints(truth: MarkerTruth, joints: FloatArray, tolerance: float 
 
 
 @pytest.mark.parametrize(("prefix", "unit_of_length"), [("", "mm"), ("Anna:", "mm"), ("", "m"), ("", "cm")])
-def test_a_file_tells_the_joint_centres(tmp_path: Path, prefix: str, unit_of_length: str) -> None:
+def test_joint_centres_are_read_from_a_file(tmp_path: Path, prefix: str, unit_of_length: str) -> None:
     markers, joints = moving()
     path = write(tmp_path / "a.c3d", markers, prefix=prefix, unit=unit_of_length, parameters=PARAMETERS)
     truth = read_plug_in_gait(path, smoothing=False)
@@ -400,7 +400,7 @@ def test_a_file_tells_the_joint_centres(tmp_path: Path, prefix: str, unit_of_len
 
 
 @pytest.mark.parametrize(("up", "order"), [("+Y", (1, 2, 0)), ("+X", (2, 0, 1))])
-def test_what_points_up_in_the_file_is_z(tmp_path: Path, up: str, order: tuple[int, ...]) -> None:
+def test_the_vertical_axis_of_the_file_becomes_z(tmp_path: Path, up: str, order: tuple[int, ...]) -> None:
     markers, joints = moving(20)
     path = write(
         tmp_path / "a.c3d",
@@ -427,7 +427,7 @@ def test_points_that_are_not_seen_are_gaps(tmp_path: Path) -> None:
     assert np.isfinite(truth.positions[10:40, Joint.SHOULDER_LEFT]).all()
 
 
-def test_what_missing_markers_inform_stays_unknown(tmp_path: Path) -> None:
+def test_joints_of_missing_markers_are_unknown(tmp_path: Path) -> None:
     markers, joints = moving(20)
     for name in ("LFIN", "RPSI", "RELB", "LBHD"):
         del markers[name]
@@ -449,7 +449,7 @@ def test_the_sacrum_stands_in_for_the_posterior_spines(tmp_path: Path) -> None:
     assert one.positions == pytest.approx(both.positions, abs=1e-6, nan_ok=True)
 
 
-def test_measurements_that_nobody_made_are_estimated_and_named(tmp_path: Path) -> None:
+def test_missing_measurements_are_estimated_and_named(tmp_path: Path) -> None:
     markers, _ = moving(20)
     given_in_part = {"LElbowWidth": 80.0, "RElbowWidth": 86.0, "LShoulderOffset": 45.0, "RWristWidth": 0.0}
     truth = read_plug_in_gait(write(tmp_path / "a.c3d", markers, parameters=given_in_part))
@@ -507,7 +507,7 @@ def test_two_points_of_one_name_are_refused(tmp_path: Path) -> None:
         read_plug_in_gait(path)
 
 
-def test_what_is_no_readable_recording_is_refused(tmp_path: Path) -> None:
+def test_unreadable_recordings_are_refused(tmp_path: Path) -> None:
     markers, _ = moving(20)
     whole = write(tmp_path / "whole.c3d", markers).read_bytes()
     contents = {

@@ -63,7 +63,7 @@ def test_frames_move_no_faster_than_people_do() -> None:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_what_the_forearm_carries_stays_in_its_frame_however_the_elbow_bends(side: str) -> None:
+def test_points_on_the_forearm_are_fixed_in_its_frame_for_any_elbow_flexion(side: str) -> None:
     model = UpperBody()
     bent = np.zeros((20, model.nv))
     bent[:, model.coordinate_names.index(f"elbow_flexion_{side}")] = np.linspace(0.0, 2.4, len(bent))

@@ -1,4 +1,4 @@
-"""The numbers of a recording: what the table says is what is in the bag."""
+"""The table of a recording agrees with the bag."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wave as one sensor at its true place would track it, which has white noise only, with the truth beside."""
+    """The wave as one sensor at its true place would track it, which has white noise only, with the truth."""
     noisy = replace(KinectErrors.none(), white=0.001)
     recording = simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=noisy))
     sensor = recording.sensors[0]
@@ -78,7 +78,7 @@ def bare(folder: Path) -> Path:
     return folder
 
 
-def test_a_summary_leaves_out_what_is_unknown() -> None:
+def test_a_summary_ignores_unknown_angles() -> None:
     row = summary(series([10.0, 170.0, 30.0, 20.0], [1.0, np.inf, 2.0, 3.0])).row("knee")
     assert row == pytest.approx({"min": 10.0, "max": 30.0, "final": 20.0, "stddev": 2.5, "known": 75.0})
 
@@ -124,7 +124,7 @@ def test_a_bag_without_truth_or_skeletons_is_shown_all_the_same(tmp_path: Path) 
     assert (tmp_path / "bare.png").read_bytes().startswith(PNG)
 
 
-def test_bags_that_hold_no_angles_are_told_in_one_line(tmp_path: Path, tracked_bag: Path) -> None:
+def test_bags_without_angles_are_reported_in_one_line(tmp_path: Path, tracked_bag: Path) -> None:
     with pytest.raises(EvaluationError, match="holds no joint angles"):
         read(BAGS / "tpose_wave")
     with pytest.raises(EvaluationError, match="no joint angles of 'bob'"):
@@ -137,7 +137,7 @@ def test_bags_that_hold_no_angles_are_told_in_one_line(tmp_path: Path, tracked_b
 
 
 def test_the_truth_may_be_in_the_bag_that_was_played(replayed_wave: Path, wave: Path, tmp_path: Path) -> None:
-    """Recordings of the live graph hold angles, not what a simulation knew."""
+    """Recordings of the live graph hold angles without ground truth."""
     table = summarise(replayed_wave, truth=wave)
     assert table.text() == summarise(replayed_wave).text()  # replay takes the truth along
     elbow = table.row("elbow_flexion_left")

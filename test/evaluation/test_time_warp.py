@@ -102,7 +102,7 @@ def test_bias_and_debiased_rms_make_up_the_rms(values: list[tuple[float, float]]
     assert other.debiased_rms == pytest.approx(one.debiased_rms, abs=1e-6)
 
 
-def test_only_what_both_have_is_compared() -> None:
+def test_only_common_samples_are_compared() -> None:
     reference = np.array([1.0, 2.0, 3.0, np.nan, 5.0])
     estimate = np.array([2.0, np.nan, 6.0, 8.0, 10.0])
     agreement = time_warp.compare(estimate, reference)

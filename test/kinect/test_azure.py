@@ -72,7 +72,7 @@ def test_left_is_left_and_the_order_along_the_body_is_that_of_the_kinect_v2() ->
 
 @settings(max_examples=50, deadline=None)
 @given(st.permutations(range(64)), st.integers(0, 2**24), st.integers(1, 100))
-def test_bodies_are_told_apart_in_any_order_of_markers(order: list[int], body: int, more: int) -> None:
+def test_bodies_are_separated_in_any_order_of_markers(order: list[int], body: int, more: int) -> None:
     first, second = upright(), upright(1.6) + [0.8, 0.0, 0.5]
     all_ids = np.array(ids(body) + ids(body + more))[order]
     got = bodies_of(all_ids.tolist(), np.concatenate([first, second])[order], 5, "f")
@@ -81,7 +81,7 @@ def test_bodies_are_told_apart_in_any_order_of_markers(order: list[int], body: i
     np.testing.assert_array_equal(got[1].positions, one(second).positions)
 
 
-def test_what_is_missing_or_no_number_is_not_tracked() -> None:
+def test_missing_and_nonfinite_joints_are_not_tracked() -> None:
     points = upright()
     points[AzureJoint.HEAD] = np.nan
     points[AzureJoint.SPINE_CHEST, 1] = 1e9
@@ -96,7 +96,7 @@ def test_what_is_missing_or_no_number_is_not_tracked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given_ids", "said"),
+    ("given_ids", "reported"),
     [
         ([100, 132], "marker 132, expected"),
         ([-1, 100], "marker -1, expected"),
@@ -104,6 +104,6 @@ def test_what_is_missing_or_no_number_is_not_tracked() -> None:
         ([100 * k for k in range(65)], "65 bodies"),
     ],
 )
-def test_markers_that_are_no_bodies_are_refused(given_ids: list[int], said: str) -> None:
-    with pytest.raises(BodyTrackingError, match=said):
+def test_markers_that_are_no_bodies_are_refused(given_ids: list[int], reported: str) -> None:
+    with pytest.raises(BodyTrackingError, match=reported):
         bodies_of(given_ids, np.zeros((len(given_ids), 3)), 5, "f")

@@ -1,4 +1,4 @@
-"""CSV recordings: what is in the file is what comes out, and what is wrong in it is named."""
+"""CSV recordings are read completely, and errors in them are named."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_windows_line_ends_quotes_and_empty_lines(tmp_path):
     assert [frame.skeletons[0].stamp_ns for frame in CsvRecording(path, "a")] == [0, 10**9]
 
 
-# --- what is wrong
+# --- errors
 
 
 def cell(name: str, text: str, line: int = 3) -> Callable[[list[str]], str]:
@@ -174,7 +174,7 @@ WRONG: list[tuple[Callable[[list[str]], str | bytes], str]] = [
 
 
 @pytest.mark.parametrize(("change", "text"), WRONG)
-def test_what_is_wrong_is_named_with_its_line(tmp_path, change, text):
+def test_errors_name_the_line(tmp_path, change, text):
     good = row("0", received="0", person="0", sensor="a", Head_state="2")
     path = write_csv(tmp_path / "a.csv", [good] * (3000 if "2502" in text else 3))
     changed = change(path.read_text().splitlines())

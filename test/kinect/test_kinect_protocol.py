@@ -104,7 +104,7 @@ def test_another_key_does_not_do(key: bytes) -> None:
         protocol.check_signature(packet, key)
 
 
-def test_who_has_the_key_still_cannot_send_nonsense() -> None:
+def test_signed_packets_with_invalid_content_are_refused() -> None:
     packet = protocol.pack_frame(Frame(11, (body(0), body(1))), HEADER, KEY)
     with pytest.raises(ProtocolError, match=f"more than {protocol.MAX_PACKET} bytes"):
         protocol.read_header(packet + bytes(protocol.MAX_PACKET))
@@ -133,7 +133,7 @@ def test_names_that_are_none(name: str) -> None:
         protocol.sensor_bytes(name)
 
 
-def test_what_cannot_be_written() -> None:
+def test_invalid_content_is_not_packed() -> None:
     with pytest.raises(ProtocolError, match="7 bodies"):
         protocol.pack_frame(Frame(0, tuple(body(k % 6) for k in range(7))), HEADER, KEY)
     with pytest.raises(ProtocolError, match="24 joints"):

@@ -62,12 +62,14 @@ INSTALLED = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "said"), [*ALONE, *INSTALLED])
-def test_what_is_missing_or_wrong_is_said_in_one_line(alone: list[str], arguments: list[str], said: str) -> None:
-    done = run(alone if (arguments, said) in ALONE else COMMAND, *arguments)
+@pytest.mark.parametrize(("arguments", "reported"), [*ALONE, *INSTALLED])
+def test_missing_or_invalid_input_is_reported_in_one_line(
+    alone: list[str], arguments: list[str], reported: str
+) -> None:
+    done = run(alone if (arguments, reported) in ALONE else COMMAND, *arguments)
     assert done.returncode == 2
     assert done.stderr.startswith("kinect_sender: ") and done.stderr.count("\n") == 1
-    assert said in done.stderr
+    assert reported in done.stderr
 
 
 def test_a_recording_comes_through_as_it_is_and_the_sender_survives_the_receiver(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Who receives skeletons over the network: takes what it should, refuses all else, and is not disturbed by it."""
+"""The network receiver accepts valid packets, and refuses all others without side effects."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_lost_frames_are_counted_and_late_ones_are_not_used() -> None:
     assert receiver.counters["accepted"] == before + 9
 
 
-def test_nobody_in_view_keeps_the_stream_alive_and_a_silent_sensor_is_named() -> None:
+def test_frames_without_bodies_keep_the_stream_alive_and_a_silent_sensor_is_reported() -> None:
     receiver, partner, now = settled()
     result = partner.give(partner.frame(now, ()), now)
     assert result is not None
@@ -104,7 +104,7 @@ def test_a_sender_that_is_started_anew_is_taken_once_it_answers() -> None:
     assert all(got[1:])
     stamps = [each.stamp_ns for each in got if each is not None]
     assert np.abs(np.array(stamps) - now - FRAME_NS * np.arange(1, 10)).max() < 100_000
-    # what the old one still has in flight does not count
+    # packets of the old sender in flight do not count
     assert receiver.take(old.frame(now), old.address, now, now) is None
     assert receiver.counters["sessions"] == 2
 
@@ -132,7 +132,7 @@ def test_nothing_that_was_recorded_is_taken_even_by_a_receiver_that_was_started_
         for k, packet in enumerate(recorded):
             at = now + NANOSECONDS + k * 20_000_000
             assert receiver_now.take(packet, partner.address, at, at) is None
-            receiver_now.outgoing.clear()  # whoever recorded cannot answer
+            receiver_now.outgoing.clear()  # a replaying attacker cannot answer
     assert receiver.counters["accepted"] == before
     assert receiver.counters["sessions"] == 1
 
@@ -380,7 +380,7 @@ def test_coordinates_are_those_of_the_optical_frame_and_damaged_ones_are_not_tra
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "reported"),
     [
         ({"address": "0.0.0.0"}, "needs the parameter 'key_file'"),
         ({"address": "192.0.2.7"}, "needs the parameter 'key_file'"),
@@ -389,8 +389,8 @@ def test_coordinates_are_those_of_the_optical_frame_and_damaged_ones_are_not_tra
         ({"device": "a/b"}, "sensor name 'a/b'"),
     ],
 )
-def test_what_is_not_safe_or_not_there_is_refused(settings: dict[str, str], said: str) -> None:
-    with pytest.raises(BodyTrackingError, match=said):
+def test_unsafe_or_unavailable_settings_are_refused(settings: dict[str, str], reported: str) -> None:
+    with pytest.raises(BodyTrackingError, match=reported):
         open_network(**settings)
 
 

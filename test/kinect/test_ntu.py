@@ -31,7 +31,7 @@ def write(path: Path, text: str) -> Path:
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.lists(st.integers(FIRST_ID, FIRST_ID + 4), max_size=3, unique=True), min_size=1, max_size=6))
-def test_what_is_in_the_file_comes_out(tmp_path_factory, sequence):
+def test_the_whole_content_of_the_file_is_read(tmp_path_factory, sequence):
     generator = np.random.default_rng(0)
     frames = [bodies(generator, *identities) for identities in sequence]
     path = write(tmp_path_factory.mktemp("ntu") / NAME, skeleton_text(frames))
@@ -101,7 +101,7 @@ def test_a_file_cut_anywhere_is_refused_or_read_up_to_its_last_whole_frame(tmp_p
         (lambda lines: [*lines, "1"], "goes on after the last of 2 frames"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(tmp_path, change, text):
+def test_errors_name_the_line(tmp_path, change, text):
     generator = np.random.default_rng(0)
     lines = skeleton_text([bodies(generator, 1), bodies(generator, 1)]).splitlines()
     path = write(tmp_path / NAME, "".join(f"{line}\n" for line in change(lines)))
@@ -110,7 +110,7 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path, change, text):
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
-def test_what_is_no_text_is_one_line(tmp_path):
+def test_binary_files_are_refused_in_one_line(tmp_path):
     path = tmp_path / NAME
     path.write_bytes(bytes(range(256)))
     with pytest.raises(NtuError, match="not a text file"):

@@ -1,4 +1,4 @@
-"""Laws of remote clocks: what round trips and delays tell, and that stamps never run backwards."""
+"""Laws of remote clocks: offsets from round trips and delays, and monotonic stamps."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_with_jitter_the_offset_errs_by_less_than_half_the_shortest_round_trip(
     assert abs(trips.offset_ns(remote) - true_offset(local, offset, drift)) < shortest / 2 + MS // 2
 
 
-def test_equal_ways_tell_the_offset_exactly_and_drift_is_followed() -> None:
+def test_with_equal_delays_the_offset_is_exact_and_drift_is_followed() -> None:
     trips = RoundTrips()
     for k in range(400):
         ask(trips, k * NANOSECONDS // 4, 300 * MS, 80e-6, 2 * MS, 2 * MS)
@@ -111,7 +111,7 @@ def test_impossible_round_trips_do_not_count(times: tuple[int, int, int, int]) -
 # --- stamps
 
 
-def test_stamps_keep_the_distances_of_the_sensor_whatever_the_delay_of_its_frames() -> None:
+def test_stamps_keep_the_sensors_intervals_for_any_delay_of_the_frames() -> None:
     numbers = np.random.default_rng(1)
     clock = CaptureClock()
     stamps, captures = [], []
@@ -121,7 +121,7 @@ def test_stamps_keep_the_distances_of_the_sensor_whatever_the_delay_of_its_frame
         stamps.append(clock.stamp(captured - 7 * NANOSECONDS, captured + delay, 300 * MS))
         captures.append(captured + 300 * MS)
     late = np.array(stamps) - np.array(captures)
-    # by the shortest delay, which nothing tells; it is found within seconds
+    # by the shortest delay, which is unobservable; it is reached within seconds
     assert np.abs(late[150:] - 20 * MS).max() < 1 * MS
     assert np.ptp(np.diff(stamps)[150:]) <= 2 * FRAME_NS // 100
 
@@ -166,7 +166,7 @@ def test_stamps_never_run_backwards(seed: int, drift: float, chance: float) -> N
         (100 * FRAME_NS, -3600 * NANOSECONDS, -3600 * NANOSECONDS),  # where this computer's clock is set back
     ],
 )
-def test_stamps_follow_what_is_set_anew(counted_ns: int, offset_ns: int, expected_ns: int) -> None:
+def test_stamps_follow_a_clock_that_is_set(counted_ns: int, offset_ns: int, expected_ns: int) -> None:
     clock = CaptureClock(20 * MS)
     for k in range(100):
         assert clock.stamp(k * FRAME_NS, k * FRAME_NS + 20 * MS, 0) == k * FRAME_NS  # the least delay is taken off

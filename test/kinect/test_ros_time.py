@@ -13,7 +13,7 @@ LEAST_NS = 4_000_000
 
 
 @pytest.mark.parametrize("wrong_s", [-59.0, 0.0, 30.0])
-def test_a_host_whose_clock_is_wrong_by_less_than_a_minute_is_left_to_calibration(wrong_s: float) -> None:
+def test_stamps_within_a_minute_of_receipt_are_unchanged(wrong_s: float) -> None:
     stamp_ns = NOW_NS + round(wrong_s * NANOSECONDS)
     assert RosTime().stamp(stamp_ns, NOW_NS) == stamp_ns
 

@@ -1,4 +1,4 @@
-"""Import: what a recording holds is what the bag holds, in time order, or there is no bag."""
+"""An import writes the whole recording in time order, or no bag."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_import_and_info_as_json_and_for_people(tmp_path, capsys):
     assert "/kinect1/skeleton" in out and "best_effort" in out and "4" in out
 
 
-def test_a_cut_recording_is_told_of_and_closed(tmp_path, capsys):
+def test_a_truncated_recording_is_reported_and_closed(tmp_path, capsys):
     rows = [csv_row(index / 30, index * 0.123) for index in range(3000)]
     import_files([write_csv(tmp_path / "a.csv", rows)], tmp_path / "bag")
     path = next((tmp_path / "bag").glob("*.mcap"))
@@ -188,7 +188,7 @@ def test_a_cut_recording_is_told_of_and_closed(tmp_path, capsys):
         (["bag", "recover", "taken"], "no mcap file"),
     ],
 )
-def test_what_is_wrong_is_one_line(tmp_path, monkeypatch, capsys, arguments, text):
+def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, text):
     monkeypatch.chdir(tmp_path)
     for name in "ab":
         frames(tmp_path / f"{name}.csv", 0)

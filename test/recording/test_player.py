@@ -106,7 +106,7 @@ def test_the_clock_ticks_by_the_steady_clock_or_comes_with_messages_only(reader,
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, SECOND), st.integers(0, 5 * SECOND))
-def test_a_pause_moves_what_follows_by_its_length(reader, stored, begin, length):
+def test_a_pause_delays_later_messages_by_its_length(reader, stored, begin, length):
     run = Run(Playback(reader))
     run.until(NOW + begin)
     before = len(run.sent)
@@ -174,7 +174,7 @@ def test_start_offset_and_selection_of_topics(reader, stored):
     assert run.stored == [item for item in stored if item[0] != "/number"]
 
 
-def test_catching_up_is_interrupted_for_whoever_wants_to_pause(tmp_path):
+def test_a_pause_interrupts_catching_up(tmp_path):
     many = [(topic, cdr, 0) for topic, cdr, _ in messages(1000)]
     write(tmp_path / "bag", many)
     with BagReader(tmp_path / "bag") as reader:
@@ -199,7 +199,7 @@ def test_catching_up_is_interrupted_for_whoever_wants_to_pause(tmp_path):
         ({"topics": ["/absent"]}, "/absent"),
     ],
 )
-def test_what_cannot_be_played_is_an_error(reader, options, text):
+def test_invalid_options_are_an_error(reader, options, text):
     with pytest.raises(BagError, match=text):
         Playback(reader, **options)
     with pytest.raises(BagError):

@@ -121,7 +121,7 @@ class Owner:
             file.write(f"{os.getpid()}\n")
 
 
-def test_the_other_process_does_not_take_down_what_it_inherits(
+def test_the_other_process_does_not_collect_inherited_garbage(
     wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Collecting(Downstream):
@@ -149,7 +149,7 @@ def job(out: Path, **settings: str) -> forked.Job:
     return forked.Job(chosen.values(), out, {}, overwrite=False, model_covariance=False)
 
 
-def test_the_end_of_the_other_process_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_the_other_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Ending(Downstream):
         def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
             time.sleep(0.2)  # until more has come, which stays unread
@@ -173,7 +173,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     return out
 
 
-def test_the_extended_filter_tells_all_of_its_state(extended: Path, replayed_wave: Path, wave: Path) -> None:
+def test_the_extended_filter_publishes_its_whole_state(extended: Path, replayed_wave: Path, wave: Path) -> None:
     with BagReader(extended) as bag, BagReader(replayed_wave) as linear:
         counts = {topic: info.count for topic, info in bag.topics.items()}
         assert not set(MODEL_TOPICS) & set(linear.topics)
@@ -266,7 +266,7 @@ def test_the_angles_follow_the_truth(replayed_wave: Path, tmp_path: Path) -> Non
         assert np.corrcoef(found[known], truth[known])[0, 1] > 0.8
 
 
-def test_the_command_ends_with_what_it_did(wave: Path, tmp_path: Path, command: Command) -> None:
+def test_the_command_prints_a_report(wave: Path, tmp_path: Path, command: Command) -> None:
     words = ("replay", wave, "-o", tmp_path / "out", "--filter", "lkf_zero_velocity", "--json")
     code, shown, error = command(*words)
     assert code == 0, error
@@ -342,7 +342,7 @@ def test_a_bag_without_skeletons_is_named_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_failure_of_the_second_stage_is_told_and_leaves_no_bag(tmp_path: Path) -> None:
+def test_a_failure_of_the_second_half_is_reported_and_leaves_no_bag(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for stage in (Downstream, ForkedDownstream):
         with pytest.raises(BagError):
@@ -408,7 +408,7 @@ def test_where_one_process_is_killed_the_other_ends_and_leaves_no_bag(tmp_path: 
             writers = reader.children()
             time.sleep(0.01)
         (writers[0] if victim == "writer" else reader).kill()
-        _, said = reader.communicate(timeout=60.0)
+        _, reported = reader.communicate(timeout=60.0)
         while out.exists():
             assert time.monotonic() < deadline
             time.sleep(0.01)
@@ -418,7 +418,7 @@ def test_where_one_process_is_killed_the_other_ends_and_leaves_no_bag(tmp_path: 
                 process.kill()
     if victim == "writer":
         assert reader.returncode == 2
-        assert said.count(b"\n") == 1
+        assert reported.count(b"\n") == 1
 
 
 def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Command) -> None:
@@ -433,10 +433,10 @@ def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Co
     ):
         file = tmp_path / "parameters.yaml"
         file.write_text(text)
-        code, _, said = command("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
+        code, _, reported = command("replay", BAG, "-o", tmp_path / "out", "--params-file", file)
         assert code == 2
-        assert message in said
-        assert said.count("\n") == 1
+        assert message in reported
+        assert reported.count("\n") == 1
     assert command("replay", BAG, "-o", tmp_path / "out", "--filter", "ukf")[0] == 2
     assert "kinect7" in command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")[2]
 

@@ -58,12 +58,12 @@ def test_a_recording_of_joint_angles_is_shown_and_compared(
     replayed_wave: Path, named: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     in_namespace = copied(replayed_wave, tmp_path / replayed_wave.name, "/lab")
-    said = []
+    reported = []
     for bag in (replayed_wave, in_namespace):
         for command in ("show", "evaluate"):
             assert cli.main([command, str(bag)]) == 0
-        said.append(capsys.readouterr().out.replace(str(bag.parent), ""))
-    assert said[0] == said[1]
+        reported.append(capsys.readouterr().out.replace(str(bag.parent), ""))
+    assert reported[0] == reported[1]
     assert cli.main(["calibrate", str(named)]) == 0
     assert "kinect2" in capsys.readouterr().out
 
@@ -80,6 +80,6 @@ def test_two_rigs_in_one_bag_are_not_mixed(wave: Path, tmp_path: Path, capsys: p
         assert rig.namespace == "/"
         assert rig.topics == reader.topics
     assert cli.main(["replay", str(both), "-o", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "no topic /<sensor>/skeleton" in said
-    assert "/left/kinect1/skeleton" in said and "/right/kinect1/skeleton" in said
+    reported = capsys.readouterr().err
+    assert "no topic /<sensor>/skeleton" in reported
+    assert "/left/kinect1/skeleton" in reported and "/right/kinect1/skeleton" in reported

@@ -1,4 +1,4 @@
-"""Bags: what is written is read, by us and by others, and nothing that breaks a file breaks the reader."""
+"""Written bags are read by this reader and by others, and damaged files do not break the reader."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def rosbags_read(path: Path) -> list[Stored]:
 
 @settings(max_examples=draws(20, 40), deadline=None)
 @given(contents, st.sampled_from(["zstd", "lz4", "none"]), st.sampled_from([100, 10_000]))
-def test_what_is_written_is_read_in_the_order_of_log_times(drawn, compression, chunk_bytes):
+def test_messages_are_read_in_the_order_of_log_times(drawn, compression, chunk_bytes):
     stored = [(topic, serialize(message(topic, text, number)), at) for topic, text, number, at in drawn]
     expected = sorted(stored, key=lambda item: item[2])
     with tempfile.TemporaryDirectory() as folder:
@@ -85,7 +85,7 @@ def test_selection_of_topics_and_start(tmp_path):
 
 
 @pytest.mark.parametrize("version", [8, 9])
-def test_rosbags_and_we_read_what_the_other_writes(tmp_path, version):
+def test_bags_are_exchangeable_with_rosbags(tmp_path, version):
     stored = messages(100)
     write(tmp_path / "ours", stored, chunk_bytes=1000)
     endless = QosTime(9223372036, 854775807)
@@ -247,7 +247,7 @@ def test_a_bag_is_continued_in_its_next_file(tmp_path):
     assert [file["message_count"] for file in information["files"]] == [30, 30, 30]
 
 
-def test_continuing_closes_what_was_cut_off(tmp_path):
+def test_resuming_closes_truncated_files(tmp_path):
     stored = messages(90)
     first = write(tmp_path / "bag", stored[:60], chunk_bytes=500)
     first.write_bytes(first.read_bytes()[:-700])
@@ -260,7 +260,7 @@ def test_continuing_closes_what_was_cut_off(tmp_path):
         assert reader.warnings == []
 
 
-def test_what_the_listing_leaves_out_or_has_too_much_is_named(tmp_path):
+def test_unlisted_and_missing_files_are_reported(tmp_path):
     stored = messages(60)
     write(tmp_path / "bag", stored[:30])
     metadata = tmp_path / "bag" / "metadata.yaml"
@@ -332,7 +332,7 @@ def test_a_cut_file_is_closed_without_losing_a_message(tmp_path):
         (folder / "metadata.yaml").unlink()
 
 
-def test_what_is_missing_of_a_cut_chunk_is_said(tmp_path):
+def test_the_missing_part_of_a_truncated_chunk_is_reported(tmp_path):
     stored = messages(40)
     path = write(tmp_path / "bag", stored, chunk_bytes=10_000, compression="none")
     data = path.read_bytes()
@@ -340,7 +340,7 @@ def test_what_is_missing_of_a_cut_chunk_is_said(tmp_path):
     path.write_bytes(data[: cut + 3])
     with BagReader(path) as reader:
         assert reader.message_count == 20
-        # The chunk's own header tells that it went on for 200 ms.
+        # The chunk's own header has its end 200 ms later.
         assert "0.200 s of recording" in reader.warnings[0] and "20 message(s)" in reader.warnings[0]
 
 
@@ -404,7 +404,7 @@ def test_any_bytes_after_the_magic_are_no_crash(head, data):
             assert "nothing in it can be read" in str(error)
 
 
-def test_what_is_no_recording_is_one_line(tmp_path):
+def test_files_that_are_no_recordings_are_refused_in_one_line(tmp_path):
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("no recording at all")
     (tmp_path / "folder").mkdir()
@@ -452,7 +452,7 @@ def test_two_writers_do_not_share_a_bag(tmp_path):
             recover(tmp_path / "bag")
 
 
-def test_what_cannot_be_written_is_an_error(tmp_path):
+def test_failed_writes_are_an_error(tmp_path):
     cdr = serialize(message("/text", "a", 0.0))
     with BagWriter(tmp_path / "bag") as writer:
         with pytest.raises(BagError, match="my_msgs/msg/Own"):
@@ -475,7 +475,7 @@ def test_what_cannot_be_written_is_an_error(tmp_path):
         deserialize("std_msgs/msg/Float64", cdr[:6])
 
 
-def test_an_unfinished_bag_holds_what_was_flushed(tmp_path):
+def test_an_unfinished_bag_has_the_flushed_messages(tmp_path):
     stored = messages(10)
     for interval_s, held in ((3600.0, 0), (0.0, 10)):
         path = tmp_path / f"bag{held}"

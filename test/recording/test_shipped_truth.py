@@ -1,4 +1,4 @@
-"""The shipped recordings against the truth in them: what a new user sees first is right."""
+"""The shipped recordings against the truth in them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def errors(found: Tracked) -> tuple[FloatArray, FloatArray, list[str]]:
 
 
 @pytest.mark.parametrize("name", some(list(reversed(SHIPPED))))
-def test_no_angle_of_the_default_filter_is_wrong_by_what_it_does_not_say(name: str, tmp_path: Path) -> None:
+def test_errors_of_the_default_filter_are_within_three_standard_deviations(name: str, tmp_path: Path) -> None:
     away, stddev, names = errors(tracked(_BAGS / name, DEFAULT_FILTER, tmp_path))
     known = np.isfinite(stddev)
     assert (np.abs(away)[known] <= 3.0 * stddev[known]).all()
@@ -48,7 +48,7 @@ def test_no_angle_of_the_default_filter_is_wrong_by_what_it_does_not_say(name: s
 
 
 @pytest.mark.parametrize("name", ["excerpt", *(pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED)])
-def test_the_extended_filter_states_every_angle_and_folds_nobody(name: str, wave: Path, tmp_path: Path) -> None:
+def test_the_extended_filter_states_every_angle_and_keeps_the_posture(name: str, wave: Path, tmp_path: Path) -> None:
     """Upright people: trunk and spine within 15 degrees RMS, and a finite deviation on all in 99 % of the frames."""
     found = tracked(wave if name == "excerpt" else _BAGS / name, "ekf", tmp_path)
     assert np.isfinite(found.angles.stddev).all(axis=1).mean() > 0.99

@@ -75,7 +75,7 @@ def test_frames_are_due_when_they_were_received_then() -> None:
         assert time.time() >= received - 1e-3
 
 
-def test_one_that_is_started_again_goes_on_where_it_should_be() -> None:
+def test_a_restarted_source_continues_at_the_present_position() -> None:
     start = time.time() - 5.0
     source = RecordingSource(SourceSettings("kinect1", file=str(BAG), start_time=start))
     assert played(source.read(2.0))[1] / NANOSECONDS - start > 4.0
@@ -135,7 +135,7 @@ def test_closing_ends_a_read_in_another_thread() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "reported"),
     [
         (SourceSettings("kinect1"), "needs the parameter 'file'"),
         (SourceSettings("kinect1", file="nowhere.csv"), "nowhere.csv"),
@@ -144,8 +144,8 @@ def test_closing_ends_a_read_in_another_thread() -> None:
         (SourceSettings("kinect1", file=str(BAG), rate=0.0), "rate 0.0"),
     ],
 )
-def test_what_cannot_be_played(settings: SourceSettings, said: str) -> None:
-    with pytest.raises(BodyTrackingError, match=said):
+def test_unplayable_recordings_are_an_error(settings: SourceSettings, reported: str) -> None:
+    with pytest.raises(BodyTrackingError, match=reported):
         open_source("recording", settings)
     assert "recording" in backends()
     with pytest.raises(BodyTrackingError, match="unknown backend 'xbox'"):

@@ -77,7 +77,7 @@ def test_ros_time_stays_as_it_is_however_wrong_within_a_minute() -> None:
     assert clock.to_ros(1234567890123456789, EPOCH_NS) == 1234567890123456789
 
 
-def test_a_log_that_was_not_kept_while_messages_came_tells_nothing() -> None:
+def test_log_times_that_were_not_recorded_live_are_ignored() -> None:
     times, _ = captured(100)
     clock = RecordedClock(nanoseconds(1000.0 + times), np.arange(100))
     assert clock.is_ros_time

@@ -50,7 +50,7 @@ def seen(
     stddev: list[float] | None = None,
     velocity_stddev: float = 0.2,
 ) -> JointAngles:
-    """What is said of the three angles."""
+    """The three angles of a message."""
     n = len(ANGLES["positional"])
     return JointAngles(
         stamp_ns,

@@ -1,4 +1,4 @@
-"""What a robot takes from what ``calibration`` says of itself."""
+"""The calibration quality from the diagnostics of ``calibration``."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality, le
 from body_tracking.robot.calibration import CalibrationQuality
 
 
-def said(calibration: OnlineCalibration) -> dict[str, str]:
+def reported(calibration: OnlineCalibration) -> dict[str, str]:
     """The values as they come in a message."""
     return {key: str(value) for key, value in calibration.status()[2].items()}
 
 
 def test_before_there_is_a_calibration_the_other_sensors_are_missing() -> None:
-    quality = CalibrationQuality.from_diagnostics(said(OnlineCalibration(("a", "b", "c"))), ("a", "b", "c"))
+    quality = CalibrationQuality.from_diagnostics(reported(OnlineCalibration(("a", "b", "c"))), ("a", "b", "c"))
     assert quality.missing == ("b", "c")
     assert math.isnan(quality.rotation_stddev)
 
 
 def test_one_sensor_needs_none() -> None:
-    assert CalibrationQuality.from_diagnostics(said(OnlineCalibration(("a",))), ("a",)) == CalibrationQuality(
+    assert CalibrationQuality.from_diagnostics(reported(OnlineCalibration(("a",))), ("a",)) == CalibrationQuality(
         (), 0.0, 0.0
     )
 
@@ -41,13 +41,13 @@ def test_the_least_certain_sensor_counts() -> None:
             {name: SensorQuality(0.03, deviations[name], 2.0 * deviations[name], 0.001, 100) for name in sensors},
         )
     )
-    quality = CalibrationQuality.from_diagnostics(said(calibration), sensors)
+    quality = CalibrationQuality.from_diagnostics(reported(calibration), sensors)
     assert quality.missing == ()
     assert quality.rotation_stddev == pytest.approx(0.05, abs=1e-3)
     assert quality.translation_stddev == pytest.approx(0.1, abs=1e-3)
 
 
-def test_what_is_no_number_is_not_known() -> None:
+def test_values_that_are_no_number_are_nan() -> None:
     values = {"reference": "a", "b rotation_stddev_deg": "much", "b translation_stddev_mm": "3"}
     quality = CalibrationQuality.from_diagnostics(values, ("a", "b"))
     assert math.isnan(quality.rotation_stddev)

@@ -1,4 +1,4 @@
-"""Laws of the safe stop: whatever is heard, and whenever."""
+"""Laws of the safe stop, for any sequence of events."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def quality(*missing: str, rotation: float = 0.01, translation: float = 0.01) ->
 
 
 class Bench:
-    """A follower, its clocks, a person whom a sensor sees 30 times a second, and a robot that does what it is told.
+    """A follower, its clocks, a person whom a sensor sees 30 times a second, and an obedient robot.
 
     Args:
         follower: arguments of the follower after the period: clock, delay.
-        state_topic: of the robot; empty where it does not say how it stands.
+        state_topic: of the robot; empty for none.
         alone: whether the elbow holds its place alone.
         safety: thresholds.
 
     Attributes:
         order: places of the angles in a message.
         frames: of the sensors, so many per command.
-        stands: where the robot stands; None where it stands at its command, silent where it says nothing.
+        stands: where the robot stands; None where it stands at its command, silent if mute.
     """
 
     def __init__(self, *follower: Any, state_topic: str = "", alone: bool = False, **safety: Any) -> None:
@@ -63,7 +63,7 @@ class Bench:
         self.mend()
 
     def mend(self) -> None:
-        """Nothing is wrong."""
+        """Remove all faults."""
         self.silent = self.mute = False
         self.convention = CONVENTION
         self.stamp_ns: Callable[[], int] = lambda: self.now_ns - LATENCY_NS
@@ -83,29 +83,29 @@ class Bench:
     def now_ns(self) -> int:
         return EPOCH_NS + self.elapsed_ns
 
-    def hear(self, convention: str) -> None:
+    def receive(self, convention: str) -> None:
         angles = seen(self.stamp_ns(), self.pose, self.velocity, self.stddev, self.velocity_stddev)
         arrays = {each.name: getattr(angles, each.name)[self.order] for each in fields(angles)[2:]}
         angles = replace(angles, names=tuple(angles.names[k] for k in self.order), **arrays)
-        self.follower.hear_angles(angles, convention, self.now_ns, self.steady_ns)
+        self.follower.receive_angles(angles, convention, self.now_ns, self.steady_ns)
 
     def run(self, seconds: float = PERIOD) -> Command:
         """Go on for some time; the last command."""
         for _ in range(round(seconds / PERIOD)):
             self.elapsed_ns += PERIOD_NS
             self.frame += self.frames
-            self.follower.hear_sensor("kinect2", EPOCH_NS + self.frame, self.steady_ns)
+            self.follower.receive_frame("kinect2", EPOCH_NS + self.frame, self.steady_ns)
             if self.quality is not None:
-                self.follower.calibration.heard(self.quality, self.steady_ns)
+                self.follower.calibration.receive_quality(self.quality, self.steady_ns)
             if not self.mute:
                 position = self.commands[-1].position if self.commands else None
                 stands = self.stands or ([0.0, 0.1] if position is None else position)
-                self.follower.hear_robot(
+                self.follower.receive_robot_state(
                     ("elbow", "gripper", "shoulder"), np.array([stands[1], 9.0, stands[0]]), self.steady_ns
                 )
             if not self.silent and self.elapsed_ns - self.seen_ns >= self.every_ns:
                 self.seen_ns = self.elapsed_ns
-                self.hear(self.convention)
+                self.receive(self.convention)
             self.commands.append(self.follower.step(self.now_ns, self.steady_ns))
         return self.commands[-1]
 
@@ -209,50 +209,50 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"quality": quality(translation=math.nan)},
         "poor: standard deviation nan m of a sensor's p",
     ),
-    "no word of the calibration": ({"quality": None}, "calibration has not been heard of"),
-    "a robot that says nothing": ({"mute": True}, "does not say how it stands"),
+    "silent calibration": ({"quality": None}, "no diagnostics of calibration"),
+    "silent robot": ({"mute": True}, "no joint states of the robot"),
 }
-"""By name: what is wrong, and the reason that is given."""
+"""Faults by name, and their reported reasons."""
 WITHIN = {
     "no angles": 0.1,
     "frames that repeat": 0.1,
-    "no word of the calibration": 5.1,
-    "a robot that says nothing": 0.55,
+    "silent calibration": 5.1,
+    "silent robot": 0.55,
 }
 """Seconds within which the robot holds; others: a message of a sensor that sees 30 times a second, and a command."""
 
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_every_fault_is_held_by_name_then_stopped_and_forgotten_when_it_ends(kind: str) -> None:
-    (wrong, said), within = FAULTS[kind], WITHIN.get(kind, 0.05)
+    (wrong, reported), within = FAULTS[kind], WITHIN.get(kind, 0.05)
     bench = Bench(state_topic=STATE_TOPIC, calibration=True, stop_after=1.0)
     bench.follower.watch_sensors(("kinect1", "kinect2"))
     before = bench.run(3.0)
     assert before.state == State.FOLLOWING
     vars(bench).update(wrong)
     held = bench.run(within)
-    assert held.state == State.HOLDING and said in held.reason
+    assert held.state == State.HOLDING and reported in held.reason
     np.testing.assert_allclose(place(held), place(before), atol=2.0**2 / (2 * 20.0))
     assert bench.run(0.9 - within).state == State.HOLDING
     stopped = bench.run(within + 0.2)
     assert (stopped.state, stopped.position) == (State.STOPPED, None)
     assert "held for 1.0 s: " in str(bench.follower.transitions[-1])
-    assert said in str(bench.follower.transitions[-1])
+    assert reported in str(bench.follower.transitions[-1])
     bench.mend()
     assert bench.run(3.0).state == State.FOLLOWING
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FAULTS if kind != "frames that repeat"])
 def test_with_a_fault_nothing_begins(kind: str) -> None:
-    wrong, said = FAULTS[kind]
+    wrong, reported = FAULTS[kind]
     bench = Bench(state_topic=STATE_TOPIC, calibration=True)
     vars(bench).update(wrong)
     stopped = bench.run(2.0)
     assert {each.state for each in bench.commands} == {State.STOPPED}
-    assert said in stopped.reason or (kind == "no angles" and stopped.reason == "no angles yet")
+    assert reported in stopped.reason or (kind == "no angles" and stopped.reason == "no angles yet")
 
 
-def test_what_nobody_asked_for_may_be_unknown() -> None:
+def test_unused_angles_may_be_unknown() -> None:
     bench = following()
     bench.pose[1] = math.nan
     bench.stddev[1] = math.inf
@@ -279,7 +279,7 @@ def test_a_joint_may_keep_its_place_alone_and_come_back_slowly() -> None:
 def test_a_calibration_may_get_too_old() -> None:
     bench = Bench(calibration=True, max_calibration_age=20.0)
     assert "age of the calibration is not known" in bench.run(0.1).reason
-    bench.follower.calibration.pose("kinect2", EPOCH_NS - 15 * NANOSECONDS)
+    bench.follower.calibration.receive_pose("kinect2", EPOCH_NS - 15 * NANOSECONDS)
     assert bench.run(4.0).state == State.FOLLOWING
     assert "calibration is 20 s old, limit 20 s" in bench.run(1.4).reason
 
@@ -289,17 +289,17 @@ def test_a_calibration_may_get_too_old() -> None:
 
 def test_angles_that_came_before_the_clock_do_not_count_for_long() -> None:
     bench = Bench()
-    bench.follower.hear_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), CONVENTION, 0, bench.steady_ns)
+    bench.follower.receive_angles(seen(bench.now_ns - LATENCY_NS - 1, bench.pose), CONVENTION, 0, bench.steady_ns)
     assert bench.run(3.0).state == State.FOLLOWING
 
 
-@pytest.mark.parametrize(("shift", "said"), [(-0.4, "old, limit 0.3 s"), (0.2, "in the future")])
-def test_old_angles_and_angles_of_the_future_are_not_followed(shift: float, said: str) -> None:
+@pytest.mark.parametrize(("shift", "reported"), [(-0.4, "old, limit 0.3 s"), (0.2, "in the future")])
+def test_old_angles_and_angles_of_the_future_are_not_followed(shift: float, reported: str) -> None:
     bench = Bench()
     bench.stamp_ns = lambda: bench.now_ns + round(shift * NANOSECONDS)
     command = bench.run(1.0)
     assert command.state == State.STOPPED
-    assert said in command.reason
+    assert reported in command.reason
 
 
 @pytest.mark.parametrize(("seconds", "state"), [(0.05, State.FOLLOWING), (1.0, State.HOLDING), (2.1, State.STOPPED)])
@@ -320,12 +320,12 @@ def test_a_standstill_of_the_commands_holds_or_stops_at_once_and_is_not_made_up_
         assert (np.abs(place(after) - place(before)) <= np.array([2.0, 3.0]) * 2 * PERIOD + 1e-9).all()
 
 
-def test_a_backward_jump_of_time_is_told_and_holds() -> None:
+def test_a_backward_jump_of_time_is_reported_and_holds() -> None:
     bench = following()
     now_ns = bench.now_ns - 10 * NANOSECONDS
     for behind_ns, jumps in ((0, True), (NANOSECONDS - 5, False)):
         angles = seen(now_ns - behind_ns, bench.pose)
-        assert bench.follower.hear_angles(angles, CONVENTION, now_ns, bench.steady_ns) == jumps
+        assert bench.follower.receive_angles(angles, CONVENTION, now_ns, bench.steady_ns) == jumps
     bench = following()
     bench.follower.time_jumped_back()
     bench.silent = True
@@ -338,22 +338,22 @@ def test_foreign_angles_between_the_right_ones_are_not_overlooked() -> None:
     for _ in range(100):
         bench.run()
         # the right ones come between this and the next command
-        bench.hear("isb")
-        bench.hear(CONVENTION)
+        bench.receive("isb")
+        bench.receive(CONVENTION)
     assert all(each.state == State.HOLDING for each in bench.commands[-99:])
 
 
 # --- who else commands, and who may
 
 
-def test_beside_another_publisher_of_its_commands_it_is_silent_at_once() -> None:
+def test_another_publisher_of_the_commands_stops_at_once() -> None:
     bench = following()
-    bench.follower.hear_publishers("another publisher of /arm: /other")
+    bench.follower.report_publishers("another publisher of /arm: /other")
     stopped = bench.run()
     assert (stopped.state, stopped.position) == (State.STOPPED, None)
     assert bench.changes()[-2:] == [(State.FOLLOWING, State.HOLDING), (State.HOLDING, State.STOPPED)]
     assert bench.run(1.0).reason == "another publisher of /arm: /other"
-    bench.follower.hear_publishers("")
+    bench.follower.report_publishers("")
     assert bench.run(0.45).state == State.STOPPED
     assert bench.run(0.2).state == State.APPROACHING
 
@@ -394,7 +394,7 @@ def test_it_begins_where_the_robot_stands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("joints", "position", "said"),
+    ("joints", "position", "reported"),
     [
         (("shoulder",), [0.0], "elbow is not among them"),
         (("shoulder", "elbow"), [0.0], "1 positions of 2 joints"),
@@ -402,13 +402,13 @@ def test_it_begins_where_the_robot_stands() -> None:
     ],
 )
 def test_joint_states_that_are_none_are_refused_and_not_followed(
-    joints: tuple[str, ...], position: list[float], said: str
+    joints: tuple[str, ...], position: list[float], reported: str
 ) -> None:
     bench = Bench(state_topic=STATE_TOPIC)
     bench.mute = True
-    with pytest.raises(FollowerError, match=said):
-        bench.follower.hear_robot(joints, np.array(position), bench.steady_ns)
-    assert said in bench.run().reason
+    with pytest.raises(FollowerError, match=reported):
+        bench.follower.receive_robot_state(joints, np.array(position), bench.steady_ns)
+    assert reported in bench.run().reason
 
 
 def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> None:
@@ -437,9 +437,9 @@ def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> Non
             stands = np.clip(stands + rng.normal(0.0, 0.02, 2), [-1.0, 0.0], [2.5, 2.0])
     assert begun > 5
     assert command.state == State.FOLLOWING
-    said = [str(each) for each in bench.follower.transitions]
-    assert any("rad from its command" in each and "-> holding" in each for each in said)
-    assert any("holding -> stopped" in each for each in said)
+    reported = [str(each) for each in bench.follower.transitions]
+    assert any("rad from its command" in each and "-> holding" in each for each in reported)
+    assert any("holding -> stopped" in each for each in reported)
 
 
 def test_where_the_robot_was_moved_while_it_held_it_goes_on_from_there() -> None:
@@ -460,7 +460,7 @@ def test_where_the_robot_was_moved_while_it_held_it_goes_on_from_there() -> None
     assert bench.run(2.0).state == State.FOLLOWING
 
 
-def test_a_robot_that_was_moved_beyond_its_limits_is_told_nothing_until_it_is_back() -> None:
+def test_no_commands_for_a_robot_beyond_its_limits_until_it_is_back() -> None:
     bench = Bench(state_topic=STATE_TOPIC)
     for elbow, seconds in ((2.2, 1.0), (0.8, 4.0), (2.6, 4.0), (0.8, 4.0)):
         bench.stands = [1.0, elbow]
@@ -474,14 +474,14 @@ def test_a_robot_that_was_moved_beyond_its_limits_is_told_nothing_until_it_is_ba
 
 
 @pytest.mark.parametrize(
-    ("period", "said"),
+    ("period", "reported"),
     [
         (0.1, "silence 0.1 s is no more than the period 0.1 s"),
         (0.05, "time_from_start 0.02 s is less than the period 0.05 s"),
     ],
 )
-def test_a_period_that_cannot_keep_the_promises_is_refused(period: float, said: str) -> None:
-    with pytest.raises(FollowerError, match=said):
+def test_a_period_longer_than_the_limits_is_refused(period: float, reported: str) -> None:
+    with pytest.raises(FollowerError, match=reported):
         Follower(mapping(), period)
 
 
@@ -507,7 +507,7 @@ wild = st.tuples(
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(calm | wild, max_size=12), st.booleans())
-def test_whatever_is_heard_the_robot_is_never_told_what_it_must_not(events: list[Any], alone: bool) -> None:
+def test_commands_are_within_limits_for_any_sequence_of_events(events: list[Any], alone: bool) -> None:
     follower = Bench(alone=alone, recover_after=0.05, approach=0.1, stop_after=0.3, max_stddev=1.0).follower
     robot = follower.mapping
     steady_ns, now_ns = START_NS, EPOCH_NS
@@ -518,7 +518,9 @@ def test_whatever_is_heard_the_robot_is_never_told_what_it_must_not(events: list
             now_ns += pause_ns
             if position is not None:
                 heard_ns = steady_ns
-                follower.hear_angles(seen(now_ns - age_ns, position, velocity, stddev), CONVENTION, now_ns, steady_ns)
+                follower.receive_angles(
+                    seen(now_ns - age_ns, position, velocity, stddev), CONVENTION, now_ns, steady_ns
+                )
             command = follower.step(now_ns, steady_ns)
             if heard_ns is None or steady_ns - heard_ns >= 90_000_000:
                 assert command.state in (State.HOLDING, State.STOPPED)

@@ -71,7 +71,7 @@ def test_no_time_no_motion() -> None:
     np.testing.assert_array_equal(joints.step(UPPER, 0.0), HOME)
 
 
-def test_what_stands_beyond_a_limit_begins_at_the_limit() -> None:
+def test_a_start_beyond_a_limit_is_clipped_to_it() -> None:
     joints = limiter()
     joints.step(UPPER, 0.01)
     joints.reset(UPPER + 0.2)

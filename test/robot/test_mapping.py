@@ -1,4 +1,4 @@
-"""What a mapping file says, and that whatever is wrong with one is refused with its name."""
+"""Mapping files are parsed, and errors in them are refused by name."""
 
 from __future__ import annotations
 
@@ -141,21 +141,21 @@ def _written(change: Callable[[dict[str, Any]], object]) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reported"),
     [
-        *(pytest.param(_written(change), said, id=wrong) for wrong, (change, said) in WRONG.items()),
+        *(pytest.param(_written(change), reported, id=wrong) for wrong, (change, reported) in WRONG.items()),
         *FILES.items(),
         (None, "cannot be read"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(text: str | None, said: str, tmp_path: Path) -> None:
+def test_invalid_mappings_are_refused_by_name(text: str | None, reported: str, tmp_path: Path) -> None:
     file = tmp_path / "robot.yaml"
     if text is not None:
         file.write_text(text)
     with pytest.raises(MappingError) as caught:
         load(file, ANGLES)
     assert str(caught.value).startswith(f"{file}: ")
-    assert said in str(caught.value)
+    assert reported in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -170,8 +170,8 @@ def test_the_documentation_knows_every_threshold_and_its_default() -> None:
     text = (ROOT / "docs" / "robots.md").read_text(encoding="utf-8")
     rows = {line.split("|")[1].strip(" `"): line.split("|")[2].strip() for line in text.splitlines() if "|" in line}
     for item in parameters_from(SafetyLimits):
-        said = rows[item.name]
+        reported = rows[item.name]
         value = item.default
         assert isinstance(value, bool | float)
         expected = str(value).lower() if isinstance(value, bool) else f"{value:g}"
-        assert said.split()[0] == ("any" if expected == "inf" else expected)
+        assert reported.split()[0] == ("any" if expected == "inf" else expected)

@@ -1,4 +1,4 @@
-"""The simulated arms of ``examples/robot_arms``: they stand as their mapping files say a person does, and follow."""
+"""The simulated arms of ``examples/robot_arms``: they copy the posture of a person as mapped, and follow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated recordings: repeatable, with the topics, poses, clocks and numbers that they say they have."""
+"""Simulated recordings are repeatable, with the documented topics, poses, clocks and body numbers."""
 
 from __future__ import annotations
 
@@ -68,12 +68,12 @@ def stamps(messages: list[Any]) -> list[int]:
     return [to_nanoseconds(message.header.stamp) for message in messages]
 
 
-# --- what is in a bag
+# --- content of a bag
 
 
 @pytest.fixture(scope="module")
 def crowd(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedRecording, Path]:
-    """Three people; the first wears an inertial sensor that tells its orientation, and two that do not."""
+    """Three people; the first wears an inertial sensor with orientation, and two without."""
     imus = (
         SimulatedImu("forearm", "forearm_left", usual_mounting("forearm_left"), 100.0, oriented=True),
         SimulatedImu("chest", "upper_trunk", usual_mounting("upper_trunk"), 50.0),
@@ -85,7 +85,7 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedRecording,
     return recording, folder
 
 
-def test_topics_and_types_are_as_told(crowd: tuple[SimulatedRecording, Path]) -> None:
+def test_topics_and_types_are_as_documented(crowd: tuple[SimulatedRecording, Path]) -> None:
     assert types(crowd[1]) == TRUTHS | CLOUDS | {
         "/forearm/imu/data": IMU,
         "/forearm/imu/mag": MAGNETIC_FIELD,
@@ -106,9 +106,9 @@ def test_everybody_is_in_one_cloud(crowd: tuple[SimulatedRecording, Path]) -> No
             assert_allclose(each.positions, true.positions[k], rtol=1e-7, atol=1e-9)
             assert (each.states == TrackingState.TRACKED).all() and each.velocities is None
     for sensor in SENSORS:
-        said = [cloud_to_skeletons(message) for message in read(folder, graph.skeleton_topic(sensor))]
+        published = [cloud_to_skeletons(message) for message in read(folder, graph.skeleton_topic(sensor))]
         meant = [frame.skeletons for frame in recording.frames if frame.sensor == sensor]
-        for skeletons, others in zip(said, meant, strict=True):
+        for skeletons, others in zip(published, meant, strict=True):
             assert {each.body for each in skeletons} <= {0, 1, 2}
             for each, other in zip(skeletons, others, strict=True):
                 assert (each.stamp_ns, each.body, each.frame_id) == (other.stamp_ns, other.body, other.frame_id)
@@ -119,10 +119,10 @@ def test_everybody_is_in_one_cloud(crowd: tuple[SimulatedRecording, Path]) -> No
 def test_the_true_model_state_is_the_configuration_of_the_first(crowd: tuple[SimulatedRecording, Path]) -> None:
     recording, folder = crowd
     truth = recording.truths[0]
-    said = [joint_state_to_model(message, MODEL) for message in read(folder, graph.TRUE_MODEL_STATE)]
-    assert [stamp_ns for stamp_ns, _, _, _ in said] == truth.stamps_ns.tolist()
-    assert {frame_id for _, frame_id, _, _ in said} == {"world"}
-    q, rates = (np.stack([each[column] for each in said]) for column in (2, 3))
+    published = [joint_state_to_model(message, MODEL) for message in read(folder, graph.TRUE_MODEL_STATE)]
+    assert [stamp_ns for stamp_ns, _, _, _ in published] == truth.stamps_ns.tolist()
+    assert {frame_id for _, frame_id, _, _ in published} == {"world"}
+    q, rates = (np.stack([each[column] for each in published]) for column in (2, 3))
     assert_allclose(MODEL.difference(q, truth.q), 0.0, atol=1e-9)
     assert_allclose(rates, truth.rates, atol=1e-12)
     assert_allclose(MODEL.forward(q, truth.person.lengths).positions, truth.positions[:, MODEL.joints], atol=1e-9)
@@ -138,20 +138,18 @@ def test_the_true_angles_are_those_of_the_true_joints(crowd: tuple[SimulatedReco
 
 
 @pytest.mark.parametrize(("number", "topic"), [(0, "data"), (1, "data_raw"), (2, "data_raw")])
-def test_inertial_sensors_say_what_they_measure(
-    crowd: tuple[SimulatedRecording, Path], number: int, topic: str
-) -> None:
+def test_inertial_messages_hold_the_samples(crowd: tuple[SimulatedRecording, Path], number: int, topic: str) -> None:
     recording, folder = crowd
     imu, samples = recording.imus[number]
     messages = read(folder, f"/{imu.name}/imu/{topic}")
     assert stamps(messages) == samples.stamps_ns.tolist()
     assert {message.header.frame_id for message in messages} == {f"{imu.name}_link"}
     for k, message in enumerate(messages):
-        for said, meant in (
+        for published, meant in (
             (message.angular_velocity, samples.angular_velocity[k]),
             (message.linear_acceleration, samples.linear_acceleration[k]),
         ):
-            assert_array_equal([said.x, said.y, said.z], meant)
+            assert_array_equal([published.x, published.y, published.z], meant)
         assert_array_equal(message.angular_velocity_covariance, samples.angular_velocity_covariance.ravel())
         assert_array_equal(message.linear_acceleration_covariance, samples.linear_acceleration_covariance.ravel())
         if imu.oriented:
@@ -161,8 +159,8 @@ def test_inertial_sensors_say_what_they_measure(
             assert_array_equal(message.orientation_covariance, samples.orientation_covariance[k].ravel())
             assert np.linalg.eigvalsh(message.orientation_covariance.reshape(3, 3)).min() > 0.0
         else:
-            assert message.orientation_covariance[0] == -1.0  # REP-145: it does not tell
-    # somebody who stands feels gravity, and nearly nothing else
+            assert message.orientation_covariance[0] == -1.0  # REP-145: no orientation
+    # on a standing person the sensor measures little but gravity
     force = np.linalg.norm(samples.linear_acceleration, axis=1)
     assert force.mean() == pytest.approx(9.81, abs=0.5)
 
@@ -174,9 +172,11 @@ def test_magnetometers_say_the_field(crowd: tuple[SimulatedRecording, Path]) -> 
             continue
         messages = read(folder, f"/{imu.name}/imu/mag")
         assert stamps(messages) == samples.stamps_ns.tolist()
-        said = [[message.magnetic_field.x, message.magnetic_field.y, message.magnetic_field.z] for message in messages]
-        assert_array_equal(said, samples.magnetic_field)
-        assert 15e-6 < np.linalg.norm(said, axis=1).mean() < 100e-6  # tesla: of the earth
+        published = [
+            [message.magnetic_field.x, message.magnetic_field.y, message.magnetic_field.z] for message in messages
+        ]
+        assert_array_equal(published, samples.magnetic_field)
+        assert 15e-6 < np.linalg.norm(published, axis=1).mean() < 100e-6  # tesla: of the earth
         for message in messages:
             assert_array_equal(message.magnetic_field_covariance, samples.magnetic_field_covariance.ravel())
 
@@ -209,7 +209,7 @@ def test_the_shipped_bags_are_whole_and_small(name: str) -> None:
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
 
 
-def test_the_shipped_bags_are_what_the_command_makes(tmp_path: Path) -> None:
+def test_the_command_reproduces_the_shipped_bags(tmp_path: Path) -> None:
     """To a tenth of a millimetre: other versions of numpy and scipy round differently."""
     name = "tpose_slow_down"
     assert main(["make-bags", "-o", str(tmp_path), "--motion", name]) == 0
@@ -253,7 +253,7 @@ def errors_of(folder: Path, sensor: str) -> FloatArray:
     return np.concatenate(errors)
 
 
-def test_poses_and_clocks_explain_what_the_sensors_say(tmp_path: Path) -> None:
+def test_true_poses_and_clocks_take_the_measurements_to_the_truth(tmp_path: Path) -> None:
     """Bring each sensor's joints into the world and its stamps into the reference clock: they meet the truth there."""
     write_bag(simulate(Setup("torso_twist", seconds=12.0, errors=KinectErrors.none())), tmp_path / "exact")
     for sensor in SENSORS:
@@ -268,7 +268,7 @@ def test_the_shipped_bags_err_as_a_kinect_does(name: str) -> None:
     for sensor in SENSORS:
         error = errors_of(BAGS / name, sensor)
         assert 0.050 < error.mean() < 0.101  # what is reported of one Kinect v2 against markers
-        assert error.max() < 0.6  # a hidden arm that is told beside the body
+        assert error.max() < 0.6  # a hidden arm reported next to the body
 
 
 @cache
@@ -277,7 +277,7 @@ def made(name: str) -> SimulatedRecording:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_second_clock_is_told_once_a_second(name: str) -> None:
+def test_the_second_clock_is_published_once_a_second(name: str) -> None:
     _, clocks = poses_and_clocks(BAGS / name)
     true = made(name).sensors[1].clock
     assert 0.0 < abs(true.offset_ns) < 2 * NANOSECONDS and 0.0 < abs(true.drift_ppm) < 50.0
@@ -315,7 +315,7 @@ def test_the_same_arguments_give_the_same_messages_and_another_seed_others(tmp_p
     assert a == b and a != c
 
 
-def test_what_is_asked_for_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_options_take_effect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     errors = tmp_path / "errors.yaml"
     errors.write_text(errors_as_yaml(KinectErrors(delay=0.5)), encoding="utf-8")
     folder = simulated(
@@ -364,12 +364,12 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
         (("--config", "nowhere.yaml"), "body_tracking: nowhere.yaml: cannot be read"),
     ],
 )
-def test_what_cannot_be_simulated_is_one_line(
+def test_impossible_simulations_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["simulate", "-o", str(tmp_path / "bag"), *arguments]) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
+    published = capsys.readouterr().err
+    assert message in published and published.count("\n") == 1
     assert not (tmp_path / "bag").exists()
 
 
@@ -378,8 +378,8 @@ def test_a_bag_is_replaced_only_if_asked(tmp_path: Path, capsys: pytest.CaptureF
     before = contents(folder)
     again = ["simulate", "-o", str(folder), "--motion", "standing_still", "--seconds", "2", "--seed", "1"]
     assert main(again) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and str(folder) in said
+    published = capsys.readouterr().err
+    assert published.count("\n") == 1 and str(folder) in published
     assert contents(folder) == before
     assert main([*again, "--overwrite"]) == 0
     assert contents(folder) != before

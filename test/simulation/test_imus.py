@@ -132,12 +132,12 @@ def degrees(value: float) -> float:
     return float(np.radians(value))
 
 
-# --- what is measured without errors ---------------------------------------------------------------------------------
+# --- measurements without errors -------------------------------------------------------------------------------------
 
 
 @given(SEEDS)
 @settings(max_examples=8, deadline=None)
-def test_at_rest_it_feels_gravity_upwards_and_no_rotation(seed: int) -> None:
+def test_at_rest_it_measures_gravity_upwards_and_no_rotation(seed: int) -> None:
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat, np.array([2.0, -1.0, 1.2])), duration=0.3)
     up = so3.quat_to_matrix(quat).T @ UP
@@ -181,8 +181,8 @@ def test_rates_and_accelerations_are_the_derivatives_of_the_motion(seed: int) ->
 
 @given(SEEDS)
 @settings(max_examples=8, deadline=None)
-def test_all_three_are_told_in_the_frame_of_the_sensor(seed: int) -> None:
-    """Turned on its place, it says the same, turned back."""
+def test_all_three_are_measured_in_the_frame_of_the_sensor(seed: int) -> None:
+    """A rotated mounting rotates the measurements inversely."""
     motion, turn = Swing.draw(seed), so3.exp(np.random.default_rng(seed).normal(size=3))
     place = np.array([0.02, 0.03, -0.2])
     straight = measured(motion, duration=0.5, mounting=Mounting(place, AT_ORIGIN.quat_xyzw))
@@ -212,9 +212,9 @@ def test_turned_to_world_the_field_is_the_earths(seed: int, north: float, dip: f
 
 def test_the_field_of_iron_is_twice_as_strong_along_its_axis_and_falls_with_the_cube() -> None:
     iron = Iron(np.array([1.0, 0.0, 0.5]), np.array([0.0, 0.0, 3.0]))
-    on_axis, beside, twice = iron.field(np.array([[1.0, 0.0, 1.0], [1.5, 0.0, 0.5], [1.0, 0.0, 1.5]]), np.zeros(3))
+    on_axis, off_axis, twice = iron.field(np.array([[1.0, 0.0, 1.0], [1.5, 0.0, 0.5], [1.0, 0.0, 1.5]]), np.zeros(3))
     assert_allclose(on_axis, 1e-7 * 2.0 * iron.moment / 0.5**3)
-    assert_allclose(beside, -0.5 * on_axis, atol=1e-20)
+    assert_allclose(off_axis, -0.5 * on_axis, atol=1e-20)
     assert_allclose(twice, on_axis / 8.0, atol=1e-20)
 
 
@@ -281,7 +281,7 @@ def test_turn_on_biases_are_spread_as_stated_and_stay() -> None:
     assert_allclose(rates[:, 0], [run.truth.gyro_bias[0] for run in runs], atol=1e-12)
 
 
-def test_scale_and_axes_mix_what_is_measured_linearly() -> None:
+def test_scale_and_axes_errors_are_linear() -> None:
     errors = replace(IDEAL, gyro_scale=0.03, gyro_axes=0.01)
     drawn = []
     for seed in range(60):
@@ -295,7 +295,7 @@ def test_scale_and_axes_mix_what_is_measured_linearly() -> None:
     assert np.std(np.array(drawn)[:, off_diagonal]) == pytest.approx(0.01, rel=0.15)  # of 360
 
 
-def test_beyond_the_range_it_says_the_end_of_the_range_and_within_it_whole_steps() -> None:
+def test_measurements_are_clipped_to_the_range_and_quantised() -> None:
     errors = replace(IDEAL, gyro_range=100.0)
     motion = turning(UP, np.pi, 0.5, 1.0)
     rates = np.degrees(measured(motion, errors, duration=2.0).angular_velocity[:, 2])
@@ -341,7 +341,7 @@ def test_misalignment_is_spread_as_stated() -> None:
 
 @given(SEEDS)
 @settings(max_examples=8, deadline=None)
-def test_at_rest_tissue_lets_the_sensor_down_by_its_sag_whatever_the_pose(seed: int) -> None:
+def test_at_rest_tissue_sags_by_its_parameter_in_any_pose(seed: int) -> None:
     """And turns it by the sag across the limb over the radius."""
     errors = replace(IDEAL, tissue_sag=0.001, tissue_turn=10.0)
     place, quat = np.array([0.0, 0.05, -0.1]), so3.exp(np.random.default_rng(seed).normal(size=3))
@@ -395,8 +395,8 @@ def test_the_skin_follows_a_twist_only_in_part_and_a_swing_whole() -> None:
         samples = measured(turning(axis, 1.2, 0.5, 1.0), errors, duration=2.0, mounting=mounting, parent=still())
         turn = so3.log(so3.quat_multiply(samples.truth.quat_xyzw[-1], so3.quat_inverse(samples.truth.quat_xyzw[0])))
         assert_allclose(turn, follows * 1.2 * axis, atol=1e-9)
-        felt = cumulative_trapezoid(samples.angular_velocity, samples.truth.times, axis=0)[-1]
-        assert np.linalg.norm(felt) == pytest.approx(follows * 1.2, rel=1e-3)
+        rotation = cumulative_trapezoid(samples.angular_velocity, samples.truth.times, axis=0)[-1]
+        assert np.linalg.norm(rotation) == pytest.approx(follows * 1.2, rel=1e-3)
 
 
 @pytest.mark.parametrize("twist", [0.0, 1.0, -2.0])
@@ -409,7 +409,7 @@ def test_no_jerk_comes_of_the_twist_where_an_arm_points_straight_up(twist: float
     assert np.abs(np.diff(rates, axis=0)).max() < 0.05
 
 
-def test_a_slip_turns_the_sensor_once_and_it_feels_it() -> None:
+def test_a_slip_turns_the_sensor_once_and_is_measured() -> None:
     turn = np.array([0.0, 0.0, degrees(20.0)])
     mounting = usual_mounting("forearm_left")
     samples = measured(still(), mounting=mounting, duration=6.0, slips=(Slip(3.0, turn),))
@@ -447,11 +447,13 @@ def test_at_rest_a_driver_with_magnetometer_knows_its_orientation_to_east_north_
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat), duration=0.5, oriented=True, surroundings=Surroundings(north=north))
     assert samples.orientation is not None
-    told = so3.quat_to_matrix(samples.orientation)
-    to_north = told @ so3.quat_to_matrix(quat).T @ np.array([np.cos(north), np.sin(north), 0.0])
-    assert_allclose(to_north, np.tile([0.0, 1.0, 0.0], (len(told), 1)), atol=1e-9)
+    orientations = so3.quat_to_matrix(samples.orientation)
+    to_north = orientations @ so3.quat_to_matrix(quat).T @ np.array([np.cos(north), np.sin(north), 0.0])
+    assert_allclose(to_north, np.tile([0.0, 1.0, 0.0], (len(orientations), 1)), atol=1e-9)
     assert_allclose(
-        rotated(told, samples.linear_acceleration), np.tile(STANDARD_GRAVITY * UP, (len(told), 1)), atol=1e-8
+        rotated(orientations, samples.linear_acceleration),
+        np.tile(STANDARD_GRAVITY * UP, (len(orientations), 1)),
+        atol=1e-8,
     )
 
 
@@ -468,7 +470,7 @@ def test_without_magnetometer_it_is_level_with_any_heading() -> None:
     assert abs(np.mean(np.exp(1j * np.array(headings)))) < 0.4
 
 
-def test_raw_data_has_no_orientation_and_says_so() -> None:
+def test_raw_data_is_marked_as_without_orientation() -> None:
     samples = measured(still(), duration=0.2)
     assert samples.orientation is None
     assert_array_equal(samples.orientation_covariance[:, 0, 0], -1.0)
@@ -478,7 +480,7 @@ def complementary_filter(
     samples: ImuSamples, errors: ImuErrors, start: FloatArray, where: Surroundings | None
 ) -> FloatArray:
     """(n, 4) the filter itself, step by step; with the magnetic field where its direction is given."""
-    quat, told = start, [start]
+    quat, orientations = start, [start]
     steps = np.diff(samples.truth.times)
     for k, step in enumerate(steps.tolist(), start=1):
         mean_rate = 0.5 * (samples.angular_velocity[k - 1] + samples.angular_velocity[k])
@@ -490,8 +492,8 @@ def complementary_filter(
             seen = so3.quat_to_matrix(quat) @ samples.magnetic_field[k]
             correction[2] = -np.angle((seen[0] + 1j * seen[1]) * np.exp(-1j * where.north)) * step / errors.heading_time
         quat = so3.quat_multiply(so3.exp(correction), quat)
-        told.append(quat)
-    return np.array(told)
+        orientations.append(quat)
+    return np.array(orientations)
 
 
 def tilt_and_heading(orientation: FloatArray, samples: ImuSamples) -> FloatArray:
@@ -528,8 +530,8 @@ def test_the_drivers_errors_are_those_of_a_complementary_filter_on_the_same_data
     )
     assert samples.orientation is not None
     filtered = complementary_filter(samples, errors, samples.orientation[0], where if magnetometer else None)
-    told, expected = (tilt_and_heading(values, samples) for values in (samples.orientation, filtered))
-    size, apart = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected, told - expected))
+    orientations, expected = (tilt_and_heading(values, samples) for values in (samples.orientation, filtered))
+    size, apart = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected, orientations - expected))
     assert size.min() > 0.5
     assert np.all(apart < 0.1 * size)
 
@@ -596,7 +598,7 @@ def test_off_and_on_again_it_is_silent_in_between_and_starts_with_other_biases_a
     delay_jitter=st.floats(0.0, 0.2),
 )
 @settings(max_examples=12, deadline=None)
-def test_stamps_and_arrivals_keep_their_order_and_tell_the_own_clock(
+def test_stamps_and_receipts_are_ordered_and_stamps_are_of_the_own_clock(
     seed: int, rate_hz: float, offset_ns: int, drift: float, jitter: float, packet: int, delay_jitter: float
 ) -> None:
     errors = replace(CONSUMER, jitter=jitter, stamp_jitter=jitter, packet=packet, delay_jitter=delay_jitter)
@@ -671,7 +673,7 @@ def everything(samples: ImuSamples) -> list[FloatArray]:
 
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
-def test_a_seed_says_everything(seed: int) -> None:
+def test_a_seed_determines_everything(seed: int) -> None:
     motion = Swing.draw(1)
     first, again, other = (
         measured(motion, CONSUMER, 2.0, number, mounting=usual_mounting("hand_left"), oriented=True, off=((0.7, 0.9),))
@@ -692,7 +694,7 @@ def test_twice_the_noise_is_the_same_noise_twice() -> None:
 
 
 @pytest.mark.parametrize("oriented", [False, True])
-def test_a_sensor_that_is_off_all_the_time_says_nothing(oriented: bool) -> None:
+def test_a_sensor_that_is_always_off_has_no_samples(oriented: bool) -> None:
     samples = measured(Swing.draw(0), CONSUMER, duration=1.0, oriented=oriented, off=((0.0, 2.0),))
     assert samples.stamps_ns.shape == (0,)
     assert samples.angular_velocity.shape == (0, 3)
@@ -700,7 +702,7 @@ def test_a_sensor_that_is_off_all_the_time_says_nothing(oriented: bool) -> None:
 
 
 @pytest.mark.parametrize("segment", ["upper_arm_left", "forearm_left", "hand_right", "pelvis", "upper_trunk"])
-def test_on_a_person_it_feels_what_people_do(segment: str) -> None:
+def test_on_a_person_the_mean_specific_force_is_gravity(segment: str) -> None:
     """Of 20 s the mean specific force is gravity, whichever way the person moves, and tissue errs by some degrees."""
     rng = np.random.default_rng(4)
     person, movement = RandomPerson.draw(rng), RandomMotion(rng, 20.0)
@@ -746,7 +748,7 @@ def test_errors_out_of_range_are_named(changes: dict[str, object]) -> None:
         ImuErrors(**changes)  # type: ignore[arg-type]
 
 
-def test_what_no_sensor_can_be_is_refused() -> None:
+def test_impossible_sensors_are_refused() -> None:
     mounting = usual_mounting("head")
     with pytest.raises(ImuSimulationError, match="segment 'tail'"):
         SimulatedImu("imu", "tail", mounting)

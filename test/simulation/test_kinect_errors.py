@@ -1,4 +1,4 @@
-"""Laws of the simulated Kinect v2: each error alone is what its parameter says, and none is none."""
+"""Laws of the simulated Kinect v2: each error alone has the size of its parameter, and without errors it is exact."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def rms(values: FloatArray) -> float:
 # --- none, all
 
 
-def test_a_sensor_without_errors_says_the_truth() -> None:
+def test_a_sensor_without_errors_reports_the_truth() -> None:
     truth = still(1.0)
     positions, states = see(NONE, truth)
     above = in_sight(truth)[0, :, 1] < 2.0 * np.tan(np.radians(30.0))
@@ -102,7 +102,7 @@ def test_a_sensor_without_errors_says_the_truth() -> None:
     assert np.array_equal(positions[:, above], in_sight(truth)[:, above])
 
 
-def test_what_is_hidden_is_inferred_and_still_exact_without_errors() -> None:
+def test_hidden_joints_are_inferred_and_still_exact_without_errors() -> None:
     truth = np.repeat(placed(standing(HANGING), PLACE, np.pi / 2), 5, axis=0)
     positions, states = see(NONE, truth)
     assert (states[:, Joint.WRIST_RIGHT] == TrackingState.INFERRED).all()
@@ -111,7 +111,7 @@ def test_what_is_hidden_is_inferred_and_still_exact_without_errors() -> None:
 
 
 @pytest.mark.parametrize("shift", [(0.0, 3.0, 0.0), (0.0, 0.0, -2.5), (3.0, 0.0, 0.0), (-1.9, 0.0, 0.0)])
-def test_what_is_out_of_view_or_range_is_not_tracked(shift: tuple[float, float, float]) -> None:
+def test_joints_out_of_view_or_range_are_not_tracked(shift: tuple[float, float, float]) -> None:
     positions, states = see(ERRORS, still(0.2) + np.array(shift))
     assert (states == TrackingState.NOT_TRACKED).all() and np.isnan(positions).all()
 
@@ -374,7 +374,7 @@ def test_guesses_have_their_size_and_only_hidden_joints_have_them() -> None:
     assert 0.5 < rms(error[:, joint]) / unit < 1.3
 
 
-def test_the_stated_share_of_hidden_joints_is_said_to_be_tracked_and_of_others_nothing() -> None:
+def test_the_parameter_is_the_share_of_hidden_joints_reported_as_tracked() -> None:
     errors = only(mislabelled=0.3, given_up=0.2, drift_time=0.5)
     states = see(errors, hidden_arm(900.0, rate=3.0), rate=3.0)[1][:, Joint.WRIST_RIGHT]
     shares = np.bincount(states, minlength=3) / len(states)

@@ -72,7 +72,7 @@ def test_no_other_numbers(number: int) -> None:
         layout(number)
 
 
-def test_what_cannot_stand_is_refused() -> None:
+def test_impossible_layouts_are_refused() -> None:
     with pytest.raises(LayoutError):
         around(())
     with pytest.raises(LayoutError):

@@ -31,7 +31,7 @@ def capsule(start: Joint, end: Joint, radius: float) -> Capsules:
     return Capsules(np.array([start], dtype=np.intp), np.array([end], dtype=np.intp), np.array([radius]))
 
 
-def test_who_faces_the_sensor_with_arms_apart_is_seen_whole() -> None:
+def test_a_person_facing_the_sensor_with_arms_apart_is_fully_visible() -> None:
     covered = cover(in_sight(standing()), flesh())
     assert covered.max() < 0.2
 
@@ -77,7 +77,7 @@ def test_a_segment_never_covers_the_joints_at_its_ends(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=12, deadline=None)
-def test_cover_is_what_the_nearest_of_many_points_on_ray_and_axis_says(seed: int) -> None:
+def test_cover_agrees_with_a_search_over_points_on_ray_and_axis(seed: int) -> None:
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.05, 0.3)
     sight = rng.normal([0.0, 0.0, 2.5], 0.5, (1, 25, 3))
@@ -105,7 +105,7 @@ def test_cover_of_a_mirrored_scene_is_mirrored() -> None:
     assert np.allclose(cover((sight * [-1.0, 1.0, 1.0])[:, MIRROR], flesh())[:, MIRROR], cover(sight, flesh()))
 
 
-def test_the_ray_ends_at_the_surface_of_what_covers_it() -> None:
+def test_the_ray_ends_at_the_covering_surface() -> None:
     sight = np.tile([5.0, 0.0, 9.0], (1, 25, 1))
     sight[0, Joint.HEAD], sight[0, Joint.HAND_LEFT] = (0.0, 0.0, 2.0), (0.0, 0.0, 3.0)
     found = obstruction(sight, capsule(Joint.HEAD, Joint.HEAD, 0.1))
@@ -114,7 +114,7 @@ def test_the_ray_ends_at_the_surface_of_what_covers_it() -> None:
     assert found.nearer[0, Joint.HAND_RIGHT] == 0.0
 
 
-def test_what_is_thin_covers_what_is_thick_in_part() -> None:
+def test_thin_parts_cover_thick_parts_partially() -> None:
     body = standing()
     body[Joint.WRIST_LEFT], body[Joint.HAND_TIP_LEFT] = ([0.4, y, 1.2] for y in (0.05, -0.05))
     covered = cover(in_sight(body), flesh())[0, Joint.SPINE_MID]

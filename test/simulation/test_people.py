@@ -34,7 +34,7 @@ def test_stature_and_mass_are_within_the_tables(seed: int) -> None:
     low, high = {"female": (1.46, 1.79), "male": (1.58, 1.93)}[person.sex]
     assert low < person.stature < high
     assert 17.5 < person.mass / person.stature**2 < 40.0
-    # nobody stands on shorter legs than makes the stature: the centre of the head is 4.9 % below the crown
+    # the legs and the trunk add up to the stature: the centre of the head is 4.9 % below the crown
     upright = sum(person.length(name) for name in ("hip_drop", "lower_trunk", "upper_trunk", "neck", "head"))
     assert_allclose(upright + person.legs.mean() + person.ankle_height, 0.951 * person.stature, rtol=1e-9)
     shares = person.lengths / MODEL.default_lengths(person.stature)
@@ -55,7 +55,7 @@ def test_many_people_are_spread_as_the_tables_say() -> None:
 
 
 @given(seeds)
-def test_flesh_weighs_what_the_person_does(seed: int) -> None:
+def test_the_capsules_have_the_persons_mass(seed: int) -> None:
     person = Person.draw(np.random.default_rng(seed))
     capsules = person.capsules()
     course = standing(person, np.random.default_rng(0), 1)

@@ -1,4 +1,4 @@
-"""Random people stay within their ranges of motion, and what is said to be true of them fits together."""
+"""Random people stay within their ranges of motion, and their ground truth is consistent."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_the_noise_is_as_asked(noise: float) -> None:
     assert np.abs(np.corrcoef(flat.T) - np.eye(57)).mean() < 0.08
 
 
-def test_skeletons_say_what_was_measured_when_and_nothing_of_the_legs() -> None:
+def test_skeletons_hold_measurements_and_stamps_and_no_legs() -> None:
     truth = someone(7)
     seen = observe(truth, MeasurementErrors(0.01), np.random.default_rng(0))
     legs = np.setdiff1d(np.arange(len(Joint)), MODEL.joints)
@@ -154,7 +154,7 @@ def test_skeletons_say_what_was_measured_when_and_nothing_of_the_legs() -> None:
     assert periods.mean() == pytest.approx(1 / 30, rel=1e-3) and 0.0005 < periods.std() < 0.003 and periods.min() > 0.01
 
 
-def test_dropouts_and_gaps_lose_what_they_name_and_nothing_else() -> None:
+def test_dropouts_and_gaps_affect_only_their_joints_and_frames() -> None:
     truth = someone(2)
     errors = MeasurementErrors(0.01, dropouts=(Dropout(1.0, 2.5, ARMS["LEFT"]),), gaps=((4.0, 5.0),))
     seen = observe(truth, errors, np.random.default_rng(0))

@@ -30,7 +30,7 @@ names = st.sampled_from(list(MOTIONS))
 seeds = st.integers(0, 2**32 - 1)
 
 
-def somebody(name: str, seed: int | None) -> tuple[Person, Movement]:
+def performance(name: str, seed: int | None) -> tuple[Person, Movement]:
     """A motion by the seed's person, or the standard performance by an average man."""
     if seed is None:
         person = Person.average("male")
@@ -47,7 +47,7 @@ def watched(movement: Movement, rate: float = 30.0) -> Course:
 @cache
 def standard(name: str) -> tuple[Person, Course, FloatArray]:
     """The standard performance, at 100 Hz."""
-    person, movement = somebody(name, None)
+    person, movement = performance(name, None)
     course = watched(movement, 100.0)
     return person, course, joints(person, course)
 
@@ -82,14 +82,14 @@ def shoulder_yaw(positions: FloatArray) -> FloatArray:
 @settings(max_examples=15)
 @given(names, seeds)
 def test_no_angle_leaves_its_range(name: str, seed: int) -> None:
-    _, movement = somebody(name, seed)
+    _, movement = performance(name, seed)
     assert np.abs(RANGES.excess(watched(movement).q)).max() == 0.0
 
 
 @settings(max_examples=15)
 @given(names, seeds)
 def test_bones_keep_their_lengths(name: str, seed: int) -> None:
-    person, movement = somebody(name, seed)
+    person, movement = performance(name, seed)
     positions = joints(person, watched(movement, 20.0))
     starts, ends = np.array(BONES).T
     lengths = np.linalg.norm(positions[:, ends] - positions[:, starts], axis=-1)
@@ -99,7 +99,7 @@ def test_bones_keep_their_lengths(name: str, seed: int) -> None:
 @settings(max_examples=15)
 @given(names, seeds)
 def test_feet_are_never_below_the_floor_and_stay_where_they_stand(name: str, seed: int) -> None:
-    person, movement = somebody(name, seed)
+    person, movement = performance(name, seed)
     course = watched(movement)
     assert course.toes[..., 2].min() >= person.toe_height - 1e-9
     assert course.ankles[..., 2].min() >= person.ankle_height - 1e-9
@@ -111,8 +111,8 @@ def test_feet_are_never_below_the_floor_and_stay_where_they_stand(name: str, see
 
 @pytest.mark.parametrize("name", ["walking_and_turning", "random"])
 @pytest.mark.parametrize("seed", range(4))
-def test_whoever_walks_has_always_one_foot_that_does_not_slide(name: str, seed: int) -> None:
-    _, movement = somebody(name, seed)
+def test_walking_always_has_a_foot_that_does_not_slide(name: str, seed: int) -> None:
+    _, movement = performance(name, seed)
     times = np.arange(0.1, movement.duration - 0.1, 0.02)
     step = 1e-3
     before, after = movement.course(times - step), movement.course(times + step)
@@ -124,7 +124,7 @@ def test_whoever_walks_has_always_one_foot_that_does_not_slide(name: str, seed: 
 @pytest.mark.parametrize("name", some(list(MOTIONS), 5))
 def test_accelerations_are_continuous(name: str) -> None:
     """A jump of the acceleration makes third differences grow with the rate; bounded jerk does not."""
-    person, movement = somebody(name, 5)
+    person, movement = performance(name, 5)
     largest = []
     for step in (6e-3, 2e-3):
         positions = joints(person, movement.course(np.arange(0.0, movement.duration, step)))
@@ -135,7 +135,7 @@ def test_accelerations_are_continuous(name: str) -> None:
 @settings(max_examples=12)
 @given(names, seeds)
 def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
-    person, movement = somebody(name, seed)
+    person, movement = performance(name, seed)
     positions = joints(person, watched(movement, 60.0))
     speeds = 60.0 * np.linalg.norm(np.diff(positions, axis=0), axis=-1)
     # a boxer's fist reaches 8 m/s, a walker's foot 4 m/s; random people step by 0.6 m in 0.5 s
@@ -146,7 +146,7 @@ def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
 @settings(max_examples=15)
 @given(st.sampled_from([name for name in MOTIONS if name not in FREE]), seeds)
 def test_exercises_begin_and_end_in_a_t_pose(name: str, seed: int) -> None:
-    person, movement = somebody(name, seed)
+    person, movement = performance(name, seed)
     assert movement.tpose_s == TPOSE_S
     for begin, end in ((0.0, TPOSE_S), (movement.duration - END_S, movement.duration)):
         is_a_t_pose(joints(person, movement.course(np.linspace(begin, end, 20))))
@@ -176,7 +176,7 @@ def is_a_t_pose(positions: FloatArray) -> None:
 @pytest.mark.parametrize("name", MOTIONS)
 def test_a_seed_repeats_and_people_differ(name: str) -> None:
     times = np.linspace(0.0, 9.0, 30)
-    one, same, other = (somebody(name, seed)[1].course(times) for seed in (1, 1, 2))
+    one, same, other = (performance(name, seed)[1].course(times) for seed in (1, 1, 2))
     assert_array_equal(one.q, same.q)
     assert_array_equal(one.ankles, same.ankles)
     assert np.abs(MODEL.difference(one.q, other.q)).max() > 0.01
@@ -187,7 +187,7 @@ def test_a_seed_repeats_and_people_differ(name: str) -> None:
 
 
 def test_any_instants_may_be_asked_for_in_any_order() -> None:
-    _, movement = somebody("random", 3)
+    _, movement = performance("random", 3)
     times = np.random.default_rng(0).uniform(0.0, movement.duration, 20)
     together = movement.course(times)
     alone = np.concatenate([movement.course(times[k : k + 1]).q for k in range(20)])
@@ -243,7 +243,7 @@ def test_the_shoulders_of_the_standard_twist_turn_by_90_degrees_to_each_side() -
     assert ((lumbar[np.abs(lumbar) > 3.0] * thoracic[np.abs(lumbar) > 3.0]) > 0.0).all()
 
 
-def test_a_clavicle_rises_by_a_third_of_what_the_arm_does() -> None:
+def test_a_clavicle_rises_by_a_third_of_the_arms_elevation() -> None:
     _, course, positions = standard("arm_raises")
     # against the chest: the trunk is upright
     arm = positions[:, Joint.ELBOW_LEFT] - positions[:, Joint.SHOULDER_LEFT]
@@ -306,7 +306,7 @@ def test_fists_strike_in_turn_and_shoulders_lift() -> None:
     assert 0.05 < np.ptp(lift) < 0.12
 
 
-def test_who_walks_swings_the_arms_against_the_legs() -> None:
+def test_arms_swing_against_the_legs_when_walking() -> None:
     person, course, positions = standard("walking_and_turning")
     legs = positions[:, Joint.ANKLE_LEFT] - positions[:, Joint.ANKLE_RIGHT]
     arms = positions[:, Joint.WRIST_LEFT] - positions[:, Joint.WRIST_RIGHT]
@@ -318,7 +318,7 @@ def test_who_walks_swings_the_arms_against_the_legs() -> None:
     assert np.ptp(positions[:, Joint.SPINE_BASE, 2]) < 0.10
 
 
-def test_who_stands_still_sways_by_millimetres() -> None:
+def test_standing_people_sway_by_millimetres() -> None:
     _, _, positions = standard("standing_still")
     sway = np.ptp(positions[:, Joint.SPINE_BASE, :2], axis=0)
     assert (sway > 0.002).all() and (sway < 0.04).all()
@@ -338,7 +338,7 @@ def test_seconds_are_kept_by_repeating(name: str) -> None:
     assert ways[1] > 1.3 * ways[0]
 
 
-def test_what_cannot_be_done_is_said() -> None:
+def test_impossible_motions_are_refused() -> None:
     person = Person.average("male")
     with pytest.raises(RepertoireError, match="unknown motion 'juggling', expected one of two_handed_wave, slow_down"):
         make_movement("juggling", person)

@@ -1,4 +1,4 @@
-"""Scenes: the same setup is the same, one thing changes nothing of another, and without errors the truth is told."""
+"""Scenes are repeatable, their parts are independent, and without errors the sensors report the truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHORT = 12.0
 """Seconds: enough for a repetition of most motions, with their T-poses."""
 
 
-def said(recording: SimulatedRecording, sensor: str) -> FloatArray:
+def reported(recording: SimulatedRecording, sensor: str) -> FloatArray:
     return np.stack([frame.skeletons[0].positions for frame in recording.frames if frame.sensor == sensor])
 
 
@@ -40,7 +40,7 @@ def test_the_same_setup_gives_the_same_numbers_and_another_seed_others() -> None
     setup = Setup("hair_combing", seconds=SHORT)
     one, two, other = simulate(setup), simulate(setup), simulate(replace(setup, seed=1))
     assert [frame.received_ns for frame in one.frames] == [frame.received_ns for frame in two.frames]
-    assert_array_equal(said(one, "kinect1"), said(two, "kinect1"))
+    assert_array_equal(reported(one, "kinect1"), reported(two, "kinect1"))
     assert_array_equal(one.truths[0].q, two.truths[0].q)
     assert one.truths[0].person.stature != other.truths[0].person.stature
 
@@ -52,7 +52,7 @@ def test_a_further_sensor_or_person_or_inertial_sensor_changes_nothing_of_the_re
     one, other = simulate(two), simulate(more)
     assert_array_equal(one.truths[0].positions, other.truths[0].positions)
     for sensor in ("kinect1", "kinect2"):
-        assert_array_equal(said(one, sensor), said(other, sensor))
+        assert_array_equal(reported(one, sensor), reported(other, sensor))
     crowd = simulate(replace(two, number=3))
     assert_array_equal(crowd.truths[0].positions, one.truths[0].positions)
 
@@ -67,7 +67,7 @@ def test_other_errors_leave_people_clocks_and_captures_as_they_are() -> None:
 
 @settings(max_examples=draws(4, 8), deadline=None)
 @given(seed=st.integers(0, 1000), number=st.sampled_from(NUMBERS))
-def test_without_errors_the_sensors_tell_where_the_joints_are(seed: int, number: int) -> None:
+def test_without_errors_the_sensors_report_the_true_joints(seed: int, number: int) -> None:
     recording = simulate(Setup("two_handed_wave", layout(number), seconds=SHORT, seed=seed, errors=KinectErrors.none()))
     truth = recording.truths[0]
     for sensor in recording.sensors:
@@ -103,7 +103,7 @@ def test_velocities_are_whole_from_the_first_instant_on(seed: int) -> None:
     assert np.abs(truth.rates[0]).max() > 0.5 * np.abs(truth.rates[1]).max()
 
 
-def test_people_stand_side_by_side_and_are_told_apart() -> None:
+def test_people_stand_side_by_side_and_are_separated() -> None:
     recording = simulate(Setup("standing_still", layout(1), number=3, seconds=3.0))
     bases = np.stack([truth.positions[0, Joint.SPINE_BASE] for truth in recording.truths])
     across = np.abs(bases[:, 1] - bases[0, 1])
@@ -115,7 +115,7 @@ def test_people_stand_side_by_side_and_are_told_apart() -> None:
         assert len({skeleton.stamp_ns for skeleton in frame.skeletons}) == 1
 
 
-def test_who_walks_behind_another_is_lost_and_comes_back_and_the_truth_has_both() -> None:
+def test_a_person_behind_another_is_lost_and_found_again_and_the_truth_has_both() -> None:
     setup = Setup("walking_and_turning", around([0.0]), number=2, seconds=8.0, standard=True, places=lanes(2))
     recording = simulate(setup)
     near, far = (truth.positions[:, Joint.SPINE_MID] for truth in recording.truths)
@@ -147,16 +147,16 @@ def test_frames_come_in_the_order_of_receipt_and_after_their_capture() -> None:
         assert frame.received_ns - RECEIVED_FROM_NS > captured
 
 
-def test_iron_in_the_surroundings_turns_the_field_that_an_inertial_sensor_feels_and_nothing_else() -> None:
+def test_iron_in_the_surroundings_changes_only_the_measured_field() -> None:
     imu = SimulatedImu("imu", "forearm_left", usual_mounting("forearm_left"))
     clean = Setup("standing_still", imus=(imu,), seconds=SHORT)
     magnet = Iron(clean.layout.position + [0.0, 0.5, 0.8], np.array([0.0, 30.0, 0.0]))
-    (_, felt), (_, disturbed) = (
+    (_, undisturbed), (_, disturbed) = (
         simulate(each).imus[0] for each in (clean, replace(clean, surroundings=Surroundings(iron=(magnet,))))
     )
-    assert felt.magnetic_field is not None and disturbed.magnetic_field is not None
-    assert np.linalg.norm(disturbed.magnetic_field - felt.magnetic_field, axis=1).min() > 1e-6
-    assert_array_equal(disturbed.linear_acceleration, felt.linear_acceleration)
+    assert undisturbed.magnetic_field is not None and disturbed.magnetic_field is not None
+    assert np.linalg.norm(disturbed.magnetic_field - undisturbed.magnetic_field, axis=1).min() > 1e-6
+    assert_array_equal(disturbed.linear_acceleration, undisturbed.linear_acceleration)
 
 
 def test_an_inertial_sensor_turns_as_its_segment_does() -> None:
@@ -181,6 +181,6 @@ def test_an_inertial_sensor_turns_as_its_segment_does() -> None:
         ({"seconds": float("nan")}, "nan seconds"),
     ],
 )
-def test_what_cannot_be_is_refused(changes: dict[str, object], message: str) -> None:
+def test_impossible_setups_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(SceneError, match=message):
         replace(Setup("squat"), **changes)  # type: ignore[arg-type]

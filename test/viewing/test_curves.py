@@ -1,4 +1,4 @@
-"""Curves of angles: nothing that matters is lost when samples are left out, and what is not known is not hidden."""
+"""Reduced curves of angles keep their extremes, and show what is unknown."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_band_has_95_percent_of_a_normal_distribution() -> None:
     assert (np.abs(samples) < BAND).mean() == pytest.approx(0.95, abs=0.003)
 
 
-def test_what_nothing_observes_has_a_wide_band_and_no_invented_angle() -> None:
+def test_unobserved_angles_have_a_wide_band_and_no_invented_value() -> None:
     history = filled(10)
     history.add(10 * STEP_NS, NAMES, np.array([0.3, 0.5]), np.array([np.inf, 0.01]))
     history.add(11 * STEP_NS, NAMES, np.array([np.nan, 0.5]), np.array([np.nan, 0.01]))
@@ -65,7 +65,7 @@ def test_what_nothing_observes_has_a_wide_band_and_no_invented_angle() -> None:
     assert other is not None and other.latest_stddev == pytest.approx(np.degrees(0.01))
 
 
-# --- what is kept
+# --- kept samples
 
 
 def test_the_window_is_kept_and_the_newest_is_at_zero() -> None:

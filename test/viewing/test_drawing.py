@@ -24,8 +24,8 @@ class Drawing(SimpleNamespace):
             page=SimpleNamespace(watched=1),
             ended=threading.Event(),
             monitor=SimpleNamespace(totals=Counter()),
-            context=SimpleNamespace(try_shutdown=lambda: self.said.append("ended")),
-            said=[],
+            context=SimpleNamespace(try_shutdown=lambda: self.reported.append("ended")),
+            reported=[],
             failing=failing,
             until=until,
             tried=0,
@@ -41,10 +41,10 @@ class Drawing(SimpleNamespace):
             raise RuntimeError("deque mutated during iteration")
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(fatal=self.said.append)
+        return SimpleNamespace(fatal=self.reported.append)
 
     def log_throttled(self, key: str, text: str) -> None:
-        self.said.append(f"warned of {key}")
+        self.reported.append(f"warned of {key}")
 
 
 def test_a_drawing_that_fails_is_tried_again_and_counted() -> None:
@@ -52,12 +52,12 @@ def test_a_drawing_that_fails_is_tried_again_and_counted() -> None:
     ViewerNode.keep_drawing(drawing)  # type: ignore[arg-type]
     assert (drawing.tried, drawing.drawn) == (20, 17)
     assert drawing.monitor.totals["drawings failed"] == 3
-    assert drawing.said == ["warned of drawing"] * 3
+    assert drawing.reported == ["warned of drawing"] * 3
 
 
-def test_where_all_drawings_fail_the_node_ends_and_says_why() -> None:
+def test_the_node_reports_repeated_failures_of_drawing_and_ends() -> None:
     drawing = Drawing(range(1, 1000), 1000)
     ViewerNode.keep_drawing(drawing)  # type: ignore[arg-type]
     assert drawing.tried == 10
-    assert "drawing failed 10 times" in drawing.said[-2] and "deque mutated" in drawing.said[-2]
-    assert drawing.said[-1] == "ended"
+    assert "drawing failed 10 times" in drawing.reported[-2] and "deque mutated" in drawing.reported[-2]
+    assert drawing.reported[-1] == "ended"

@@ -34,7 +34,7 @@ from body_tracking.viewing.snapshot import PageError
         ("https://example.com", "127.0.0.1:8080", False),
         ("http://127.0.0.1:8000", "127.0.0.1:8080", False),  # another server of this machine
         ("http://localhost:8080", "127.0.0.1:8080", False),
-        ("http://example.com:8080", "example.com:8080", False),  # whose DNS says that it is this machine
+        ("http://example.com:8080", "example.com:8080", False),  # a foreign name that resolves to this machine
         ("http://127.0.0.1.example.com:8080", "127.0.0.1.example.com:8080", False),
         ("null", "127.0.0.1:8080", False),  # a file, or a frame in a sandbox
         ("", "127.0.0.1:8080", False),
@@ -42,7 +42,7 @@ from body_tracking.viewing.snapshot import PageError
         ("http://127.0.0.1:8080", None, False),
     ],
 )
-def test_whose_page_asks(origin: str | None, host: str | None, own: bool) -> None:
+def test_origin_is_compared_with_host(origin: str | None, host: str | None, own: bool) -> None:
     assert is_own(origin, host) == own
 
 
@@ -77,7 +77,7 @@ def test_no_page_of_another_site_may_show_it_in_a_frame(port: int) -> None:
         assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
 
 
-def test_what_serves_afterwards_is_not_touched() -> None:
+def test_servers_started_afterwards_are_not_patched() -> None:
     serve = websockets.asyncio.server.serve
     with pytest.raises(PageError, match="cannot be guarded"), same_origin():
         pass

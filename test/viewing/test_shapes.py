@@ -1,4 +1,4 @@
-"""What is drawn is where it is said to be: ellipsoids hold their share, capsules join joints, red is what is lost."""
+"""Shapes: ellipsoids contain their share, capsules join joints, lost joints are red."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 def standing(
     rng: np.random.Generator, states: int | FloatArray = 2, covariances: FloatArray | None = None, body: int = 0
 ) -> Skeleton:
-    """Joints anywhere; what is drawn does not ask for a person."""
+    """Joints at random positions."""
     positions = rng.normal(size=(N_JOINTS, 3))
     return Skeleton(0, "world", positions, np.broadcast_to(np.uint8(states), N_JOINTS).copy(), body, covariances)
 
@@ -48,7 +48,7 @@ def test_an_ellipsoid_is_the_surface_of_its_covariance(seed: int) -> None:
     assert distances == pytest.approx(chi2.ppf(0.95, 3), rel=1e-5)
 
 
-def test_what_has_no_covariance_has_no_ellipsoid_and_what_has_a_huge_one_hides_nothing() -> None:
+def test_no_ellipsoid_without_covariance_and_a_limited_one_with_a_huge_covariance() -> None:
     rng = np.random.default_rng(1)
     covariances = spread(rng)
     covariances[Joint.HEAD] = np.nan
@@ -91,7 +91,7 @@ def test_intensities_give_the_colour_back_as_a_screen_shows_them() -> None:
 # --- skeletons
 
 
-def test_a_figure_draws_every_body_of_a_cloud_and_only_what_has_a_place() -> None:
+def test_a_figure_has_every_body_and_only_joints_with_a_position() -> None:
     rng = np.random.default_rng(2)
     one, two = standing(rng), standing(rng, body=1)
     one.positions[Joint.WRIST_LEFT] = np.nan
@@ -133,7 +133,7 @@ def test_a_frustum_has_the_angles_of_its_view_and_looks_along_z() -> None:
     assert {tuple(corner) for corner in edges[4:, 0]} == {tuple(corner) for corner in corners}
 
 
-def test_what_a_level_sensor_sees_ahead_is_ahead_in_world() -> None:
+def test_points_ahead_of_a_level_sensor_are_ahead_in_world() -> None:
     pose = level_pose("kinect1", height=1.0)
     seen = Skeleton(
         7, "kinect1_optical_frame", np.tile([0.0, -0.5, 2.0], (N_JOINTS, 1)), np.full(N_JOINTS, 2, np.uint8)

@@ -1,4 +1,4 @@
-"""The table of nodes: what is silent is not shown as alive, and no node can write into the page."""
+"""The table of nodes: silent nodes are shown as silent, and texts are escaped."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ def test_a_figure_that_is_none_is_left_out(values: dict[str, str], rate: str) ->
     assert " ms" not in text and rate in text and ("Hz" in text) == bool(rate)
 
 
-def test_what_nodes_say_is_text() -> None:
+def test_node_texts_are_escaped() -> None:
     text = table({"<b>x": NodeStatus("<b>x: y", 2, "<script>alert(1)</script>")}, 0.0)
     assert "<script>" not in text and "&lt;script&gt;" in text and "<b>x" not in text
