@@ -20,7 +20,7 @@ from body_tracking.inertial.alignment import pose_rotations, rotation_vectors
 from body_tracking.inertial.mounting import mounting, mountings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import Slip, usual_mounting
-from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, Told
+from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackerOutput
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS
 
@@ -249,8 +249,8 @@ def held(
         if fused_late_ns is not None:
             received_ns = stamp_ns + 15_000_000
             if heard:
-                tracker.hear(stamp_ns + 5 * NANOSECONDS, received_ns)
-            tracker.see(replace(skeleton, stamp_ns=stamp_ns + 5 * NANOSECONDS), received_ns + fused_late_ns)
+                tracker.take_camera_frame(stamp_ns + 5 * NANOSECONDS, received_ns)
+            tracker.take_skeleton(replace(skeleton, stamp_ns=stamp_ns + 5 * NANOSECONDS), received_ns + fused_late_ns)
     return told
 
 
@@ -278,7 +278,7 @@ def told_later(
     turned: FloatArray = STILL,
     *,
     skeleton: bool = True,
-) -> Told:
+) -> TrackerOutput:
     """What a reading of the left forearm, so long after a T-pose, makes the tracker tell."""
     level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
     stamp_ns += 110 * NANOSECONDS

@@ -26,7 +26,7 @@ def test_stamps_of_all_clocks_come_out_in_that_of_the_camera(left: int, right: i
     clocks = SensorClocks(OWN, SENSORS)
     assert not clocks.camera_known
     for stamp, received in heard(camera):
-        clocks.hear(stamp, received)
+        clocks.take_camera_frame(stamp, received)
     assert clocks.camera_known
     for name, offset in zip(SENSORS, (left, right), strict=True):
         own = ReceiptClock()
@@ -39,7 +39,7 @@ def test_stamps_of_all_clocks_come_out_in_that_of_the_camera(left: int, right: i
 def test_of_clocks_that_are_shared_one_tells_of_all(offset: int) -> None:
     clocks = SensorClocks(SHARED, SENSORS)
     for stamp, received in heard(offset):
-        clocks.take(stamp, received)
+        clocks.take_reading(stamp, received)
     nothing = ReceiptClock()
     assert clocks.offset_ns(SENSORS[0], nothing) == clocks.offset_ns(SENSORS[1], nothing) == -offset
     clocks.correct(SENSORS[1], 1.0, 0.02, 0.001)
@@ -70,23 +70,23 @@ def test_a_camera_counts_by_its_own_frames_where_they_are_heard() -> None:
     for stamp, received in heard(0):
         own.add(stamp, received)
     for stamp, received in heard(0, transport_ns=30 * 10**6):  # skeletons come late
-        assert not clocks.see(stamp, received, jumped=False)
+        assert not clocks.take_skeleton(stamp, received, jumped=False)
     assert clocks.offset_ns(SENSORS[0], own) == -30 * 10**6
-    begun = [clocks.hear(stamp, received) for stamp, received in heard(0)]
+    begun = [clocks.take_camera_frame(stamp, received) for stamp, received in heard(0)]
     assert begun[0] and not any(begun[1:])
     assert clocks.offset_ns(SENSORS[0], own) == 0
     for stamp, received in heard(0, transport_ns=30 * 10**6):
-        clocks.see(stamp, received, jumped=False)
+        clocks.take_skeleton(stamp, received, jumped=False)
     assert clocks.offset_ns(SENSORS[0], own) == 0
 
 
 def test_a_camera_whose_clock_is_set_is_noticed() -> None:
     clocks = SensorClocks(OWN, SENSORS)
     (stamp, received), *_ = heard(0)
-    assert not clocks.see(stamp, received, jumped=False)
-    assert clocks.see(stamp + 60 * NANOSECONDS, received + NANOSECONDS, jumped=False)
-    assert clocks.see(stamp, received + 2 * NANOSECONDS, jumped=True)
+    assert not clocks.take_skeleton(stamp, received, jumped=False)
+    assert clocks.take_skeleton(stamp + 60 * NANOSECONDS, received + NANOSECONDS, jumped=False)
+    assert clocks.take_skeleton(stamp, received + 2 * NANOSECONDS, jumped=True)
     frames = SensorClocks(OWN, SENSORS)
-    assert frames.hear(stamp, received)
-    assert not frames.hear(stamp + NANOSECONDS, received + NANOSECONDS)
-    assert frames.hear(stamp - 60 * NANOSECONDS, received + 2 * NANOSECONDS)
+    assert frames.take_camera_frame(stamp, received)
+    assert not frames.take_camera_frame(stamp + NANOSECONDS, received + NANOSECONDS)
+    assert frames.take_camera_frame(stamp - 60 * NANOSECONDS, received + 2 * NANOSECONDS)

@@ -139,7 +139,7 @@ def feed(
         if now > seconds:
             break
         if isinstance(what, Skeleton):
-            tracker.see(what, received_ns)
+            tracker.take_skeleton(what, received_ns)
         else:
             assert isinstance(what, ImuSample)
             if meddle is not None:
