@@ -1,4 +1,4 @@
-"""How a person is expected to move on, and how briskly."""
+"""Motion model of a person, with adaptive noise densities."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Motion:
     def densities_learnt(
         self, state: State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
     ) -> FloatArray:
-        """The spectral densities, from whether the corrections of the velocities lean to one side."""
+        """Adapt the spectral densities to the mean corrections of the velocities."""
         rate = self._parameters.density_rate * dt / _WHITENESS_TIME
         # coordinates that the measurement does not touch say nothing
         share = variance / (variance + _UNTOUCHED * remaining + 1e-30)
