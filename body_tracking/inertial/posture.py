@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import AlignmentError, rotation_vectors
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
@@ -108,32 +107,6 @@ class OrientationKinematics:
         covariance = np.diag(np.full(model.nv, np.inf))
         covariance[3:, 3:] = np.linalg.inv(information)
         return best, covariance
-
-    def estimate(
-        self,
-        stamp_ns: int,
-        rotations: FloatArray,
-        covariances: FloatArray,
-        lengths: FloatArray,
-        previous: FloatArray | None = None,
-        frame_id: str = "world",
-    ) -> ModelEstimate:
-        """The solution as an estimate for the angle conventions, with NaN velocities.
-
-        Args:
-            stamp_ns: nanoseconds.
-            rotations: as of :meth:`solve`.
-            covariances: as of :meth:`solve`.
-            lengths: (21,) metres.
-            previous: (35,) initial configuration.
-            frame_id: of the orientations.
-        """
-        model = self._model
-        q, covariance = self.solve(rotations, covariances, previous)
-        whole = np.diag(np.full(2 * model.nv, np.inf))
-        whole[: model.nv, : model.nv] = covariance
-        unknown = np.full(model.nv, np.nan)
-        return ModelEstimate(stamp_ns, frame_id, 0, q, unknown, whole, lengths, np.zeros(len(lengths)))
 
     def _start(self, rotations: FloatArray) -> FloatArray:
         """Ball joints by the nearest sensors, the other angles at the middle of their ranges."""

@@ -27,10 +27,10 @@ _MOST, _DOUBTED = 1.0, 10.0
 class Facing:
     """Swaps left and right of frames that contradict the state.
 
-    A Kinect takes every body to face it, and exchanges left and right of one that has turned away. A filter that has
-    followed the turn knows better. One that knows cameras alone may have been wrong from the beginning; where the
-    orientation of an arm is measured it is told so: the arms would have to be twisted as none is, or that arm points
-    where the other one is seen to.
+    A Kinect assumes that every body faces it, and swaps left and right of one that has turned away. A filter that has
+    followed the turn detects the swap. With cameras alone its facing may be wrong from the start; a measured
+    orientation of an arm shows this: the arms would be twisted beyond their ranges, or that arm points where the other
+    one is seen.
 
     Args:
         space: of the states.

@@ -262,9 +262,8 @@ class OrientationUpdate:
     def without_thumbs(self, state: State, measurement: Measurement) -> Measurement:
         """A frame without the thumbs of forearms or hands whose orientation is measured.
 
-        A thumb is all that tells a camera how a forearm is turned about itself, and it is off for as long as it looks
-        the same: by 50 degrees with a Kinect v2. Any alignment of an inertial sensor is better than what it would be
-        corrected to.
+        For a camera only the thumb shows the axial rotation of a forearm, with a persistent error of 50 degrees for a
+        Kinect v2. Any alignment of an inertial sensor is better.
         """
         unseen = self._space.thumbs[state.sources.segments].any(axis=0)
         return replace(measurement, measured=measurement.measured & ~unseen)

@@ -120,10 +120,10 @@ class Output:
         space = self._space
         q, covariance = self._handed_out(state)
         lines = self._model.linearise(q, state.lengths)
-        told = covariance[: space.observed, : space.observed]
+        observed = covariance[: space.observed, : space.observed]
         joints = self._model.joints
         observation = space.observation(lines)
-        spread = observation @ told @ observation.T
+        spread = observation @ observed @ observation.T
         positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
         covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)

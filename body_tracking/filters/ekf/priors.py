@@ -64,7 +64,7 @@ class Priors:
         prior = self._prior.rows(state.q, self._model.linearise(state.q, state.lengths))
         values, gradients, stddev = prior.residuals, prior.gradients, self._stddev
         excess = self._ranges.excess_of(prior.coordinates)
-        if state.sources.names:  # the posture prior is not validated beside sensors whose mounting is being estimated
+        if state.sources.names:  # the posture prior is not validated with sensors whose mounting is being estimated
             values[:-3], stddev = prior.coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)

@@ -322,7 +322,7 @@ class SkeletonUpdate:
         return sensor.stamps[-1] if sensor is not None and sensor.stamps else measurement.stamp_ns
 
     def _measured(self, state: State, measurement: Measurement) -> State:
-        """The lengths that many poses tell, which take the place of those that the filter had."""
+        """Replace the lengths by those estimated from many poses."""
         space = self._space
         if state.seen is None:
             return state
