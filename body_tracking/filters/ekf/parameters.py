@@ -93,9 +93,7 @@ class EkfParameters(OrientationParameters):
 
     posture: bool = field(
         default=True,
-        metadata={
-            "doc": "a prior of posture for directions that points do not show, such as how the spine shares a bend"
-        },
+        metadata={"doc": "posture prior for directions that points do not show, such as how the spine shares a bend"},
     )
     t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 

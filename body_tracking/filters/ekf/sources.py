@@ -12,8 +12,8 @@ filter. All seven numbers are estimated with the body; their parts that cannot b
 forearm's axial misalignment and its pronation) keep their deviation. This requires a linearisation with the same
 direction for both at every estimate, so m is expressed in the segment's frame and not in the sensor's, which rotates
 with the estimate (Huang, Mourikis and Roumeliotis 2010 on such spurious information). An angular velocity that comes
-with an orientation corrects the velocities only: its error persists, and is not in the state. Errors of rotations are rotation vectors (Sola, Deray and Atchuthan
-2018).
+with an orientation corrects the velocities only: its error persists, and is not in the state. Errors of rotations are
+rotation vectors (Sola, Deray and Atchuthan 2018).
 """
 
 from __future__ import annotations
