@@ -1,7 +1,6 @@
-"""Filters: skeletons in, smoother skeletons with covariances and velocities out; one of them on a body model.
+"""Filters from skeletons to smoothed skeletons with covariances and velocities; one of them on a body model.
 
-Knows ``skeleton.py`` and ``kinematics`` (how people move, the body models); used by the nodes and the offline replay,
-which choose a filter by its name. The filters themselves are imported when one is made: scipy takes its time.
+The stage chooses a filter by its name. A filter's module is imported when it is made, as importing scipy takes long.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from body_tracking.kinematics.upper_body import UpperBody
 
 _LINEAR: Final = ("linear", "LinearKalmanFilter", "LinearKalmanParameters", "")
-# name: module, class, class of its parameters, prefix of their names where several filters' stand together
+# name: module, class, class of its parameters, prefix of their names in the table of all filters
 _FILTERS: Final = {
     "lkf_zero_velocity": _LINEAR,
     "lkf_constant_velocity": _LINEAR,
@@ -34,12 +33,12 @@ FILTERS: Final = tuple(_FILTERS)
 
 
 class SkeletonFilter(Protocol):
-    """What a filter of skeletons offers, whatever is inside."""
+    """The interface of all filters."""
 
     counters: dict[str, int]
 
     def update(self, skeleton: Skeleton) -> Skeleton | None:
-        """Take one frame; the filtered skeleton of the same stamp, or None where there is nothing to say."""
+        """Take one frame; the filtered skeleton of the same stamp, or None without an estimate."""
 
     def reset(self) -> None:
         """Forget the person; the counters stay."""
@@ -47,32 +46,32 @@ class SkeletonFilter(Protocol):
 
 @runtime_checkable
 class ModelFilter(SkeletonFilter, Protocol):
-    """A filter on a body model, which takes each sensor's frames by themselves and knows what is to be expected."""
+    """A filter on a body model, which takes each sensor's frames separately and predicts."""
 
     model: UpperBody
 
     def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
-        """Take one frame of one sensor, as above."""
+        """Take one frame of one sensor."""
 
     def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
-        """The same without making the filtered skeleton; whether there is something to say of its time."""
+        """Take one frame without making the filtered skeleton; whether there is an estimate at its time."""
 
     def take_orientation(self, measurement: SegmentOrientation) -> bool:
-        """Take the orientation of one segment; whether there is something to say of its time."""
+        """Take the orientation of one segment; whether there is an estimate at its time."""
 
     def settle(self, until_ns: int) -> None:
-        """Do what waits, where nothing of before a time is to be expected any more; it changes no result."""
+        """Do deferred work when no measurement from before a time will come; results do not change."""
 
     @property
     def filtered(self) -> Skeleton | None:
-        """The filtered skeleton after the last frame in its order; None before a first."""
+        """The filtered skeleton at the latest frame; None before the first one."""
 
     @property
     def estimate(self) -> ModelEstimate | None:
-        """The state of the model after the last frame; None before a first."""
+        """The state of the model at the latest frame; None before the first one."""
 
     def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
-        """What is to be expected at a later time; None where the person is lost."""
+        """The prediction at a later time; None where the person is lost."""
 
 
 def _from(module: str, name: str) -> Any:
@@ -80,7 +79,7 @@ def _from(module: str, name: str) -> Any:
 
 
 def parameter_classes() -> dict[str, type[Any]]:
-    """The classes of all filters' parameters, by the prefix of their names where they stand together."""
+    """The parameter classes of all filters, by prefix."""
     return {prefix: _from(module, name) for module, _, name, prefix in _FILTERS.values()}
 
 
@@ -92,7 +91,7 @@ def _row(name: str) -> tuple[str, str, str, str]:
 
 
 def parameter_prefix(name: str) -> str:
-    """The prefix of the parameters of a filter; see :func:`parameter_classes`.
+    """The prefix of a filter's parameters; see :func:`parameter_classes`.
 
     Raises:
         FilterError: an unknown name.
@@ -101,7 +100,7 @@ def parameter_prefix(name: str) -> str:
 
 
 def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
-    """A filter by its name.
+    """Make a filter by its name.
 
     Args:
         name: one of ``FILTERS``.

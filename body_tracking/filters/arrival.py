@@ -1,4 +1,4 @@
-"""Which frames a filter takes: every stamp once and in order; a jump of time or of the frame starts anew."""
+"""Classification of frames by their stamps: every stamp once and in order; jumps restart the filter."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 
 
 class Arrival(Enum):
-    """What a frame is to the one before it."""
+    """Relation of a frame to the previous one."""
 
     FIRST = auto()
     NEXT = auto()
     AFTER_GAP = auto()
     """Later than ``reset_gap`` allows."""
     AFTER_JUMP = auto()
-    """In another frame, or so much earlier that time went back: nothing known of the person holds any more."""
+    """In another frame of reference, or so much earlier that time jumped back: the estimate is void."""
     IGNORED = auto()
-    """A repeated stamp, or a frame that came late."""
+    """A repeated stamp, or a late frame."""
 
 
 class Arrivals:
-    """Compares each frame with the one before it, and counts what is not ordinary.
+    """Classifies each frame, and counts the irregular ones.
 
-    The number of the body may change from frame to frame, as sensors number it differently.
+    The body's number may change from frame to frame, as sensors number bodies differently.
 
     Args:
         counters: those of the filter; ``NAMES`` are added to them.
-        reorder_window: seconds by which a late frame may be older than the last one; an older one is a jump of time.
-        reset_gap: seconds between frames from which on there is a gap.
+        reorder_window: greatest age of a late frame against the last one, seconds; an older one is a jump of time.
+        reset_gap: seconds between frames from which there is a gap.
 
     Attributes:
-        elapsed: seconds from the last frame to the one taken now; 0 for a first one and after a jump.
+        elapsed: seconds from the previous frame to the last one; 0 for the first one and after a jump.
     """
 
     NAMES = ("frames", "repeated_stamps", "late_frames", "backward_jumps", "gaps", "frame_changes")
@@ -51,7 +51,7 @@ class Arrivals:
         self.elapsed = 0.0
 
     def take(self, skeleton: Skeleton) -> Arrival:
-        """What a frame is; it becomes the last one unless it is ignored."""
+        """Classify a frame, and make it the last one unless it is ignored."""
         arrival = self._compared(skeleton.frame_id, skeleton.stamp_ns - self._stamp_ns)
         if arrival is Arrival.IGNORED:
             return arrival

@@ -4,18 +4,18 @@ Each joint has a filter of its own with the thesis's state: its position (zero-v
 and velocity (constant-velocity model, eq. 5.12). Unlike there, the process noise is a continuous white noise with the
 time step that really passed, the measurement noise is the fused skeleton's own, and every innovation is gated.
 
-A depth sensor's skeleton is wrong by centimetres but trembles by millimetres: most of its error stays for seconds (a
-joint placed beside the anatomical one, a tilt by the viewing direction). A filter told that all of it were white would
-average it away on paper only. So the measurement covariance ``R`` is split: ``white_noise_share`` of it drives the
-gain, the rest is carried along and added to the covariance that is handed out; gating allows for all of it.
+The errors of a depth sensor's skeleton are centimetres, its white noise millimetres: most errors persist for seconds (a
+joint offset from the anatomical one, a tilt by the viewing direction). A filter with all of it as white noise would
+understate its covariance. So the measurement covariance ``R`` is split: ``white_noise_share`` of it determines the
+gain, the rest is added to the output covariance; the gate uses all of it.
 
-What no sensor shows does not fly on as it last moved: at constant velocity a hand that is hidden in mid-reach would be
-a metre away after half a second. It is carried along by the nearest joint towards the trunk that is seen, and its own
-movement against that one fades (an Ornstein-Uhlenbeck process, whose velocity has the initial deviation for ever).
+At constant velocity a joint that is hidden in mid-reach would be a metre away after half a second. Instead, a hidden
+joint moves with the nearest seen joint towards the trunk, and its velocity relative to that one decays (an
+Ornstein-Uhlenbeck process whose stationary velocity has the initial standard deviation).
 
-A limb that is thrust forward is no outlier, and following it with the gain of a quiet one leaves it farther behind with
-every frame until it is taken for one. So each joint's process noise grows with its surprising innovations, and is back
-soon (adjustable level of the process noise, Bar-Shalom, Li and Kirubarajan 2001, section 11.2).
+A sudden movement is no outlier, but with the gain of a slow one the filter would lag until it is rejected. So each
+joint's process noise grows with large innovations and decays soon (adjustable level of the process noise, Bar-Shalom,
+Li and Kirubarajan 2001, section 11.2).
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ CONSTANT_VELOCITY = "lkf_constant_velocity"
 LINEAR_MODELS = (ZERO_VELOCITY, CONSTANT_VELOCITY)
 
 T_POSE = (
-    "learn from a T-pose that is held still for a second where the sensors take the joints' centres to be, and take it "
-    "off: straight arms are straight then; of skeletons that state covariances only"
+    "estimate the sensors' offsets of the joint centres from a T-pose that is held still for a second, and subtract "
+    "them, so that straight arms are straight; only for skeletons with covariances"
 )
-"""What the parameter of this name does, in all filters that have it."""
+"""Description of the parameter of this name, for all filters that have it."""
 _MAX_RANGE = 100.0
-"""A coordinate beyond this many metres is no measurement of a person but a damaged number."""
+"""Metres: a larger coordinate is damaged data."""
 _REFERENCE_DISTANCE = 2.0
-"""Metres within which the measurement noise no longer shrinks."""
+"""Metres: the modelled measurement noise is proportional to the distance from here on, and constant below."""
 _EYE3 = np.eye(3)
 _LEAST_VARIANCE = 1e-12
-"""Square metres: a covariance that claims less in any direction, a micrometre, is damaged, and cannot be inverted."""
+"""Square metres: a covariance with a smaller eigenvalue is damaged, and cannot be inverted."""
 _SURPRISING, _MOST_SURPRISING = 4.0, 10.0
-"""Times its expectation from which a normalised innovation squared raises the process noise, and up to which."""
+"""Multiples of its expectation between which a normalised innovation squared raises the process noise."""
 _MOST_LEVEL = np.log(200.0)
-"""Of a joint with 50 m/s2, the fastest that people punch, instead of 3."""
+"""Greatest log of the factor on the process noise: accelerations of 50 m/s2, a fast punch, instead of 3."""
 _ALL: IntArray = np.arange(N_JOINTS, dtype=np.intp)
 
 
 def _towards_trunk() -> IntArray:
-    """(25,) the next joint towards the base of the spine, which is its own."""
+    """(25,) the next joint towards the base of the spine; the base itself for the base."""
     towards = _ALL.copy()
     for parent, child in BONES:
         towards[child] = parent
@@ -77,12 +77,12 @@ _TOWARDS_TRUNK = _towards_trunk()
 
 
 class FilterError(BodyTrackingError):
-    """A filter was asked for by an unknown name or with parameters that make no sense."""
+    """Raised for an unknown filter or invalid parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinearKalmanParameters:
-    """The settings of both linear filters; each field's metadata says what it is, its unit and its range.
+    """The settings of both linear filters; each field's metadata has its meaning, unit and range.
 
     Raises:
         FilterError: a value out of its range.
@@ -136,22 +136,22 @@ class LinearKalmanParameters:
     )
     white_noise_share: float = number_field(
         0.06,
-        "share of the measurement variance that is new in every frame, and is filtered; the rest is a slow "
-        "error that no filter can remove, and is added to the covariance of the result",
+        "share of the measurement variance that is white, and is filtered; the rest is a slow error that no "
+        "filter can remove, and is added to the output covariance",
         "",
         0.001,
         1.0,
     )
     adaptation: float = number_field(
         0.5,
-        "by how much the logarithm of a joint's process noise rises with each normalised innovation squared "
-        "beyond four times its expectation; 0 leaves the noise as it is",
+        "increase of the logarithm of a joint's process noise per normalised innovation squared beyond four "
+        "times its expectation; 0 keeps the noise constant",
         "",
         0.0,
         10.0,
     )
     adaptation_time: float = number_field(
-        0.1, "time constant with which that fades: a thrust lasts that long", "s", 0.001, 100.0
+        0.1, "time constant of the decay of this increase: the duration of a sudden movement", "s", 0.001, 100.0
     )
     initial_velocity_stddev: float = number_field(
         1.0, "standard deviation per axis of the velocity of a joint when it is first seen", "m/s", 1e-3, 100.0
@@ -166,8 +166,8 @@ class LinearKalmanParameters:
     )
     reacquire_after: float = number_field(
         0.12,
-        "a joint rejected without a break for longer than this is started anew on its measurement; much "
-        "later the grown uncertainty would let it in as a sudden movement, and overshoot",
+        "a joint rejected for longer than this restarts at its measurement; much later the grown variance "
+        "would accept it as a sudden movement, and overshoot",
         "s",
         0.0,
         60.0,
@@ -175,14 +175,12 @@ class LinearKalmanParameters:
     predict_for: float = number_field(
         0.5, "a joint without an accepted measurement for longer than this is lost: not tracked, NaN", "s", 0.0, 60.0
     )
-    reset_gap: float = number_field(
-        1.0, "a gap between frames longer than this starts every joint anew", "s", 0.01, 600.0
-    )
+    reset_gap: float = number_field(1.0, "a gap between frames longer than this restarts every joint", "s", 0.01, 600.0)
 
     reorder_window: float = number_field(
         0.1,
-        "a frame older than the last one by no more than this came late and is ignored; an older one is a "
-        "backward jump of time, which starts every joint anew",
+        "a frame older than the last one by no more than this is late and ignored; an older one is a backward "
+        "jump of time, which restarts every joint",
         "s",
         0.0,
         10.0,
@@ -200,11 +198,11 @@ class LinearKalmanFilter:
     [[dt^3/3, dt^2/2], [dt^2/2, dt]] (constant velocity: white acceleration; Bar-Shalom 2001, eq. 6.2.2-12). Both make
     two half steps equal to one whole.
 
-    A missing joint has an observation matrix of zeros, hence exactly no gain and no innovation (thesis, eq. 5.21-5.22).
-    A rejected one goes back to its prior, which is the same.
+    A missing joint has an observation matrix of zeros, hence neither gain nor innovation (thesis, eq. 5.21-5.22). A
+    rejected one is reset to its prior, which is equivalent.
 
     Attributes:
-        counters: what happened since the construction, for diagnostics; joints are counted one by one.
+        counters: events since the construction, for diagnostics; joints are counted individually.
         innovation_distances: (25,) squared Mahalanobis distance of the last frame's innovations by the white part of
             the noise (the normalised innovation squared, chi-square with 3 degrees of freedom where the model holds);
             NaN where a joint had no measurement or no prior.
@@ -220,7 +218,7 @@ class LinearKalmanFilter:
         Raises:
             FilterError: an unknown model.
         """
-        from filterpy.common import Q_continuous_white_noise  # takes 0.8 s, which only who filters need pay
+        from filterpy.common import Q_continuous_white_noise  # takes 0.8 s: import only for this filter
 
         if model not in LINEAR_MODELS:
             raise FilterError(f"unknown linear filter {model!r}, expected one of {', '.join(LINEAR_MODELS)}")
@@ -235,7 +233,7 @@ class LinearKalmanFilter:
             self._order = 1
             densities = (p.velocity_density_trunk, p.velocity_density_limb, p.velocity_density_extremity)
             unit_step, powers = np.eye(3), np.array([[1.0]])
-        # Every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it.
+        # every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it
         self._unit_noise: FloatArray = joint_densities(densities)[:, None, None] * unit_step
         self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
         # an Ornstein-Uhlenbeck velocity of variance s driven by white noise of density q fades in 2 s / q
@@ -279,15 +277,15 @@ class LinearKalmanFilter:
             The same body at the same stamp: position and covariance (position part of ``P`` and the slow part of the
             noise); velocity (constant velocity) or NaN (the zero-velocity model has none); and the state: the
             measurement's where it was used, INFERRED where the joint is predicted, NOT_TRACKED with NaN and an
-            infinite covariance where it is lost or was never seen. None where the stamp repeats the last one or is a
-            little older, or no joint is known.
+            infinite covariance where it is lost or was never seen. None for a repeated or late stamp, and where no
+            joint is known.
         """
         arrival = self._arrivals.take(skeleton)
         if arrival is Arrival.IGNORED:
             return None
         if arrival is Arrival.AFTER_JUMP:
             self._centres.reset()
-        if arrival is not Arrival.NEXT:  # after a gap it is still the same person
+        if arrival is not Arrival.NEXT:
             self._restart()
         step = self._arrivals.elapsed if arrival is Arrival.NEXT else 0.0
         if self.parameters.t_pose:
@@ -295,7 +293,7 @@ class LinearKalmanFilter:
         positions, measured = self._measurement(skeleton)
         noise = self._measurement_noise(skeleton, positions, measured)
         rejected = self._filter(positions, noise, measured & self._alive, step)
-        self._book(step, measured, rejected)
+        self._update_ages(step, measured, rejected)
 
         started = measured & (~self._alive | (self._rejected > self.parameters.reacquire_after))
         if started.any():
@@ -308,7 +306,7 @@ class LinearKalmanFilter:
         return self._output(skeleton, used)
 
     def _measurement(self, skeleton: Skeleton) -> tuple[FloatArray, BoolArray]:
-        """(25, 3) positions without a NaN or infinity, (25,) which of them are measurements."""
+        """(25, 3) finite positions, (25,) whether they are measured."""
         # abs() < limit is False for NaN and infinity too
         sane = (np.abs(skeleton.positions) < _MAX_RANGE).all(axis=1)
         measured: BoolArray = sane & (skeleton.states > TrackingState.NOT_TRACKED)
@@ -316,7 +314,7 @@ class LinearKalmanFilter:
         return np.where(measured[:, None], corrected, 0.0), measured
 
     def _measurement_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
-        """(25, 3, 3) covariance of the measurements, positive definite; the identity where there is none."""
+        """(25, 3, 3) covariance of the measurements, positive definite; the identity for missing joints."""
         if skeleton.covariances is None:
             return self._modelled_noise(skeleton, positions, measured)
         noise = np.where(measured[:, None, None], skeleton.covariances, _EYE3)
@@ -333,27 +331,27 @@ class LinearKalmanFilter:
         return noise
 
     def _modelled_noise(self, skeleton: Skeleton, positions: FloatArray, measured: BoolArray) -> FloatArray:
-        """(25, 3, 3) by joint, tracking state and distance from the frame's origin, where a sensor stands."""
+        """(25, 3, 3) covariance by joint, tracking state and distance from the origin, where a sensor stands."""
         inferred = np.where(skeleton.states == TrackingState.TRACKED, 1.0, INFERRED_FACTOR)
         distance = np.maximum(np.sqrt(np.einsum("ij,ij->i", positions, positions)) / _REFERENCE_DISTANCE, 1.0)
         stddev = self.parameters.measurement_noise_scale * BASE_STDDEV * inferred * distance
         return np.where(measured, stddev**2, 1.0)[:, None, None] * _EYE3
 
     def _filter(self, positions: FloatArray, noise: FloatArray, observed: BoolArray, step: float) -> BoolArray:
-        """Predict all joints, update the observed ones, take back those beyond the gate; returns (25,) these."""
+        """Predict all joints, update the observed ones, reject those beyond the gate; returns (25,) rejected."""
         kalman = self._kalman
         size = 3 * self._order
         carrier = self._carriers(observed)
         self._level *= np.exp(-step / self.parameters.adaptation_time)
         noise_of_step = self._unit_noise * step**self._noise_powers
-        usual = np.exp(self._level)[:, None, None]
+        scale = np.exp(self._level)[:, None, None]
         if (carrier != _ALL).any():
-            self._predict_carried(carrier, usual * noise_of_step, step)
+            self._predict_carried(carrier, scale * noise_of_step, step)
         else:
             transition = np.eye(size)  # eq. 5.11, 5.12
             if self._order == 2:
                 transition[:3, 3:] = step * _EYE3
-            kalman.predict(F=transition, Q=usual * noise_of_step)
+            kalman.predict(F=transition, Q=scale * noise_of_step)
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
@@ -370,27 +368,27 @@ class LinearKalmanFilter:
             self._carry(carrier, ~observed)
             return suspects
 
-        # Too far for white noise: the slow error has changed (another sensor sees the joint now), or it is thrust
-        # forward, or it is an outlier. Once more for these, with all of the noise of both kinds: a change is then
-        # followed with a small kick to the velocity only.
+        # Too far for white noise: a change of the slow error (another sensor sees the joint), a sudden movement, or an
+        # outlier. Update these again with white and slow noise: a change of the slow error then disturbs the velocity
+        # only little.
         kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
-        raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - usual, 0.0) * noise_of_step
+        raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - scale, 0.0) * noise_of_step
         kalman.P = Stacked.of(np.asarray(kalman.P_prior) + raised)
         noise = np.where(suspects[:, None, None], noise, white)
         kalman.update(measurement, R=Stacked.of(noise), H=Stacked.of(observation))
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
-        self._level[rejected] = level[rejected]  # nobody moves like that
+        self._level[rejected] = level[rejected]  # an outlier does not raise the noise
         self._carry(carrier, ~observed | rejected)
         return rejected
 
     def _carriers(self, observed: BoolArray) -> IntArray:
-        """(25,) which joint carries each along: itself where it is seen, now and when it was last looked for."""
+        """(25,) the joint that carries each one: itself if it is observed now and was in the last frame."""
         loose = ~observed | (self._unmeasured > 0.0)
         carrier = _ALL
         if self._order == 2 and loose.any():
-            for _ in _ALL:  # as far as the longest chain at most
+            for _ in _ALL:  # bounds the longest chain
                 further = np.where(loose[carrier], _TOWARDS_TRUNK[carrier], carrier)
                 if (further == carrier).all():
                     break
@@ -398,12 +396,12 @@ class LinearKalmanFilter:
         return carrier
 
     def _predict_carried(self, carrier: IntArray, noise: FloatArray, step: float) -> None:
-        """Predict all joints; those with another carrier (25,) move with it, and less and less against it.
+        """Predict all joints; those with another carrier (25,) move with it, and their relative velocity decays.
 
         With ``tau`` the fading time, ``f = exp(-step / tau)``, ``r = tau (1 - f)`` and ``u`` the carrier's velocity,
         ``x' = x + r v + (step - r) u`` and ``v' = f v + (1 - f) u``; the noise is that of an integrated
         Ornstein-Uhlenbeck velocity (Gillespie 1996, eq. 2.8-2.9), which for a long ``tau`` is that of eq. 5.12. Where
-        nothing on the way is seen the base of the spine carries, and goes on as it last moved, if that is known.
+        no joint on the way is seen, the carrier is the base of the spine at its last velocity, if known.
         """
         free = carrier != _ALL
         carrying = np.where(self._alive[carrier, None, None], self._kalman.x[carrier, 3:], 0.0)
@@ -428,7 +426,7 @@ class LinearKalmanFilter:
         self._kalman.predict(u=Stacked.of(carrying), B=Stacked.of(control), F=Stacked.of(transition), Q=noise)
 
     def _carry(self, carrier: IntArray, unseen: BoolArray) -> None:
-        """What the measurements corrected of a carrier's motion, its unseen joints (25,) do, too."""
+        """Apply the corrections of the carriers to their unseen joints (25,)."""
         if self._order == 2:
             carried = unseen & (carrier != _ALL)
             correction = self._kalman.x - self._kalman.x_prior
@@ -440,11 +438,11 @@ class LinearKalmanFilter:
         distances: FloatArray = (innovation * (np.asarray(self._kalman.SI) @ innovation)).sum(axis=(1, 2))
         return distances
 
-    def _book(self, step: float, measured: BoolArray, rejected: BoolArray) -> None:
-        """Age the joints that got no measurement, and give up those for which it was too long."""
+    def _update_ages(self, step: float, measured: BoolArray, rejected: BoolArray) -> None:
+        """Age the joints without a measurement, and drop those without one for too long."""
         accepted = measured & ~rejected
         self._unmeasured = np.where(accepted, 0.0, self._unmeasured + step)
-        # a missing frame between two rejected ones is no break: only an accepted measurement is
+        # only an accepted measurement resets the time of rejection, a missing one does not
         self._rejected = np.where(accepted, 0.0, np.where(rejected, self._rejected + step, self._rejected))
         lost = self._alive & (self._unmeasured > self.parameters.predict_for)
         self._alive &= ~lost
@@ -468,7 +466,7 @@ class LinearKalmanFilter:
         if not alive.any():
             return None
         state = self._kalman.x[:, :, 0]
-        # copies, and plain arrays: what is handed out must not change with the next frame
+        # copies, and plain arrays: the output must not change with the next frame
         positions: FloatArray = np.array(state[:, :3])
         covariances: FloatArray = np.asarray(self._kalman.P)[:, :3, :3] + self._slow
         velocities: FloatArray = np.array(state[:, 3:]) if self._order == 2 else np.full((N_JOINTS, 3), np.nan)

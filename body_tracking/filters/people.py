@@ -1,4 +1,4 @@
-"""A filter for each of several people."""
+"""One filter per person, for several people."""
 
 from __future__ import annotations
 
@@ -20,18 +20,11 @@ from body_tracking.pipeline.people import ALL, HeldSubject
 from body_tracking.pipeline.stage import Port
 
 _AWAY = NANOSECONDS
-"""Of somebody who is away from the fused frames for this long, nanoseconds, nothing is kept with several people."""
+"""Nanoseconds without a fused frame of a person after which that person is forgotten."""
 
 
 class PeopleFilter:
-    """A :class:`PersonFilter` of each person; each gives what it would give if there were nobody else.
-
-    Arguments and errors as there.
-
-    Attributes:
-        by_sensor: as there.
-        models: as there.
-    """
+    """A :class:`PersonFilter` per person, independent of each other; arguments, attributes and errors as there."""
 
     def __init__(
         self,
@@ -55,7 +48,7 @@ class PeopleFilter:
             self.people = People(settings.sensors, settings.people, first.alignment.reference, self._gone)
 
     def inherit(self, before: PersonFilter | PeopleFilter) -> None:
-        """Take over what is known of the sensors from the filter that was there before: latched poses come once."""
+        """Take over the sensors' poses and clocks from the previous filter: latched messages come once."""
         if isinstance(before, PeopleFilter) and self.people is not None and before.people is not None:
             self.people, self.people.gone = before.people, self._gone
             for person, former in zip(self._persons, before._persons, strict=True):
@@ -68,14 +61,14 @@ class PeopleFilter:
 
     @property
     def tracked(self) -> tuple[str, ...]:
-        """The ids of the people who are there."""
+        """The ids of the people who are tracked."""
         if self.people is not None:
             return tuple(self._ids[number - 1] for number in self.people.tracked)
         return tuple(body for person in self._persons for body in person.tracked)
 
     @property
     def counters(self) -> dict[str, int]:
-        """What happened since the construction, to all together."""
+        """Sums of all filters' counters."""
         total: Counter[str] = Counter()
         for person in self._persons:
             total.update(person.counters)
@@ -101,13 +94,13 @@ class PeopleFilter:
         """One fused frame.
 
         Args:
-            skeletons: in world, each with the person's number; others than those that there are do not count.
-            now_ns: when it arrived, in a clock that goes on.
+            skeletons: in world, each with the person's number; unknown numbers are ignored.
+            now_ns: time of arrival, in a steady clock.
         """
         self._wearer.pick(skeletons)
         stamp_ns = skeletons[0].stamp_ns
         for number, last_ns in list(self._last_ns.items()):
-            if stamp_ns - last_ns > _AWAY:  # somebody else may have the number now
+            if stamp_ns - last_ns > _AWAY:  # another person may have the number now
                 self._gone(number)
         for skeleton in skeletons:
             if 1 <= skeleton.body <= len(self._persons):
@@ -122,7 +115,7 @@ class PeopleFilter:
             self._persons[number - 1].hold(sensor, [replace(body, body=number)], now_ns)
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
-        """The orientation of one segment of the one who wears the sensors: who is nearest to the reference sensor."""
+        """Take the orientation of one segment of the wearer, who is the person nearest to the reference sensor."""
         wearer = self._wearer.body if self.people is None else self.people.nearest
         if wearer is not None and wearer <= len(self._persons):
             self._persons[wearer - 1].on_orientation(measurement, now_ns)
@@ -141,16 +134,16 @@ class PeopleFilter:
 
     @property
     def deadline_ns(self) -> int | None:
-        """As of :class:`PersonFilter`, of whoever comes first."""
+        """As of :class:`PersonFilter`, the earliest of all."""
         return min((at for person in self._persons if (at := person.deadline_ns) is not None), default=None)
 
     @property
     def due_ns(self) -> int | None:
-        """As of :class:`PersonFilter`, of whoever comes first."""
+        """As of :class:`PersonFilter`, the earliest of all."""
         return min((at for person in self._persons if (at := person.due_ns) is not None), default=None)
 
     def reset(self) -> None:
-        """Forget everybody, because time jumped back; poses and clocks stay."""
+        """Forget all people, after a jump of time; poses and clocks stay."""
         self._last_ns.clear()
         for person in self._persons:
             person.reset()
@@ -175,6 +168,6 @@ def filter_of(
     publish: Callable[[str, Any, int], None],
     wanted: Callable[[str], bool] | None = None,
 ) -> PersonFilter | PeopleFilter:
-    """The filter that the settings ask for; arguments and errors as of :class:`PersonFilter`."""
+    """The filter for one or several people by the settings; arguments and errors as of :class:`PersonFilter`."""
     of_people = settings.people.subject == ALL
     return PeopleFilter(settings, publish, wanted) if of_people else PersonFilter(settings, publish, wanted)

@@ -45,19 +45,19 @@ DEFAULT_ORDER_WAIT = 0.05
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
-    """What to filter, and how; defaults as the node's.
+    """Settings of a :class:`PersonFilter`; the defaults are those of the node.
 
     Attributes:
         filter_name: one of ``FILTERS``.
         parameters: of the filter, without a prefix.
         input: ``graph.AUTO``, ``graph.FUSED_INPUT`` or ``graph.SENSORS_INPUT``.
         sensors: for ``graph.SENSORS_INPUT``.
-        reference: likewise: whose clock is that of ``world``; the first one where empty.
-        world: likewise: the frame of the output.
-        body: the person's id in topics, of one subject.
+        reference: for the same: sensor with the clock of ``world``; empty for the first one.
+        world: for the same: frame of the output.
+        body: the person's id in topics.
         predict_after: seconds without a frame after which predicted ones are published.
-        order_wait: seconds that a sensor's frame waits at most for an older one.
-        people: whom to filter.
+        order_wait: greatest time in seconds that a sensor's frame waits for an older one.
+        people: selection of people.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -76,20 +76,20 @@ class PersonFilter:
     """Feeds the filter of one person and publishes its output.
 
     Args:
-        settings: which one.
-        publish: takes a topic, the content of a message and its capture time.
-        wanted: whether to make messages of a topic at all; always when None.
-        one_of_several: gets the filtered skeletons instead of ``publish``, of one of several people; frames are of this
-            person alone then, and topics below the person's name.
+        settings: of the filter.
+        publish: called with topic, payload and capture time.
+        wanted: whether a topic has a subscriber; None: all topics are published.
+        one_of_several: called with the filtered skeletons instead of ``publish``, for one of several people; all frames
+            are of this person then, and topics have the person's name.
 
     Attributes:
-        by_sensor: it takes sensors' frames, not fused ones.
-        alignment: places these; None with fused ones.
-        models: it publishes the state of a model.
+        by_sensor: whether it takes sensors' frames instead of fused ones.
+        alignment: from sensors to world; None with fused frames.
+        models: whether it publishes the state of a model.
 
     Raises:
-        FilterError: the filter or its parameters make no sense.
-        GraphError: it does not take this input.
+        FilterError: unknown filter, or invalid parameters.
+        GraphError: the filter does not take this input.
         FusionError: the reference is not among the sensors.
     """
 
@@ -125,7 +125,6 @@ class PersonFilter:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What happened since the construction."""
         counters = dict(self._filter.counters)
         if self.alignment is not None:
             counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
@@ -152,12 +151,12 @@ class PersonFilter:
             self.alignment.set_clock(sensor, valid_from_ns, clock)
 
     def inherit(self, before: object) -> None:
-        """Take over what is known of the sensors from the filter that was there before: latched poses come once."""
+        """Take over the sensors' poses and clocks from the previous filter: latched messages come once."""
         if isinstance(before, PersonFilter) and self.by_sensor and before.by_sensor:
             self.alignment, self.people = before.alignment, before.people
 
     def outputs(self, skeletons: Qos, results: Qos) -> tuple[Port, ...]:
-        """The topics that it publishes, where skeletons and results have these qualities of service."""
+        """The published topics, with these qualities of service of skeletons and results."""
         filtered = (Port(graph.FILTERED, Skeletons(), skeletons, measured=True),)
         if self._model_filter is None:
             return filtered
@@ -173,16 +172,16 @@ class PersonFilter:
 
     @property
     def tracked(self) -> tuple[str, ...]:
-        """The ids of the people who are there."""
-        there = self._present if self.people is None else bool(self.people.tracked)
-        return (self._body,) if there else ()
+        """The ids of the people who are tracked."""
+        tracked = self._present if self.people is None else bool(self.people.tracked)
+        return (self._body,) if tracked else ()
 
     def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         """One fused frame.
 
         Args:
-            skeletons: in world; with one subject the first of them counts.
-            now_ns: when it arrived, in a clock that goes on.
+            skeletons: in world; the first one is filtered.
+            now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
         skeleton = skeletons[0]
@@ -193,19 +192,19 @@ class PersonFilter:
             self._skeleton(filtered)
 
     def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
-        """Keep one frame of one sensor: the next :meth:`poll` takes all that are here, in the order of their stamps.
+        """Queue one frame of one sensor for the next :meth:`poll`, which filters frames in the order of their stamps.
 
         Args:
             sensor: its name.
-            skeletons: the bodies in it, in the sensor's own frame and clock.
-            now_ns: as above.
+            skeletons: the bodies in the frame, in the sensor's own frame and clock.
+            now_ns: time of arrival, in a steady clock.
         """
         aligned = self._aligned(sensor, skeletons)
         if aligned is not None:
             self._ordering.hold(sensor, aligned, now_ns)
 
     def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The person in ``world``; None where the sensor is not calibrated, or shows nobody."""
+        """The person in ``world``; None where the sensor is not calibrated, or has no person."""
         self._received[sensor] += 1
         if self.people is None:
             subject = skeletons[0]
@@ -216,14 +215,10 @@ class PersonFilter:
         return None if self.alignment is None else self.alignment.push(sensor, subject)
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
-        """The orientation of one segment, in ``world`` and in the reference's clock, as inertial sensors have it.
+        """Take the orientation of one segment, in ``world`` and in the reference's clock.
 
-        What it changes is published with the next frame; while none comes, with the predicted ones. Filters without a
-        model of the body have no use for it.
-
-        Args:
-            measurement: how it is turned.
-            now_ns: as above.
+        The corrected estimate is published with the next frame, measured or predicted. Filters without a body model
+        ignore it.
         """
         if self._model_filter is None:
             return
@@ -235,11 +230,11 @@ class PersonFilter:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
         if self._model_filter is None:
             return
-        # each when it need not wait longer, whenever somebody asks: else what is predicted would depend on that
+        # each at its own deadline: predictions must not depend on the times of the calls
         while (deadline_ns := self._ordering.deadline_ns) is not None and deadline_ns <= now_ns:
             self._take(self._ordering.poll(deadline_ns), deadline_ns)
         self._take(self._ordering.poll(now_ns), now_ns)
-        # what waits is of a time that must not be told before
+        # a waiting frame is older than a prediction, and goes first
         while self.deadline_ns is None and (stamp_ns := self._prediction.due(now_ns)) is not None:
             predicted = self._model_filter.predict(stamp_ns)
             if predicted is None:
@@ -249,25 +244,23 @@ class PersonFilter:
             self._send(*predicted)
 
     def settle(self) -> None:
-        """Do what the next frame would have to wait for; to be called when there is nothing else to do."""
+        """Do deferred work before the next frame; to be called when idle."""
         expected_ns = self._ordering.expected_ns
         if self._model_filter is not None and expected_ns is not None:
             self._model_filter.settle(expected_ns)
 
     @property
     def deadline_ns(self) -> int | None:
-        """When :meth:`poll` is to be called for a frame that waits, in the clock by which it does; None without one."""
+        """Time of the next :meth:`poll` for a waiting frame, in the clock of ``now_ns``; None without one."""
         return self._ordering.deadline_ns
 
     @property
     def due_ns(self) -> int | None:
-        """When it should be called for a predicted frame, in the clock of ``now_ns``; None where none is to come
-        before a frame that waits.
-        """
+        """Time of the next :meth:`poll` for a predicted frame; None if a frame waits, or without prediction."""
         return self._prediction.due_ns if self.deadline_ns is None else None
 
     def reset(self) -> None:
-        """Forget the person, because time jumped back; poses and clocks stay."""
+        """Forget the person, after a jump of time; poses and clocks stay."""
         self._filter.reset()
         self._ordering.flush()
         self._prediction.stop()
@@ -275,13 +268,13 @@ class PersonFilter:
         self._present = False
 
     def forget(self) -> None:
-        """Forget the person, because the next frames are of somebody else."""
+        """Forget the person, because the next frames are of another one."""
         self.reset()
         if self.alignment is not None:
             self.alignment.forget()
 
     def _take(self, frames: Sequence[tuple[str, Skeleton]], now_ns: int) -> None:
-        """Filter frames, and publish what is known after each that does not come after newer ones."""
+        """Filter frames, and publish the estimate after each one that is the newest."""
         assert self._model_filter is not None
         for sensor, skeleton in frames:
             if not self._model_filter.take(skeleton, sensor):
@@ -300,7 +293,7 @@ class PersonFilter:
         self._publish(graph.FILTERED, (skeleton,), skeleton.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
-        """Publish an estimate, and the skeleton that belongs to it; None for the filter's own."""
+        """Publish an estimate and its skeleton; None for the filter's current one."""
         assert self._model_filter is not None
         if self._wanted(graph.FILTERED):
             skeleton = skeleton or self._model_filter.filtered

@@ -1,4 +1,4 @@
-"""When to say what is to be expected of a person, because nothing arrives."""
+"""Schedule of predicted frames while no measurement arrives."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ PERIOD_NS = round(NANOSECONDS / 30)
 
 
 class Prediction:
-    """After a silence of some length, predicted frames are due at a steady rate until the next frame or the end.
+    """After a silence, predicted frames are due at a steady rate until the next frame or :meth:`stop`.
 
-    The stamps are those that frames would have had which arrived then; they do not depend on when somebody asks.
+    Their stamps are those of frames that would have arrived then, and do not depend on the times of the calls.
 
     Args:
         after: seconds without a frame after which the first predicted one is due.
 
     Attributes:
-        due_ns: when the next one is due, in the clock of :meth:`arrived`; None where nothing is to be expected.
+        due_ns: time of the next predicted frame, in the clock of :meth:`arrived`; None after :meth:`stop`.
     """
 
     def __init__(self, after: float) -> None:
@@ -26,16 +26,12 @@ class Prediction:
         self.due_ns: int | None = None
 
     def arrived(self, stamp_ns: int, now_ns: int) -> None:
-        """A frame of this capture time came just now, and the filter took it."""
+        """A frame with this capture time has just been filtered."""
         self._delay_ns = now_ns - stamp_ns
         self.due_ns = now_ns + self._after_ns
 
     def due(self, now_ns: int) -> int | None:
-        """The stamp of a predicted frame that is due; ask again until there is none.
-
-        Args:
-            now_ns: as in :meth:`arrived`; any clock that goes on.
-        """
+        """The stamp of a predicted frame that is due, to be called until None; now in any steady clock."""
         if self.due_ns is None or now_ns < self.due_ns:
             return None
         stamp_ns = self.due_ns - self._delay_ns
@@ -43,5 +39,5 @@ class Prediction:
         return stamp_ns
 
     def stop(self) -> None:
-        """Nothing is to be expected any more, until a frame arrives."""
+        """End the predictions until the next frame."""
         self.due_ns = None

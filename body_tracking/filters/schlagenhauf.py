@@ -6,9 +6,9 @@ and the base of the spine stands still where it was then. Segment lengths come f
 missing joint has neither innovation nor gain (eq. 5.21-5.22). The one thing corrected in the filter is line 8: the
 innovation is ``z - h(s)``, not ``z - H s``. (The other errors of DESIGN 4, 1-3, are calibration's and fusion's.)
 
-Its weaknesses are part of it: of 26 directions in the space of angles six are never observed, eight not in the T-pose,
-and the angles wander along them; it gates nothing; time that passes without a frame does not pass for it. It reports
-what it believes, covariances that are singular along the segments included. ``filters`` has better ones.
+Its weaknesses are kept: of 26 directions in the space of angles six are never observed, eight not in the T-pose, and
+the angles drift along them; there is no gate; time without a frame is not predicted. Its covariances are too small, and
+singular along the segments. The package has better filters.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ _STARTS: IntArray = np.array(
     + [Joint.SPINE_SHOULDER, Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT],
     dtype=np.intp,
 )
-"""(10,) where the segments of L1 to L10 start (table 3.3); they end at the model's joints."""
+"""(10,) first joints of the segments L1 to L10 (table 3.3), which end at the model's joints."""
 _OTHER_SIDE: IntArray = np.array([0, 1, 6, 7, 8, 9, 2, 3, 4, 5], dtype=np.intp)
 _NARROWEST = 0.05
-"""Metres of shoulders and hips, seen from above, below which they show no heading."""
+"""Least horizontal width of shoulders and hips for a heading, metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class SchlagenhaufParameters:
-    """The settings; each field's metadata says what it is, its unit and its range.
+    """The settings; each field's metadata has its meaning, unit and range.
 
-    The thesis states Q (figure 5.11, not for what) but neither R nor P(0|0). R is the one with the least position error
-    on simulated people in her three motions (with white noise of 5 and 20 mm and with the errors of simulated sensors),
-    so that the comparison does her no wrong: 4 to 7 mm do as well, 10 mm costs up to 6 mm of position error, 30 mm up
-    to 25. P(0|0) is how well a person holds a T-pose; a tenth of it or three times as much change less than 1 mm.
+    The thesis states Q (figure 5.11, not for which quantities) but neither R nor P(0|0). The R with the
+    least position error on simulated people in her three motions (with white noise of 5 and 20 mm and with the errors
+    of simulated sensors) makes the comparison fair: 4 to 7 mm do as well, 10 mm costs up to 6 mm of position error,
+    30 mm up to 25. P(0|0) is how well a person holds a T-pose; a tenth or three times of it change less than 1 mm.
 
     Raises:
         FilterError: a value out of its range.
@@ -73,7 +73,7 @@ class SchlagenhaufParameters:
     initial_angle_stddev: float = number_field(0.1, "square root of P(0|0) of the angles", "rad", 1e-6, 10.0)
     initial_rate_stddev: float = number_field(0.1, "square root of P(0|0) of the rates", "rad/s", 1e-6, 100.0)
     time_step: float = number_field(
-        1.0 / 30.0, "what passes from frame to frame, whatever their stamps say", "s", 1e-3, 1.0
+        1.0 / 30.0, "time step from frame to frame, independent of their stamps", "s", 1e-3, 1.0
     )
     calibration_frames: int = field(
         default=50,
@@ -87,16 +87,16 @@ class SchlagenhaufParameters:
     )
     reset_gap: float = number_field(
         1.0,
-        "a gap between frames longer than this is counted; it is one step like any other, for a new start "
-        "would need the T-pose",
+        "a gap between frames longer than this is counted; it is a step like any other, as a restart would "
+        "need the T-pose",
         "s",
         0.01,
         600.0,
     )
     reorder_window: float = number_field(
         0.1,
-        "a frame older than the last one by no more than this came late and is ignored; an older one is a "
-        "backward jump of time, which starts with a new T-pose",
+        "a frame older than the last one by no more than this is late and ignored; an older one is a backward "
+        "jump of time, which restarts with a new T-pose",
         "s",
         0.0,
         10.0,
@@ -117,8 +117,7 @@ class SchlagenhaufKalmanFilter:
         lengths: (10,) metres, L1 to L10; NaN until calibrated.
         innovations: (10, 3) metres, z - h(s) of the last frame, in the order of the model's joints; NaN where a joint
             was missing.
-        counters: what happened since the construction, for diagnostics; measured and predicted joints are counted one
-            by one.
+        counters: events since the construction, for diagnostics; joints are counted individually.
     """
 
     def __init__(self, parameters: SchlagenhaufParameters | None = None) -> None:
@@ -162,7 +161,7 @@ class SchlagenhaufKalmanFilter:
 
     def _start(self) -> None:
         """s(0|0) is the T-pose at rest."""
-        from filterpy.kalman import ExtendedKalmanFilter  # takes 0.8 s, which only who filters need pay
+        from filterpy.kalman import ExtendedKalmanFilter  # takes 0.8 s: import only for this filter
 
         p, n = self.parameters, self.model.nq
         kalman = ExtendedKalmanFilter(dim_x=2 * n, dim_z=3 * len(self.model.joints))
@@ -180,11 +179,10 @@ class SchlagenhaufKalmanFilter:
             skeleton: in a fixed frame with z up, usually ``/fused/skeleton``.
 
         Returns:
-            The same body at the same stamp: her ten joints with covariance and velocity, and SpineBase where it was in
-            the T-pose, which she takes for exact. The state is the measurement's where it was used, INFERRED where the
-            joint is predicted or fixed; joints that her model does not have are NOT_TRACKED, NaN, with an infinite
-            covariance. None until the frames of the T-pose are complete and show every length, and where the stamp
-            repeats the last one or is a little older.
+            The same body at the same stamp: the model's ten joints with covariance and velocity, and SpineBase at its
+            place in the T-pose, without error. The state is the measurement's where it was used, INFERRED where the
+            joint is predicted or fixed; joints that the model does not have are NOT_TRACKED, NaN, with an infinite
+            covariance. None during the calibration in the T-pose, and for a repeated or late stamp.
         """
         arrival = self._arrivals.take(skeleton)
         if arrival is Arrival.IGNORED:
@@ -203,9 +201,9 @@ class SchlagenhaufKalmanFilter:
         return self._output(skeleton, measured)
 
     def _calibrate(self, positions: FloatArray) -> None:
-        """Lengths, place and heading from (n, 25, 3) metres in the T-pose; nothing where they show no place or heading.
+        """Lengths, position and heading from (n, 25, 3) metres in the T-pose; no change without position or heading.
 
-        A length that is never seen is the other side's, or that of a person of average proportions.
+        A length that is never seen is that of the other side, or of average proportions.
         """
         base = _median(positions[:, Joint.SPINE_BASE])
         axes = _median(left_right_axes(positions))[:, :2]  # of shoulders and hips, seen from above
@@ -250,7 +248,7 @@ class SchlagenhaufKalmanFilter:
             self._start()
 
     def _output(self, skeleton: Skeleton, measured: BoolArray) -> Skeleton:
-        """h(s(k|k)) (line 10) with what P(k|k) says of it."""
+        """h(s(k|k)) (line 10) with its covariance by P(k|k)."""
         n, joints = self.model.nq, self.model.joints
         here = self.model.linearise(self._kalman.x[:n], self.lengths)
         positions, velocities = np.full((N_JOINTS, 3), np.nan), np.full((N_JOINTS, 3), np.nan)
@@ -268,7 +266,7 @@ class SchlagenhaufKalmanFilter:
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """The median over the first axis of what is not NaN; NaN where all is."""
+    """Median over the first axis without NaN; NaN where all values are."""
     known = np.isfinite(values).any(axis=0)
     result = np.full(values.shape[1:], np.nan)
     result[known] = np.nanmedian(values[:, known], axis=0)

@@ -1,9 +1,8 @@
-"""Many small matrices that a filter written for one takes for one.
+"""Stacks of small matrices for filters that are written for single matrices.
 
-``filterpy.kalman.KalmanFilter`` writes its equations with ``numpy.dot``, ``.T``, ``+`` and ``-`` alone. Those mean the
-wrong thing on a stack of matrices; on a :class:`Stacked` they mean, of every matrix in it, what they mean on one. So
-one filter object runs a whole skeleton of independent filters in some twenty numpy calls instead of five hundred, and
-its equations stay filterpy's own.
+``filterpy.kalman.KalmanFilter`` uses only ``numpy.dot``, ``.T``, ``+`` and ``-``. On a :class:`Stacked` these apply to
+every matrix, so one filter object runs a whole skeleton of independent filters in some twenty numpy calls instead of
+five hundred, with filterpy's own equations.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ class Stacked(np.ndarray[Any, np.dtype[np.float64]]):
     """An array of matrices (..., rows, columns) that multiplies and transposes matrix by matrix.
 
     ``numpy.dot`` is ``numpy.matmul`` (which broadcasts, so one shared (6, 6) matrix may meet a (25, 6, 6) stack) and
-    ``.T`` exchanges the last two axes. All else is an ordinary array.
+    ``.T`` exchanges the last two axes.
     """
 
     @classmethod
     def of(cls, values: ArrayLike) -> Stacked:
-        """The same numbers, not copied where they already are an array of float64."""
+        """A view of the values, without a copy for an array of float64."""
         return np.asarray(values, dtype=np.float64).view(cls)
 
     @property

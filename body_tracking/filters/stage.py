@@ -1,6 +1,5 @@
-"""Fused skeletons, or every sensor's skeletons and orientations, to filtered ones and the state of a body model.
-
-The stage of the node ``skeleton_filter``.
+"""Fused skeletons, or every sensor's skeletons and orientations, to filtered ones and the state of a body model: the
+stage of the node ``skeleton_filter``.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ INPUT = Parameter(
 PREDICT_AFTER = Parameter(
     "predict_after",
     DEFAULT_PREDICT_AFTER,
-    "ekf: publish what is to be expected when no frame has come for this long",
+    "ekf: publish predicted frames when no frame has arrived for this long",
     unit="s",
     min=0.01,
     max=3600.0,
@@ -74,7 +73,7 @@ ORIENTATIONS = Parameter(
 
 
 def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
-    """Of each segment in :data:`ORIENTATIONS` its topic, as segment by topic.
+    """Segments of :data:`ORIENTATIONS` by topic.
 
     Raises:
         OrientationError: the body has no such segment.
@@ -87,11 +86,11 @@ def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
 
 
 _SETTABLE = {"": ("measurement_noise_scale", "predict_for", "t_pose"), "ekf.": ("predict_for", "posture", "t_pose")}
-"""What users may set of the filters with each prefix; the thesis's are as she has them."""
+"""The settable parameters of filters by prefix; those of the thesis are fixed."""
 
 
 def filter_table() -> tuple[Parameter, ...]:
-    """The parameters of all filters, as ``skeleton_filter`` has them."""
+    """The settable parameters of all filters."""
     classes = parameter_classes()
     return tuple(
         item
@@ -101,19 +100,19 @@ def filter_table() -> tuple[Parameter, ...]:
 
 
 def filter_parameters(name: str, values: Mapping[str, Value]) -> dict[str, Any]:
-    """Those of the values of :func:`filter_table` that are the named filter's, without the prefix."""
+    """The named filter's values of :func:`filter_table`, without the prefix."""
     prefix = parameter_prefix(name)
     return fields_of(parameter_classes()[prefix], values, prefix=prefix)
 
 
 _CALIBRATIONS = 1000
-"""Poses, and clocks, that may wait while the filter is busy; none is to be lost."""
+"""Queue of poses and clocks, long enough that none is lost while the filter is busy."""
 _ORIENTATIONS = 32
-"""Orientations of a segment that may wait likewise: half a second of them."""
+"""Queue of orientations per segment: half a second."""
 
 
 class FilterStage(Stage):
-    """Filters fused skeletons, or what every sensor sees."""
+    """Filters fused skeletons, or every sensor's frames."""
 
     NAME = "skeleton_filter"
     PARAMETERS = (
@@ -137,10 +136,10 @@ class FilterStage(Stage):
         self._tracked: tuple[str, ...] = ()
         self._t_poses = 0
         self._stamp_ns = 0
-        self.filter = self._made(values)
+        self.filter = self._make(values)
         self._connect(values)
 
-    def _made(self, values: Mapping[str, Value]) -> PersonFilter | PeopleFilter:
+    def _make(self, values: Mapping[str, Value]) -> PersonFilter | PeopleFilter:
         given: dict[str, Any] = dict(values)
         name = given["filter"]
         settings = FilterSettings(
@@ -158,7 +157,7 @@ class FilterStage(Stage):
         return filter_of(settings, self._publish, self.wanted)
 
     def _connect(self, values: Mapping[str, Value]) -> None:
-        """Take what the filter needs, and nothing else."""
+        """Set the inputs and outputs of the current filter."""
         orientations = orientation_topics(names_in(values["orientations"]))
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors_of(values)}
         qos = skeleton_qos(values)
@@ -176,8 +175,8 @@ class FilterStage(Stage):
         )
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """A new filter starts from the next frame on."""
-        made = self._made(values)
+        """Start a new filter at the next frame."""
+        made = self._make(values)
         made.inherit(self.filter)
         self.filter, self.values = made, values
         self._connect(values)
@@ -185,8 +184,8 @@ class FilterStage(Stage):
     def _publish(self, topic: str, payload: Any, stamp_ns: int) -> None:
         self._published.append(Output(topic, payload, stamp_ns))
 
-    def _taken(self) -> Iterable[Output]:
-        """What the filter has published, and the ids of those who are tracked where these are others now."""
+    def _collect(self) -> Iterable[Output]:
+        """The filter's outputs, and the ids of tracked people if they changed."""
         published, self._published = self._published, []
         if published:
             self._stamp_ns = published[-1].stamp_ns or self._stamp_ns
@@ -207,11 +206,11 @@ class FilterStage(Stage):
             self.filter.hold(self._sensors[topic], payload, now.steady_ns)
         else:
             self.filter.on_orientation(payload, now.steady_ns)
-        return self._taken()
+        return self._collect()
 
     def poll(self, steady_ns: int) -> Iterable[Output]:
         self.filter.poll(steady_ns)
-        return self._taken()
+        return self._collect()
 
     @property
     def deadline_ns(self) -> int | None:
@@ -225,7 +224,7 @@ class FilterStage(Stage):
         self.filter.settle()
 
     def reset(self, topic: str) -> None:
-        """Of a sensor, the alignment finds out by itself."""
+        """Reset for fused frames; with sensors' frames the alignment detects jumps itself."""
         if topic == graph.FUSED:
             self.filter.reset()
 
@@ -233,7 +232,7 @@ class FilterStage(Stage):
         counters = self.filter.counters
         before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
         if self._t_poses > before:
-            self.events.append("learnt from a T-pose where sensors see this person's joints: angles are better now")
+            self.events.append("joint centres of this person learnt from a T-pose: angles are more accurate now")
         return 0, str(self.values["filter"]), {"tracked": ", ".join(self.filter.tracked), **counters}
 
     @property

@@ -1,4 +1,4 @@
-"""The filters, and what each means for the nodes around it."""
+"""The filter system: node, options and topics."""
 
 from __future__ import annotations
 

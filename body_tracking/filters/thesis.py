@@ -1,13 +1,13 @@
 """The thesis's linear Kalman filters, for comparison (Schlagenhauf 2017, sections 3.7 and 5.4, algorithm 1).
 
-As published, with nothing repaired. ``thesis_lkf1`` is her LKF1 (section 5.7), the zero-velocity model (eq. 3.6-3.9 and
+As published, without corrections. ``thesis_lkf1`` is her LKF1 (section 5.7), the zero-velocity model (eq. 3.6-3.9 and
 5.11); ``thesis_lkf2`` is her LKF2, the constant-velocity model (eq. 3.10-3.11 and 5.12). All 25 joints are filtered
 alike and each by itself (section 5.4); the measurement is the fused joint position (section 5.4.1). Process and
 measurement noise are constant (eq. 3.14-3.15), the time step is the sampling time, and every frame is one step. A joint
 that no sensor tracks has neither innovation nor gain (section 5.5.2, eq. 5.21-5.22). There is no gate, and a joint is
-never given up: at constant velocity a hidden hand flies on for as long as it is hidden.
+never lost: at constant velocity a hidden hand keeps its velocity for as long as it is hidden.
 
-What the thesis leaves open is read as plainly as possible:
+The simplest reading of what the thesis does not specify:
 
 ====================  ================================================================================================
 Q                     figures 5.7 and 5.9 state "Q = 0.005" for LKF2, without a unit: that number times the identity,
@@ -19,8 +19,8 @@ frames without a      algorithm 1 waits for a new measurement (line 4): time wit
 measurement
 ====================  ================================================================================================
 
-In return for its simplicity the filter reports only what it believes: its covariance holds white noise alone, none of
-the centimetres by which a Kinect is wrong for long. ``filters.linear`` has the better filters of the same models.
+The covariance includes white noise only, not a Kinect's persistent errors of centimetres. ``filters.linear`` has better
+filters with the same models.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ THESIS_LKF2 = "thesis_lkf2"
 
 @dataclass(frozen=True, slots=True)
 class ThesisLkfParameters:
-    """The settings of both filters; each field's metadata says what it is, its unit and its range.
+    """The settings of both filters; each field's metadata has its meaning, unit and range.
 
     Q is the thesis's (figures 5.7 and 5.9). R is not stated in it; this is the largest power of ten that costs no
     accuracy. The mean error of her ten joints, without each joint's offset, of four simulated people in her three
     motions and her fusion is 45.5 mm for any smaller R. With this one it is 45.8 mm (LKF1) and 46.0 mm (LKF2), and the
     jitter 10 % less; ten times as much costs 5 mm and 30 ms of delay, a hundred times 28 mm and 120 ms. P(0|0), here
-    that of the first measurement, is forgotten after five frames.
+    that of the first measurement, has no influence after five frames.
 
     Raises:
         FilterError: a value out of its range.
@@ -73,12 +73,12 @@ class ThesisLkfParameters:
         1e4,
     )
     time_step: float = number_field(
-        1.0 / 30.0, "the sampling time: what passes from frame to frame, whatever their stamps say", "s", 1e-3, 1.0
+        1.0 / 30.0, "the sampling time: the time step from frame to frame, independent of their stamps", "s", 1e-3, 1.0
     )
     reorder_window: float = number_field(
         0.1,
-        "a frame older than the last one by no more than this came late and is ignored; an older one is a "
-        "backward jump of time, which starts every joint anew",
+        "a frame older than the last one by no more than this is late and ignored; an older one is a backward "
+        "jump of time, which restarts every joint",
         "s",
         0.0,
         10.0,
@@ -102,8 +102,7 @@ class _ThesisLinearFilter(ABC):
         R: (3, 3) covariance of the measurement noise (eq. 3.15).
         s: (25, n) state estimates; zeros where a joint is not known yet.
         P: (25, n, n) their error covariances.
-        counters: what happened since the construction, for diagnostics; measured and predicted joints are counted one
-            by one.
+        counters: events since the construction, for diagnostics; joints are counted individually.
     """
 
     def __init__(self, parameters: ThesisLkfParameters | None = None) -> None:
@@ -140,8 +139,8 @@ class _ThesisLinearFilter(ABC):
         Returns:
             The same body at the same stamp: position and covariance of s(k|k) and P(k|k); velocity (LKF2) or NaN (the
             state of LKF1 has none); and the state: the measurement's where it was used, INFERRED where the joint is
-            predicted, NOT_TRACKED with NaN and an infinite covariance where it was never measured. None where the stamp
-            repeats the last one or is a little older, or no joint is known.
+            predicted, NOT_TRACKED with NaN and an infinite covariance where it was never measured. None for a repeated
+            or late stamp, and where no joint is known.
         """
         arrival = self._arrivals.take(skeleton)
         if arrival is Arrival.IGNORED:
@@ -161,8 +160,8 @@ class _ThesisLinearFilter(ABC):
         """Predict and update all joints, with (25, 3) metres, of which (25,) are measured; unknown ones do not matter.
 
         Eq. 3.16-3.21. The gain is zero where a joint is missing (section 5.5.2), so that lines 7 and 8 leave the
-        prediction (eq. 5.21-5.22). Line 8 is computed in Joseph's form, which is the same matrix: as printed it loses
-        its digits where a joint is measured again that was hidden for long, and may come out negative.
+        prediction (eq. 5.21-5.22). Line 8 is computed in Joseph's form, which is the same matrix: the printed form may
+        become negative by rounding when a joint is measured again after a long time.
         """
         F, H, Q, R = self.F, self.H, self.Q, self.R
         self.s = self.s @ F.T  # line 2, eq. 3.16
@@ -182,7 +181,7 @@ class _ThesisLinearFilter(ABC):
         self._known |= joints
 
     def _output(self, skeleton: Skeleton, measured: BoolArray) -> Skeleton:
-        """s(k|k) (line 9) with what P(k|k) says of it."""
+        """s(k|k) (line 9) with its covariance in P(k|k)."""
         known = self._known
         states = np.where(measured, skeleton.states, np.uint8(TrackingState.INFERRED))
         states[~known] = TrackingState.NOT_TRACKED
@@ -198,7 +197,6 @@ class ThesisLkf1(_ThesisLinearFilter):
 
     @staticmethod
     def _model(time_step: float) -> tuple[FloatArray, FloatArray]:
-        """F and H of eq. 5.11 (A and C of eq. 3.8 and 3.9)."""
         return np.eye(3), np.eye(3)
 
 
@@ -207,5 +205,4 @@ class ThesisLkf2(_ThesisLinearFilter):
 
     @staticmethod
     def _model(time_step: float) -> tuple[FloatArray, FloatArray]:
-        """F and H of eq. 5.12 (A and C of eq. 3.10 and 3.11)."""
         return np.eye(6) + time_step * np.eye(6, k=3), np.eye(3, 6)

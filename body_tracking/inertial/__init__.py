@@ -1,12 +1,12 @@
-"""How inertial sensors sit on a body, which way they face, and how their clocks run.
+"""Inertial sensors on a body: orientation, alignment with the segments, heading, and clocks.
 
-``clock`` finds a clock's offset from motion, ``alignment`` how a sensor is turned against its segment, ``heading``
-keeps that and the heading of every sensor over time, ``detection`` finds exchanged and slipped sensors, ``posture``
-makes a configuration of the body model of segments' orientations. ``worn`` takes the readings of one sensor,
-``timing`` brings their clocks together, ``mounting`` says how they are meant to be put on, ``held_pose`` when a pose is
-held, ``body`` makes a skeleton, and ``tracking`` with its ``parameters`` a source of all of it. Arrays in, small
-dataclasses out; it knows ``skeleton``, ``orientation``, ``kinematics``, the inertial readings of ``sensors`` and the
-clock fit of ``calibration``, neither files nor ROS. The node ``imu_skeleton`` and the filters may import it.
+``worn`` takes the readings of one sensor; ``imu_orientation`` estimates its orientation from raw ones. ``alignment``
+estimates the rotation between sensor and segment, and ``heading`` tracks it and every sensor's heading over time.
+``held_pose`` detects a pose for the alignment, ``mounting`` has the intended mountings, ``detection`` finds exchanged
+and slipped sensors. ``clock`` estimates a clock's offset by motion, ``timing`` keeps the offsets of all. ``posture``
+fits the body model to orientations, ``body`` makes a skeleton, ``angles`` makes joint angles. ``tracking`` with its
+``parameters`` puts these together for ``stage``. ``simulated`` and its helpers simulate sensors; ``imu_csv`` and
+``mvnx`` read recordings.
 
 Frames: *sensor*, that of the chip; *earth*, level with z up and a heading of its own for each sensor; *segment*, that
 of ``UpperBody``; *world*. With the alignment A (segment to sensor) and the heading psi (about z, earth to world)::

@@ -1,24 +1,24 @@
-"""How inertial sensors are turned against their segments: from a held pose, and from the axes of the elbow.
+"""Alignment of inertial sensors with their segments: by a held pose, and by the axes of the elbow.
 
-**Pose.** In a pose that the model knows, R_pose of eq. 1 is given. Sensors that each have a heading of their own leave
-four unknowns for its three equations; how the sensor was meant to be put on, or headings known from elsewhere, tell
-the fourth. The most probable alignment A = A_0 exp(delta) and heading psi minimise, weighted by their covariances,
+**Pose.** In a known pose, R_pose of eq. 1 is given. Sensors that each have a heading of their own leave four unknowns
+for its three equations; the intended mounting, or headings known from elsewhere, determine the fourth. The most
+probable alignment A = A_0 exp(delta) and heading psi minimise, weighted by their covariances,
 
-    log(R_pose^T Rz(psi) R_es A),  log(A_meant^T A),  psi - psi_known                                               (4)
+    log(R_pose^T Rz(psi) R_es A),  log(A_intended^T A),  psi - psi_known                                            (4)
 
 People hold a pose to within 5-10 degrees per axis of a segment; static calibrations of the upper limb compared by
 Bouvier et al., Sensors 15 (2015) 18813. One person repeats a pose to 2 degrees, people differ by far more (Donaldson
-et al., ISBS 39 (2021) 58): it is no noise that more time averages out. See :func:`pose_covariance`.
+et al., ISBS 39 (2021) 58): longer averaging does not reduce this error. See :func:`pose_covariance`.
 
 **Elbow.** Flexion turns about an axis j1 that is fixed in the upper arm, pronation about j2 fixed in the forearm, so
-that the relative angular rate has no part square to both (Mueller et al. 2016; with the heading between the two sensors
-Delta unknown besides, Laidig, Weygers and Seel, Sensors 22 (2022) 9850):
+that the relative angular rate has no component normal to both (Mueller et al. 2016; with an unknown heading Delta
+between the two sensors, Laidig, Weygers and Seel, Sensors 22 (2022) 9850):
 
     (R1 w1 - Rz(Delta) R2 w2) . n / |n| = 0,  n = R1 j1 x Rz(Delta) R2 j2                                           (5)
 
-It is weighted by what an angular rate is worth at that speed (as Olsson et al., Sensors 20 (2020) 3534, weigh
-samples by their motion), and robust. A sample counts as often as what it leaves is independent of the one before; and
-no movement knows an axis better than the flesh and the person's own joint let it.
+It is robust, and weighted by the standard deviation of an angular rate at that speed (as Olsson et al., Sensors 20
+(2020) 3534, weigh samples by their motion). The weight of a sample allows for the autocorrelation of the residuals, and
+soft tissue and the person's own joint bound the accuracy of an axis.
 
 Over 500 lines: the inertial issue rewrites headings and alignment.
 """
@@ -41,42 +41,41 @@ from body_tracking.kinematics.upper_body import UpperBody
 Pose = Literal["t", "n"]
 
 POSE_STDDEV: Final = float(np.radians(6.0))
-"""Radians by which a person's joint is off the pose that was asked for, about each of its axes: makes 6-10 degrees of a
-segment."""
+"""Radians per axis: standard deviation of a person's joint from the requested pose; gives 6-10 degrees of a segment."""
 TISSUE_STDDEV: Final = float(np.radians(3.0))
-"""Radians per axis by which the flesh turns a sensor."""
+"""Radians per axis: standard deviation of a sensor's rotation by soft tissue."""
 MOUNTING_STDDEV: Final = float(np.radians(10.0))
-"""Radians per axis by which a sensor is off how it was meant to be put on."""
+"""Radians per axis: standard deviation of a sensor from its intended mounting."""
 CLAVICLE_IN_T: Final = float(np.radians(20.0))
-"""Radians of a clavicle's elevation with the arm at 90 degrees: a third of what is beyond 30 (Inman et al. 1944)."""
+"""Radians of a clavicle's elevation with the arm at 90 degrees: a third of that beyond 30 (Inman et al. 1944)."""
 
 STILL_RATE: Final = 0.25
-"""rad/s, root mean square of a tenth of a second: who holds a pose sways by less, and no gyroscope's bias is as much.
-What turns slowly all the while turns further than :data:`STILL_TURN`."""
+"""rad/s, root mean square over a tenth of a second: above the sway in a pose and a gyroscope's bias. Slow rotation
+exceeds :data:`STILL_TURN`."""
 STILL_TIME: Final = 1.0
 """Seconds that a pose must be held."""
 STILL_TURN: Final = float(np.radians(10.0))
-"""Radians by which a sensor may have turned from the beginning of a pose to its end."""
+"""Greatest rotation of a sensor from the beginning of a pose to its end, radians."""
 _BIN = 0.1
 POSE_CONE: Final = float(np.radians(35.0))
-"""Radians from hanging, or from horizontal, within which an arm is taken to be."""
+"""Radians within which an arm counts as hanging or horizontal."""
 
 AXIS_FLOOR: Final = float(np.radians(5.0))
-"""Radians per direction below which no fit knows an axis: the skin follows a forearm's twist only in part."""
+"""Radians per direction: least standard deviation of a fitted axis; the skin follows a forearm's twist only in part."""
 AXIS_OFF: Final = float(np.radians(4.0))
-"""Radians per direction by which a person's axes are off the model's: carrying angle, varus and valgus."""
+"""Radians per direction: standard deviation of a person's axes from the model's: carrying angle, varus and valgus."""
 FLESH_TURN: Final = float(np.radians(15.0))
-"""Radians by which the movement of an elbow tells the heading between its sensors wrongly, as skin lags a twist by a
+"""Radians: standard deviation of the heading between an elbow's sensors by its movement, as the skin lags a twist by a
 fifth; simulated."""
 _RATE_NOISE = 0.03
 _RATE_SHARE = 0.1
-"""rad/s and share of itself that a relative rate is off: noise and bias, and the flesh that swings."""
+"""rad/s and share of the rate: standard deviation of a relative rate, by noise and bias, and by soft tissue."""
 _TWIST_SHARE = 0.2
 _REPETITIONS = 15.0
-"""Share of a segment's twist that the skin does not follow; and how many independent samples there are at most: the
-flesh errs alike in each repetition of a movement."""
+"""Share of a segment's twist that the skin does not follow, and greatest number of independent samples: the errors of
+soft tissue repeat with the movement."""
 _LEAST_TURNING = 0.3
-"""rad/s: less motion than that at an elbow says nothing."""
+"""rad/s: least motion of an elbow for a fit."""
 _Z: Final = np.array([0.0, 0.0, 1.0])
 _STEPS = 12
 
@@ -87,16 +86,16 @@ class AlignmentError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """What one oriented sensor said.
+    """The readings of one oriented sensor.
 
     Attributes:
-        segment: of ``UpperBody.segment_names``, that it is supposed to be on.
-        stamps: (n,) seconds, strictly ascending, in a clock that all streams share.
+        segment: of ``UpperBody.segment_names``, its stated place.
+        stamps: (n,) seconds, strictly ascending, in a clock common to all streams.
         rotations: (n, 3, 3) sensor to its earth.
         rates: (n, 3) rad/s in the sensor's frame.
 
     Raises:
-        AlignmentError: shapes that do not belong together, stamps that do not ascend, numbers that are not finite.
+        AlignmentError: inconsistent shapes, stamps that do not ascend, numbers that are not finite.
     """
 
     segment: str
@@ -115,12 +114,12 @@ class Stream:
             raise AlignmentError(f"{self.segment}: rotations and rates must be finite")
 
     def between(self, begin: float, end: float) -> Stream:
-        """The samples from a time on, up to another."""
+        """The samples from begin to end, end excluded."""
         part = slice(*np.searchsorted(self.stamps, [begin, end]))
         return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
 
     def thinned(self, rate: float) -> Stream:
-        """At most about so many samples per second."""
+        """Every n-th sample, for about ``rate`` samples per second."""
         if len(self.stamps) < 2:
             return self
         every = max(1, round(float(len(self.stamps) - 1) / float(np.ptp(self.stamps)) / rate))
@@ -128,7 +127,7 @@ class Stream:
         return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
 
     def at(self, times: FloatArray, gap: float = 0.1) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Rotations and rates between samples, and where samples no further apart than a gap surround the time."""
+        """Interpolated rotations and rates, and whether the surrounding samples are no further apart than the gap."""
         if len(self.stamps) < 2:
             nowhere = np.zeros(len(times), dtype=np.bool_)
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3)), nowhere
@@ -143,7 +142,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class StillPeriod:
-    """A time in which nothing moved.
+    """A period in which no sensor moved.
 
     Attributes:
         begin, end: seconds.
@@ -155,14 +154,14 @@ class StillPeriod:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """How k sensors are turned against their segments, and which way their earths face.
+    """The rotations of k sensors against their segments, and the headings of their earth frames.
 
     Attributes:
         segments: k names.
         rotations: (k, 3, 3) segment to sensor.
         headings: (k,) radians, earth to world about z.
-        covariance: (4 k, 4 k) radians squared: of sensor after sensor the error of its rotation (three numbers, a small
-            rotation vector in the segment's frame), then that of its heading.
+        covariance: (4 k, 4 k) radians squared: for each sensor the error of its rotation (a small rotation vector in
+            the segment's frame), then that of its heading.
     """
 
     segments: tuple[str, ...]
@@ -177,15 +176,15 @@ class Alignment:
         return result
 
     def oriented(self, number: int, rotations: FloatArray) -> FloatArray:
-        """(n, 3, 3) orientations of a segment in world, of those (n, 3, 3) of its sensor in its earth (eq. 1)."""
+        """(n, 3, 3) orientations of a segment in world from those (n, 3, 3) of its sensor in its earth (eq. 1)."""
         result: FloatArray = yaw(self.headings[number]) @ rotations @ self.rotations[number]
         return result
 
     def replaced(self, part: Alignment) -> Alignment:
-        """With other knowledge of some of its sensors, that has nothing in common with what is known of the others.
+        """A copy with another alignment of some sensors, uncorrelated with the others.
 
         Raises:
-            AlignmentError: one of a segment that carries no sensor here.
+            AlignmentError: a segment without a sensor here.
         """
         numbers = numbers_of(self, *part.segments)
         rotations, headings, covariance = self.rotations.copy(), self.headings.copy(), self.covariance.copy()
@@ -196,7 +195,7 @@ class Alignment:
         return Alignment(self.segments, rotations, headings, covariance)
 
     def moved(self, error: FloatArray, covariance: FloatArray) -> Alignment:
-        """Corrected by (4 k,) as of the covariance's coordinates."""
+        """A copy corrected by (4 k,) errors in the coordinates of the covariance."""
         parts = error.reshape(-1, 4)
         turned = self.rotations @ so3.quat_to_matrix(so3.exp(parts[:, :3]))
         return Alignment(self.segments, turned, wrapped(self.headings + parts[:, 3]), 0.5 * (covariance + covariance.T))
@@ -208,7 +207,7 @@ def yaw(angle: FloatArray | float) -> FloatArray:
 
 
 def wrapped(angle: FloatArray) -> FloatArray:
-    """The same angles from -pi to pi."""
+    """Angles wrapped to [-pi, pi)."""
     result: FloatArray = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
     return result
 
@@ -230,10 +229,10 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def pose_rotations(model: UpperBody, pose: Pose) -> FloatArray:
-    """(12, 3, 3) orientations of all segments in a pose of somebody who faces x.
+    """(12, 3, 3) orientations of all segments in a pose of a person who faces x.
 
     ``n`` is the model's neutral pose: arms hanging, thumbs forward. ``t`` has the arms out to the sides, thumbs forward
-    and palms down, raised by the clavicles in part.
+    and palms down, with raised clavicles.
 
     Raises:
         AlignmentError: another pose.
@@ -257,10 +256,10 @@ def _pose(model: UpperBody, pose: Pose) -> FloatArray:
 def pose_covariance(
     model: UpperBody, pose: Pose, segments: Sequence[str], joint_stddev: float = POSE_STDDEV
 ) -> FloatArray:
-    """(3 k, 3 k) radians squared by which people's segments are off a pose, each in its own frame.
+    """(3 k, 3 k) radians squared: covariance of people's segments about a pose, each in its own frame.
 
-    Joints are held to within ``joint_stddev`` radians per axis; what is off in a proximal joint moves all that hangs on
-    it. The flesh turns each sensor besides by :data:`TISSUE_STDDEV`.
+    Joints have a standard deviation of ``joint_stddev`` radians per axis; the error of a proximal joint moves all
+    distal segments. Soft tissue adds :data:`TISSUE_STDDEV` for each sensor.
 
     Raises:
         AlignmentError: a segment that the model does not have.
@@ -271,7 +270,7 @@ def pose_covariance(
     stddev = np.full(model.nv, joint_stddev)
     stddev[:3] = 0.0
     for number, name in enumerate(model.coordinate_names):
-        if name.startswith(("lumbar", "thoracic")):  # of a trunk that is held as a whole
+        if name.startswith(("lumbar", "thoracic")):  # both joints together have the trunk's deviation
             stddev[number] *= np.sqrt(0.5)
     lines = model.linearise(_pose(model, pose), model.default_lengths())
     numbers = [model.segment_names.index(name) for name in segments]
@@ -282,7 +281,7 @@ def pose_covariance(
 
 
 def still_periods(streams: Sequence[Stream], least: float = STILL_TIME) -> tuple[StillPeriod, ...]:
-    """When all sensors were still for at least so many seconds."""
+    """Periods in which all sensors were still for at least ``least`` seconds."""
     if not all(len(stream.stamps) for stream in streams):
         return ()
     begin = max(stream.stamps[0] for stream in streams)
@@ -295,7 +294,7 @@ def still_periods(streams: Sequence[Stream], least: float = STILL_TIME) -> tuple
         inside = (place >= 0) & (place < count)
         squares = np.bincount(place[inside], (stream.rates[inside] ** 2).sum(axis=1), count)
         samples = np.bincount(place[inside], minlength=count)
-        # a bin without a sample says nothing, and nobody moves and stops within a tenth of a second
+        # a bin without a sample counts as still: no movement begins and ends within a tenth of a second
         with np.errstate(invalid="ignore"):
             still &= (samples == 0) | (squares / samples < STILL_RATE**2)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
@@ -310,19 +309,19 @@ def still_periods(streams: Sequence[Stream], least: float = STILL_TIME) -> tuple
 
 
 def _turned(stream: Stream) -> float:
-    """Radians from the beginning to the end; infinite without samples."""
+    """Radians between the first and the last orientation; infinite without samples."""
     if len(stream.stamps) < 2:
         return np.inf
     return float(np.linalg.norm(rotation_vectors(stream.rotations[0].T @ stream.rotations[-1])))
 
 
 def pose_of(streams: Sequence[Stream], mountings: FloatArray, period: StillPeriod) -> Pose | None:
-    """Which pose it was, by how steep the arms were; None if neither, or no arm carries a sensor.
+    """The pose by the inclination of the arms; None if it is neither, or no arm carries a sensor.
 
     Args:
         streams: k sensors.
-        mountings: (k, 3, 3) segment to sensor, as the sensors were meant to be put on.
-        period: in which to look.
+        mountings: (k, 3, 3) segment to sensor, as intended.
+        period: of the pose.
     """
     slopes = []
     for stream, mounting in zip(streams, mountings, strict=True):
@@ -355,20 +354,20 @@ def align_in_pose(
     Args:
         segments: k names.
         measured: (k, 3, 3) sensor to earth, the mean over the pose.
-        pose: (k, 3, 3) the segments of somebody who faces x, such as of :func:`pose_rotations`.
-        covariance: (3 k, 3 k) by which people are off it, such as :func:`pose_covariance`.
-        mountings: (k, 3, 3) segment to sensor, as the sensors were meant to be put on; None if anyhow.
-        mounting_stddev: radians per axis by which they are off that.
-        headings: (k,) radians, earth to world, where something else knows them, or None.
-        heading_covariance: (k, k) of them. Sensors with magnetometers share a heading: a large common variance and a
+        pose: (k, 3, 3) the segments of a person who faces x, such as of :func:`pose_rotations`.
+        covariance: (3 k, 3 k) of people about the pose, such as :func:`pose_covariance`.
+        mountings: (k, 3, 3) segment to sensor, as intended; None if unknown.
+        mounting_stddev: radians per axis, of sensors from their intended mounting.
+        headings: (k,) radians, earth to world, known from elsewhere, or None.
+        heading_covariance: (k, k) of these. Sensors with magnetometers share a heading: a large common variance and a
             small own one.
         facing: radians, the person's heading in world.
 
     Returns:
-        Without mountings and headings each heading is as good as any other, and its deviation says so.
+        The alignment; without mountings and headings its headings have the deviation of unknown ones.
 
     Raises:
-        AlignmentError: shapes that do not belong together, or numbers that are not finite.
+        AlignmentError: inconsistent shapes, or numbers that are not finite.
     """
     k = len(segments)
     for name, value, shape in (
@@ -382,7 +381,7 @@ def align_in_pose(
         if value is not None and (value.shape != shape or not np.isfinite(value).all()):
             raise AlignmentError(f"alignment in a pose: {name} of shape {value.shape}, expected {shape} finite numbers")
     posed = yaw(facing) @ pose
-    # nothing is known of a heading: uniform over a turn
+    # an unknown heading is uniform over a turn
     known = np.diag(np.full(k, np.pi**2 / 3.0)) if heading_covariance is None else heading_covariance
     if mountings is not None:
         turn = posed @ mountings.swapaxes(-1, -2) @ measured.swapaxes(-1, -2)
@@ -393,7 +392,7 @@ def align_in_pose(
     if headings is not None and mountings is None:
         psi = prior.copy()
     elif headings is not None:
-        # as near to the known headings as what they share lets them be
+        # with a common unknown part, the nearest headings to the known ones
         common = np.angle(np.exp(1j * (psi - prior)).mean())
         prior = prior + (common if known[0, 0] > (0.5 * np.pi) ** 2 else 0.0)
         psi = prior.copy()
@@ -433,7 +432,7 @@ def align_in_pose(
 
 
 def across(axis: FloatArray) -> FloatArray:
-    """(3, 2) two directions square to a unit vector and to each other."""
+    """(3, 2) two unit vectors normal to a unit vector and to each other."""
     least = np.eye(3)[int(np.abs(axis).argmin())]
     one = np.cross(axis, least)
     one /= np.linalg.norm(one)
@@ -447,7 +446,7 @@ def _tilted(axis: FloatArray, by: FloatArray) -> FloatArray:
 
 
 def _common(first: Stream, second: Stream) -> tuple[FloatArray, ...]:
-    """Times; rotations and rates of both at the times of the slower one, where both are known."""
+    """Times of the slower stream where both are known, and rotations and rates of both at these."""
     ends = [one.stamps[[0, -1]] if len(one.stamps) else np.array([np.inf, -np.inf]) for one in (first, second)]
     begin, end = max(ends[0][0], ends[1][0]), min(ends[0][1], ends[1][1])
     slower = min((first, second), key=lambda one: len(one.between(begin, end).stamps))
@@ -459,14 +458,14 @@ def _common(first: Stream, second: Stream) -> tuple[FloatArray, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ElbowFit:
-    """What the movement of an elbow told.
+    """An alignment by the movement of an elbow.
 
     Attributes:
         alignment: corrected.
         before: (5,) radians, standard deviations before: of two directions of the flexion axis in the upper arm's
             sensor, two of the pronation axis in the forearm's, and of the heading between both.
-        after: (5,) the same with what the movement told.
-        information: the movement's own, nats: half the logarithm of how much smaller the covariance became.
+        after: (5,) the standard deviations after the fit.
+        information: of the movement, nats: half the logarithm of the ratio of the covariances' determinants.
     """
 
     alignment: Alignment
@@ -478,17 +477,17 @@ class ElbowFit:
 def align_by_elbow(alignment: Alignment, side: str, upper: Stream, lower: Stream) -> ElbowFit | None:
     """Correct two alignments and headings by any movement of the elbow between them (eq. 5).
 
-    The most probable errors of both, starting from the alignment as the prior; the person's axes are off the model's by
-    unknown constants of :data:`AXIS_OFF` besides. Where the movement tells little, little changes.
+    The most probable errors of both with the alignment as prior; the person's axes deviate from the model's by unknown
+    constants of :data:`AXIS_OFF`.
 
     Args:
-        alignment: so far, such as of a pose.
+        alignment: the prior, such as one by a pose.
         side: ``left`` or ``right``.
         upper: of the upper arm's sensor.
-        lower: of the forearm's.
+        lower: of the forearm's sensor.
 
     Returns:
-        None where the two did not move against each other, or were not seen together for a second.
+        None where the two did not move against each other, or have less than a second in common.
 
     Raises:
         AlignmentError: no sensor on one of the segments.
@@ -514,7 +513,7 @@ def align_by_elbow(alignment: Alignment, side: str, upper: Stream, lower: Stream
     )
 
     def off_plane(y: FloatArray) -> FloatArray:
-        """(n,) eq. 5, y: errors of both sensors (4 each), of the model's axes (2 each), and the flesh's turn."""
+        """(n,) eq. 5, y: errors of both sensors (4 each), of the model's axes (2 each), and heading by soft tissue."""
         worlds, turned = [], []
         for place, rotations in enumerate((r1, r2)):
             number, error = int(numbers[place]), y[4 * place : 4 * place + 4]
@@ -536,13 +535,13 @@ def align_by_elbow(alignment: Alignment, side: str, upper: Stream, lower: Stream
     y, worth = np.zeros(13), np.sqrt(_REPETITIONS / len(times))
     found = None
     for _ in range(3):
-        # a sample counts as often as what it leaves is independent of the one before, and as its size says
+        # weights by the size and the autocorrelation of the residuals
 
         def residuals(y: FloatArray, worth: float = worth) -> FloatArray:
             return np.concatenate([worth * _huber(off_plane(y)), white @ y])
 
         starts = [y]
-        if found is None:  # the valley between the heading and the axes can be long
+        if found is None:  # heading and axes are strongly correlated
             starts = [y + np.eye(13)[7] * turn for turn in (0.0, -0.4, 0.4)]
         found = min((least_squares(residuals, start) for start in starts), key=lambda each: float(each.cost))
         y = found.x
@@ -569,7 +568,7 @@ def _huber(values: FloatArray, bound: float = 2.0) -> FloatArray:
 
 
 def _correlated(values: FloatArray) -> float:
-    """How many samples make an independent one: the integral of the autocorrelation up to where it vanishes."""
+    """Samples per independent sample: the integral of the autocorrelation up to its first zero."""
     centred = values - values.mean()
     power = np.correlate(centred, centred, "full")[len(values) - 1 :]
     power = power / max(float(power[0]), 1e-12)
@@ -587,7 +586,7 @@ def _axes_stddev(alignment: Alignment, numbers: IntArray, axes: tuple[FloatArray
 
 
 def elbow_segment_axes(side: str) -> tuple[FloatArray, FloatArray]:
-    """(3,) flexion in the upper arm's frame and (3,) pronation in the forearm's, of a side, as ``UpperBody`` has them.
+    """(3,) flexion axis in the upper arm's frame and (3,) pronation axis in the forearm's, as in ``UpperBody``.
 
     Raises:
         AlignmentError: neither ``left`` nor ``right``.
@@ -598,10 +597,10 @@ def elbow_segment_axes(side: str) -> tuple[FloatArray, FloatArray]:
 
 
 def numbers_of(alignment: Alignment, *segments: str) -> IntArray:
-    """Where an alignment has segments.
+    """Indices of segments in an alignment.
 
     Raises:
-        AlignmentError: one of them carries no sensor.
+        AlignmentError: a segment without a sensor.
     """
     missing = [name for name in segments if name not in alignment.segments]
     if missing:

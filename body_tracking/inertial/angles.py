@@ -1,8 +1,7 @@
-"""ISB joint angles straight from the orientations of segments, without the body model between them.
+"""ISB joint angles directly from the orientations of segments, without the body model.
 
-The same sequences as convention ``isb`` of ``kinematics.conventions``, which tells the angles of a configuration of the
-model. Where sensors give every orientation, the rotation of a joint has three angles even where the model's joint has
-two: the carrying angle of an elbow, the twist of a wrist. They are told here under names of their own.
+The sequences are those of convention ``isb`` in ``kinematics.conventions``. Sensors measure three angles even where the
+model's joint has two: the carrying angle of an elbow, the twist of a wrist. These third angles get their own names.
 """
 
 from __future__ import annotations
@@ -15,32 +14,33 @@ from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
 
-_UNTOLD = {"elbow": "elbow_carrying", "wrist": "wrist_twist", "clavicle": "clavicle_axial", "neck": "neck_axial"}
-"""What the convention does not tell of a joint, by the first word of the angles that it does tell."""
+_THIRD_ANGLES = {"elbow": "elbow_carrying", "wrist": "wrist_twist", "clavicle": "clavicle_axial", "neck": "neck_axial"}
+"""Name of a joint's third angle, by the first word of the names of its other angles."""
 _KNOWN = np.pi / 10.0
-"""Radians of deviation up to which an angle of two sensors is handed out."""
+"""Radians: an angle with a larger standard deviation gets an infinite one."""
 
 
 class SegmentAngles:
     """Rotations of segments to ISB angles.
 
     Attributes:
-        names: of the angles: those of convention ``isb`` and the third ones of its joints of two.
+        names: the angles of convention ``isb`` and the third angles of its joints with two.
     """
 
     def __init__(self, model: UpperBody) -> None:
         isb = convention("isb", model)
         # all its chains are between segments: one stage
         ((self._sequences, self._parents, self._children, rows),) = isb.stages
-        told = dict(zip((isb.rows - rows.start).tolist(), isb.names, strict=True))
+        isb_names = dict(zip((isb.rows - rows.start).tolist(), isb.names, strict=True))
         names = []
         for place in range(rows.stop - rows.start):
-            if place in told:
-                names.append(told[place])
+            if place in isb_names:
+                names.append(isb_names[place])
                 continue
-            neighbour = next(told[other] for other in range(3 * (place // 3), 3 * (place // 3) + 3) if other in told)
+            first = 3 * (place // 3)
+            neighbour = next(isb_names[other] for other in range(first, first + 3) if other in isb_names)
             side = neighbour.rpartition("_")[2]
-            word = _UNTOLD[neighbour.partition("_")[0]]
+            word = _THIRD_ANGLES[neighbour.partition("_")[0]]
             names.append(f"{word}_{side}" if side in ("left", "right") else word)
         self.names = tuple(names)
 

@@ -1,7 +1,7 @@
-"""The skeleton of a body whose segments carry inertial sensors: where its points are, how sure, and which are told.
+"""The skeleton of a body whose segments carry inertial sensors, with covariances and tracking states.
 
-Orientations alone do not place a body: its base is where a camera last saw it, less surely with every second since,
-and its segments are as long as the camera has measured them; without one it stands at the origin.
+Orientations alone do not place a body. Its base is at the camera's last measurement, with a variance that grows with
+time, and the camera measures the segment lengths. Without a camera the body stands at the origin.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from body_tracking.kinematics.lengths import SkeletonLengths
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
 _BASE_STDDEV, _BASE_UNKNOWN = 0.05, 1.0
-"""Metres: of the base where a camera sees it, and where nobody knows."""
+"""Metres: standard deviation of the base where a camera measures it, and where it is unknown."""
 _BASE_WALK = 0.3
-"""Metres per root second that the base is known less well when the camera does not see it."""
+"""Metres per root second: random walk of the base between the camera's measurements."""
 _STANDING: Final = np.array([0.0, 0.0, 1.0])
 _EYE3: Final = np.eye(3)
 _SMALL: Final = 1e-4 * _EYE3
@@ -38,7 +38,7 @@ _CARRIERS: Final = {
     "HAND_TIP": "hand",
     "THUMB": "hand",
 }
-"""Of each kind of joint the segment that it is a point of."""
+"""The segment to which each kind of joint belongs."""
 _LITTLE_MOVED: Final = ("lower_trunk", "clavicle_left", "clavicle_right")
 _TRUNK: Final = ("pelvis", "upper_trunk")
 
@@ -48,7 +48,7 @@ class WornBody:
 
     Args:
         model: of the body.
-        stature: metres, of the person, until a camera has measured the segments.
+        stature: metres; used until a camera has measured the segments.
         world: name of the frame of the skeletons.
     """
 
@@ -59,8 +59,8 @@ class WornBody:
         self._lengths = SkeletonLengths()
         self._posture: FloatArray | None = None
 
-    def see(self, skeleton: Skeleton) -> None:
-        """Take where the base is, and how long segments are, from a camera's skeleton in ``world``."""
+    def take_skeleton(self, skeleton: Skeleton) -> None:
+        """Take the position of the base and the segment lengths from a camera's skeleton in ``world``."""
         if skeleton.valid[Joint.SPINE_BASE]:
             self._base = skeleton.stamp_ns, skeleton.positions[Joint.SPINE_BASE]
         known = skeleton.valid[self._model.joints]
@@ -80,8 +80,8 @@ class WornBody:
             covariances: (k, 3, 3) radians squared, in the segments' own frames.
 
         Returns:
-            Tracked are the points whose place against the trunk sensors tell; the others are inferred. Each with its
-            covariance; points that the model does not have are unknown.
+            Points whose position relative to the trunk the sensors determine are TRACKED, the others INFERRED, each
+            with its covariance. Points that the model does not have are NOT_TRACKED.
 
         Raises:
             AlignmentError: as of :meth:`OrientationKinematics.solve`.
@@ -115,7 +115,7 @@ class WornBody:
 
 
 def joint_variances(skeleton: Skeleton) -> FloatArray:
-    """(25,) square metres per axis, of a camera's joints."""
+    """(25,) variances of a camera's joints, square metres per axis."""
     if skeleton.covariances is None:
         return BASE_STDDEV**2
     traces: FloatArray = np.trace(skeleton.covariances, axis1=1, axis2=2) / 3.0
@@ -123,15 +123,15 @@ def joint_variances(skeleton: Skeleton) -> FloatArray:
 
 
 def _placed_by(model: UpperBody, sensed: Sequence[str]) -> BoolArray:
-    """(19,) points whose place against the trunk sensors tell: every segment from there on carries one.
+    """(19,) points whose position relative to the trunk the sensors determine: every segment from there on has one.
 
-    None is asked for on the spine and on the girdle, which move little, nor on more than one end of the trunk.
+    Lower trunk and clavicles, which move little, need no sensor, and one end of the trunk is enough.
     """
     trunk = any(name in sensed for name in _TRUNK)
-    sure: dict[str, bool] = {}
+    determined: dict[str, bool] = {}
     for number, name in enumerate(model.segment_names):
-        above = PARENTS[number] < 0 or sure[model.segment_names[PARENTS[number]]]
-        sure[name] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
+        above = PARENTS[number] < 0 or determined[model.segment_names[PARENTS[number]]]
+        determined[name] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
     carriers = []
     for joint in model.joints.tolist():
         kind, _, side = Joint(joint).name.rpartition("_")
@@ -140,4 +140,4 @@ def _placed_by(model: UpperBody, sensed: Sequence[str]) -> BoolArray:
             carriers.append(carrier if carrier == "pelvis" else f"{carrier}_{side.lower()}")
         else:
             carriers.append(_CARRIERS[Joint(joint).name])
-    return np.array([sure[carrier] for carrier in carriers])
+    return np.array([determined[carrier] for carrier in carriers])

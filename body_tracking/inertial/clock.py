@@ -1,21 +1,21 @@
-"""The offset between the clocks of two inertial sensors, or of one and a camera, from the motion that both felt.
+"""The offset between the clocks of two inertial sensors, or of one and a camera, by the motion that both measured.
 
-How fast something turns does not depend on where a sensor sits nor on which way it faces, so the magnitudes of angular
-rates are compared: of two sensors, or of a sensor and of a bone that a camera sees. Coarsely by Pearson's correlation
-at every offset of a wide window, finely by
-:class:`~body_tracking.calibration.clock_correlation.ClockFit` over windows of motion.
+The magnitude of an angular rate depends neither on a sensor's place nor on its orientation, so magnitudes are compared:
+of two sensors, or of a sensor and of a bone that a camera sees. A coarse search uses Pearson's correlation at every
+offset of a wide window; :class:`~body_tracking.calibration.clock_correlation.ClockFit` refines it over windows of
+motion.
 
-An offset is only told where the data decide. Turning is smooth, so that its samples are not independent; the variance
-of the correlation of two series that have nothing to do with each other is (Bartlett 1946)
+An offset is only returned where the data decide. Rates are smooth, so their samples are not independent; the variance
+of the correlation of two independent series is (Bartlett 1946)
 
     var rho = 1 / n',  n' = T / sum_k rho_a(k) rho_b(k) dt                                                          (2)
 
-with their autocorrelations rho_a, rho_b over lags k and the overlap T; a motion that repeats itself has few n'. And of
-two offsets that leave shares s of the variance unexplained, the better one is told only if
+with their autocorrelations rho_a, rho_b over lags k and the overlap T; a periodic motion has a small n'. Of two offsets
+that leave shares s of the variance unexplained, the better one is returned only if
 
     log(likelihood ratio) = T / (2 tau) log(s_worse / s_better)                                                     (3)
 
-is large, with the correlation time tau of what is left. Of a motion that repeats itself exactly both leave the same.
+is large, with the correlation time tau of the residuals. For an exactly periodic motion both shares are equal.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 
 WINDOW = 60.0
-"""Seconds to either side in which an offset is looked for."""
+"""Half width of the search, seconds."""
 
 LEAST_OVERLAP = 8.0
-"""Seconds that both must have felt at an offset for it to count."""
+"""Least overlap of both series at an offset, seconds."""
 
 LONGEST_GAP = 0.1
 """Seconds between samples over which a rate is interpolated."""
 
 SIGNIFICANCE = 5.0
-"""Standard deviations by which a correlation must exceed chance: among some thousand offsets that are looked at."""
+"""Standard deviations by which a correlation must exceed chance, among some thousand offsets."""
 
 DECISIVE = 5.0
 """Logarithm of the likelihood by which the best offset must exceed every other peak."""
@@ -58,12 +58,12 @@ LEAST_RATE = 0.05
 _AUTOCORRELATION = 20.0
 """Seconds up to which autocorrelations count in eq. 2."""
 _RIVALS = 12
-"""How many of the other peaks are looked at, the highest ones first."""
+"""Number of other peaks that are compared, the highest ones first."""
 _CAUTION = 3.0
-"""Correlation times that an independent sample of the fine fit takes: on simulated arms, flesh and camera together err
-1.7 times as much as samples of one correlation time say."""
+"""Correlation times per independent sample of the fine fit: on simulated arms, the errors of soft tissue and camera are
+1.7 times as large as with one correlation time per sample."""
 _WORST = 0.05
-"""Seconds of standard deviation from which an offset is not told: the fine fit looks 0.15 s around the coarse one."""
+"""Greatest standard deviation of an offset, seconds: the fine fit searches 0.15 s around the coarse one."""
 _PART = 5.0
 """Seconds of a window of the fine fit."""
 _SMOOTH = 0.17
@@ -71,13 +71,13 @@ _SMOOTH = 0.17
 
 
 def turning(stamps: FloatArray, rates: FloatArray) -> Series:
-    """How fast something turns: stamps (n,) seconds, strictly ascending, and rates (n,) rad/s, NaN where unknown."""
+    """A series of turning rates: stamps (n,) seconds, strictly ascending, and rates (n,) rad/s, NaN where unknown."""
     good = np.isfinite(rates)
     return Series(stamps[good], rates[good, None], np.ones(int(good.sum()), dtype=np.bool_), LONGEST_GAP)
 
 
 def turning_of_sensor(stamps: FloatArray, rates: FloatArray, axis: FloatArray | None = None) -> Series:
-    """From angular rates (n, 3) rad/s; with an axis (3,) in the sensor's frame, only what turns the axis."""
+    """From angular rates (n, 3) rad/s; with an axis (3,) in the sensor's frame, without the part about it."""
     if axis is not None:
         rates = rates - (rates @ axis)[:, None] * axis / float(axis @ axis)
     return turning(stamps, np.linalg.norm(rates, axis=-1))
@@ -86,7 +86,7 @@ def turning_of_sensor(stamps: FloatArray, rates: FloatArray, axis: FloatArray | 
 def turning_of_bone(stamps: FloatArray, vectors: FloatArray) -> Series:
     """From the vectors (n, 3) between two joints of a skeleton; NaN where unknown.
 
-    ``|u x u'|`` of the direction u: a camera does not see a bone turn about itself.
+    ``|u x u'|`` of the direction u: a camera does not see a bone's rotation about its axis.
     """
     n = len(stamps)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -95,7 +95,7 @@ def turning_of_bone(stamps: FloatArray, vectors: FloatArray) -> Series:
     length = 2 * max(round(0.5 * _SMOOTH / step), 1) + 1
     if n < length + 2:
         return turning(stamps, np.full(n, np.nan))
-    # a straight line through some frames on either side, in their own times
+    # the slope of a line through the neighbouring frames
     near = np.zeros((n, length), dtype=np.intp)
     near[:] = np.clip(np.arange(n)[:, None] + np.arange(length) - length // 2, 0, n - 1)
     t = stamps[near] - stamps[near].mean(axis=1, keepdims=True)
@@ -109,7 +109,7 @@ def turning_of_bone(stamps: FloatArray, vectors: FloatArray) -> Series:
 def clock_offset(
     reference: Series, other: Series, guess: float = 0.0, window: float = WINDOW, *, parts: float = _PART
 ) -> ClockModel | None:
-    """Another clock against the reference clock, where the motion decides it.
+    """The offset of another clock from the reference clock, where the motion determines it.
 
     Args:
         reference: turning in the reference clock.
@@ -119,15 +119,15 @@ def clock_offset(
         parts: seconds of a window of the fine fit.
 
     Returns:
-        None where nothing moves, too little overlaps, the correlation may be chance, or the motion repeats itself so
-        that another offset is nearly as likely.
+        None without motion or enough overlap, where the correlation may be chance, and where a periodic motion makes
+        another offset nearly as likely.
     """
     lag = _coarse(reference, other, guess, window)
     return None if lag is None else _fine(reference, other, lag, parts)
 
 
 def _autocorrelation(values: FloatArray, known: BoolArray) -> FloatArray:
-    """(k,) at lags 0, STEP, 2 STEP, ...; of what is known."""
+    """(k,) at lags 0, STEP, 2 STEP, ..., of the known samples."""
     centred = np.where(known, values - values[known].mean(), 0.0)
     n = len(values)
     lags = min(round(_AUTOCORRELATION / STEP), n - 1)
@@ -144,7 +144,7 @@ def _bartlett(a: FloatArray, known_a: BoolArray, b: FloatArray, known_b: BoolArr
 
 
 def independent_samples(a: FloatArray, b: FloatArray, known: BoolArray) -> float:
-    """How many independent samples two series (n,) on a grid of STEP are, where both are known (eq. 2)."""
+    """Number of independent samples of two series (n,) on a grid of STEP, where both are known (eq. 2)."""
     return float(known.sum()) * STEP / _bartlett(a, known, b, known)
 
 
@@ -177,14 +177,14 @@ def _coarse(reference: Series, other: Series, guess: float, window: float) -> fl
 
 
 def _unexplained(found: Correlation, lag: int) -> tuple[float, float]:
-    """The share of the reference's variance that the other leaves unexplained at a lag, and its correlation time, s."""
+    """Share of the reference's variance unexplained at a lag, and the residuals' correlation time in seconds."""
     (a, known_a), (b, known_b) = found.reference, found.sensor
     shifted = slice(lag, lag + len(a))
     both = known_a & known_b[shifted]
     x, y = a[both, 0], b[shifted][both, 0]
     x, y = x - x.mean(), y - y.mean()
-    left = x - float(x @ y) / float(y @ y) * y
-    return float(left @ left) / float(x @ x), max(correlation_time(left, STEP), SAMPLE_TIME)
+    residuals = x - float(x @ y) / float(y @ y) * y
+    return float(residuals @ residuals) / float(x @ x), max(correlation_time(residuals, STEP), SAMPLE_TIME)
 
 
 def _fine(reference: Series, other: Series, lag: float, parts: float) -> ClockModel | None:

@@ -1,18 +1,17 @@
-"""Which sensor is where it should not be: exchanged with another one, or slipped.
+"""Detection of exchanged and slipped sensors.
 
-**Exchanged.** How well each of k streams goes with each of k segments is a table of log likelihoods; the assignment
-with the highest sum (Kuhn and Munkres) tells of an exchange, where being where it is said to be is worth something of
-its own to each sensor: forearm and upper arm of one side turn so much alike that either fits the other. From a
-skeleton: of the rate at which a bone turns, the correlation rho with that of the sensor's over n' independent samples
-is worth
+**Exchanged.** A table has the log likelihoods of each of k streams on each of k segments; the assignment with the
+highest sum (Kuhn and Munkres) shows an exchange. The stated segments get a prior in favour, because forearm and upper
+arm of one side turn so similarly that each fits the other. With a skeleton, the correlation rho of the turning rates
+of sensor and bone over n' independent samples has the log likelihood
 
     - n' / 2 log(1 - rho^2),  0 for rho < 0                                                                         (13)
 
-and needs neither alignment nor heading. From a pose: how far the orientation is from how the sensor was meant to be put
-on, normal with the deviations of both. Sensors that each have a heading of their own only show how steep they are.
+and needs neither alignment nor heading. In a pose, the orientation's distance from the intended mounting is normal with
+the variances of both. Of sensors with individual unknown headings, only the inclination counts.
 
-**Slipped.** What a camera, or a joint, sees of a segment stays beside what the sensor says by more than noise and over
-seconds: the median over a window is free of outliers, and its deviation that of the camera's lasting errors.
+**Slipped.** The residual between a segment's direction by a camera or a joint and by its sensor exceeds the noise for
+seconds. The median over a window rejects outliers; its standard deviation is that of the camera's persistent errors.
 """
 
 from __future__ import annotations
@@ -36,27 +35,27 @@ from body_tracking.inertial.alignment import (
 from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, independent_samples
 
 SEGMENT_STDDEV: Final = float(np.radians(8.0))
-"""Radians per axis by which a person's segment is off a pose."""
+"""Radians per axis: standard deviation of a person's segment from a pose."""
 SURE: Final = 5.0
-"""Logarithm of the likelihood ratio from which a sensor is somewhere else than is said."""
+"""Log likelihood ratio in favour of each sensor's stated segment."""
 SLIP_TURN: Final = float(np.radians(10.0))
-"""Radians from which a slip is one: below, the flesh gives as much."""
+"""Least turn of a slip, radians: soft tissue moves by less."""
 SLIP_TIME: Final = 6.0
-"""Seconds over which it must last."""
+"""Seconds over which a slip must last."""
 SLIP_SURE: Final = 3.0
-"""Standard deviations by which it must stand out; a filter that follows the slip takes some of it away meanwhile."""
+"""Standard deviations that a slip must exceed; the heading filter removes part of a slip meanwhile."""
 LASTING: Final = 1.0
-"""Seconds that the errors of what it is compared with last."""
+"""Seconds for which the errors of the reference persist."""
 _LEAST_SAMPLES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Which stream belongs to which segment.
+    """An assignment of streams to segments.
 
     Attributes:
         segments: for each stream the segment that fits best, of those stated.
-        exchanged: those that are not the stated ones, as (stated, found); empty where nothing is sure.
+        exchanged: (stated, found) where both differ; empty where the evidence is too weak.
         advantage: logarithm of the likelihood ratio of the best assignment against the stated one.
     """
 
@@ -69,7 +68,7 @@ def assign(stated: Sequence[str], likelihood: FloatArray) -> Assignment:
     """The best assignment of streams to segments.
 
     Args:
-        stated: k segments, where the streams are said to be.
+        stated: k segments of the streams.
         likelihood: (k, k) logarithms: of stream i being on segment j; 0 where nothing is known.
 
     Raises:
@@ -89,7 +88,7 @@ def likelihood_by_motion(sensors: Sequence[Series], bones: Sequence[Series | Non
 
     Args:
         sensors: k streams.
-        bones: of the k segments as a camera sees them; None of one that it does not see, of which nothing is known.
+        bones: of the k segments by a camera; None for an unseen one, whose log likelihoods are 0.
     """
     result = np.zeros((len(sensors), len(bones)))
     seen = [(j, bone) for j, bone in enumerate(bones) if bone is not None and len(bone.stamps)]
@@ -125,16 +124,16 @@ def likelihood_by_pose(
     Args:
         segments: k names.
         measured: (k, 3, 3) sensor to earth, the mean over the pose.
-        pose: (k, 3, 3) the segments of somebody who faces x.
-        mountings: (k, 3, 3) segment to sensor on each segment, as meant.
-        common_heading: all earths face the same way (magnetometers); which way is tried in steps. Otherwise each sensor
-            has a heading of its own, and only how steep its axes are counts.
-        stddev: radians per axis by which sensors are off how they are meant to be put on.
-        steps: how many headings are tried.
+        pose: (k, 3, 3) the segments of a person who faces x.
+        mountings: (k, 3, 3) segment to sensor on each segment, as intended.
+        common_heading: all headings are equal (magnetometers), and are searched on a grid. Otherwise each sensor has a
+            heading of its own, and only the inclination of its axes counts.
+        stddev: radians per axis, of sensors from their intended mounting.
+        steps: number of headings on the grid.
     """
     variance = np.full(len(segments), stddev**2 + SEGMENT_STDDEV**2)
     if not common_heading:
-        # the direction of up in the sensor, as it is and as it should be: two directions of error
+        # the vertical in the sensor's frame, measured and intended: two directions of error
         up, meant = measured[:, 2], (mountings @ pose[:, 2][..., None])[..., 0]
         off = np.arccos(np.clip(up @ meant.T, -1.0, 1.0))
         steep: FloatArray = -0.5 * off**2 / variance - np.log(variance)
@@ -150,13 +149,13 @@ def likelihood_by_pose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipFound:
-    """A sensor is not turned on its segment as it was.
+    """A detected slip of a sensor on its segment.
 
     Attributes:
-        segment: that carries it.
-        stamp: seconds, when it was noticed.
-        turn: (3,) radians, rotation vector in the segment's frame of what is seen against what the sensor says.
-        stddev: radians, of its size.
+        segment: of the sensor.
+        stamp: seconds, time of detection.
+        turn: (3,) radians, rotation vector in the segment's frame from the sensor's orientation to the observed one.
+        stddev: radians, of its magnitude.
     """
 
     segment: str
@@ -166,29 +165,29 @@ class SlipFound:
 
 
 class SlipDetector:
-    """Watches what is left between a segment as seen and as its sensor has it."""
+    """Monitors the residual between a segment's observed orientation and its sensor's."""
 
     def __init__(self, segment: str, *, least: float = SLIP_TURN, window: float = SLIP_TIME) -> None:
-        """Of a segment.
+        """Set up without a residual.
 
         Args:
-            segment: name.
-            least: radians from which a turn is a slip.
+            segment: its name.
+            least: least turn of a slip, radians.
             window: seconds over which it must last.
         """
         self._segment, self._least, self._window = segment, least, window
         self._recent: deque[tuple[float, FloatArray, float]] = deque()
 
     def update(self, stamp: float, turn: FloatArray, stddev: float) -> SlipFound | None:
-        """Take one comparison.
+        """Take one residual.
 
         Args:
-            stamp: seconds, ascending; after a jump backwards it starts anew.
+            stamp: seconds, ascending; a jump backwards restarts the detector.
             turn: (3,) radians in the segment's frame, such as ``Innovation.turn``; ignored where it is not finite.
-            stddev: radians per direction that it is off by noise and by what is known of alignment and heading.
+            stddev: radians per direction, of noise, alignment and heading together.
 
         Returns:
-            A slip, once; then it starts anew.
+            A slip, once; then the detector restarts.
         """
         if self._recent and stamp < self._recent[-1][0]:
             self._recent.clear()

@@ -1,4 +1,4 @@
-"""Which way the earth of each inertial sensor faces, and how the sensor is turned on its segment, kept over time.
+"""Tracking of the heading of each inertial sensor's earth frame and of the sensor's alignment with its segment.
 
 A Kalman filter on the errors of an :class:`~body_tracking.inertial.alignment.Alignment`: delta, a small rotation of
 each sensor's segment in the segment's own frame, and the heading psi. With R of eq. 1, a segment's orientation is off
@@ -6,18 +6,18 @@ by
 
     e = delta + (R^T z) d psi                                                                                        (8)
 
-Between observations both walk: headings as gyroscopes drift without a magnetometer, alignments as straps creep. What
-observes them:
+Both are random walks: headings drift with the gyroscopes without a magnetometer, alignments as straps creep. The
+observations are:
 
-- a bone that a camera sees, along the axis a of a segment: ``P^T R^T d = -P^T [a]x e``, P square to a               (9)
-- an elbow, whose axes of flexion and pronation stay square: ``(R1 a1) . (R2 a2) = 0`` (Mueller 2016)               (11)
-- ranges of motion: an angle beyond its limit is taken for the limit, and one within it for nothing (Lehmann, Laidig and
-  Seel 2020 use them so for headings)                                                                               (12)
+- a bone that a camera sees, along the axis a of a segment: ``P^T R^T d = -P^T [a]x e``, P normal to a               (9)
+- an elbow, whose axes of flexion and pronation stay normal: ``(R1 a1) . (R2 a2) = 0`` (Mueller 2016)               (11)
+- ranges of motion: an angle beyond its limit is observed to be at the limit, one within it gives no observation
+  (Lehmann, Laidig and Seel 2020 use them so for headings)                                                          (12)
 
-Without a camera only differences of headings are observed: what is common to all of them drifts, and the covariance
-says so. Errors of a camera's skeleton, of joints' axes and of a person at a limit last; an observation repeated within
-that time counts as a part of one: its variance is multiplied by ``max(1, 2 tau / dt)``. An observation that departs by
-more than noise does is given the weight of a Student's t (4 degrees of freedom).
+Without a camera only differences of headings are observed: their common part drifts, and the covariance grows with it.
+Errors of a camera's skeleton, of joint axes and of a person at a limit persist for a time tau. An observation repeated
+within it counts in part: its variance is multiplied by ``max(1, 2 tau / dt)``. Outliers get the weight of a Student's t
+(4 degrees of freedom).
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ HEADING_WALK: Final = float(np.radians(0.4))
 ALIGNMENT_WALK: Final = float(np.radians(0.05))
 """Radians per root second and axis of an alignment: a degree and a half in a quarter of an hour."""
 CAMERA_TIME: Final = 1.0
-"""Seconds that the errors of a camera's skeleton last."""
+"""Seconds for which the errors of a camera's skeleton persist."""
 ELBOW_STDDEV: Final = float(np.radians(6.0))
-"""Radians by which the axes of an elbow are not square: carrying angle, and the flesh."""
+"""Radians: standard deviation of the angle between an elbow's axes from 90 degrees: carrying angle and soft tissue."""
 ELBOW_TIME: Final = 20.0
-"""Seconds that this lasts: it is a person's own, but its direction turns with the movement."""
+"""Seconds for which this error persists: it is constant in a person, but its direction turns with the movement."""
 RANGE_STDDEV: Final = float(np.radians(8.0))
-"""Radians by which people's limits differ from the published ones."""
+"""Radians: standard deviation of people's limits from the published ones."""
 RANGE_TIME: Final = 5.0
 _FREEDOM = 4.0
 _FAR = 0.5
-"""Radians of a heading's deviation from which an observation is first turned to."""
+"""Radians of a heading's standard deviation from which the update starts at the observed heading."""
 _DIFFERENCE = 1e-5
 _Z: Final = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bone:
-    """What of a skeleton shows a segment's direction.
+    """The bone of a skeleton that shows a segment's direction.
 
     Attributes:
         axis: (3,) unit vector in the segment's frame.
@@ -75,7 +75,7 @@ class Bone:
 
 
 def bone_of(segment: str) -> Bone | None:
-    """The bone of a segment whose long axis a camera sees; None for those that it does not."""
+    """The bone along a segment's axis; None for a segment whose axis a camera does not see."""
     side = segment.rpartition("_")[2]
     ends: dict[str, tuple[FloatArray, str, str]] = {
         "pelvis": (np.array([0.0, 1.0, 0.0]), "HIP_RIGHT", "HIP_LEFT"),
@@ -96,14 +96,14 @@ def bone_of(segment: str) -> Bone | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """How far an observation was from what was expected.
+    """The innovation of an observation.
 
     Attributes:
         residual: (m,) radians.
-        covariance: (m, m) expected of it.
-        turn: (3,) radians: the smallest rotation of the segment, in its own frame, that would explain it; NaN where the
-            observation is not of a single sensor.
-        weight: at most 1: what it was given.
+        covariance: (m, m) of the residual.
+        turn: (3,) radians: the smallest rotation of the segment, in its own frame, that explains the residual; NaN for
+            an observation of two sensors.
+        weight: of the observation, at most 1.
     """
 
     residual: FloatArray
@@ -113,14 +113,14 @@ class Innovation:
 
 
 _Linear = tuple[FloatArray, FloatArray]
-"""(m,) residual and (m, 4 k) its derivative by the error, at a state."""
+"""(m,) residual and (m, 4 k) its derivative by the error."""
 
 
 class HeadingTracker:
     """Alignments and headings of k sensors over time; every ``observe`` takes the sensors' rotations of that instant.
 
     Attributes:
-        alignment: the present one.
+        alignment: the current estimate.
     """
 
     def __init__(
@@ -130,10 +130,10 @@ class HeadingTracker:
         heading_walk: FloatArray | float = HEADING_WALK,
         alignment_walk: float = ALIGNMENT_WALK,
     ) -> None:
-        """Start.
+        """Start from an alignment.
 
         Args:
-            alignment: such as of a pose.
+            alignment: such as one by a pose.
             heading_walk: (k,) or one for all, radians per root second; less for sensors with magnetometers.
             alignment_walk: radians per root second.
         """
@@ -146,7 +146,7 @@ class HeadingTracker:
         self._last: dict[tuple[str, ...], float] = {}
 
     def predict(self, stamp: float) -> None:
-        """Up to a time, seconds.
+        """Predict to a time, seconds.
 
         Raises:
             AlignmentError: earlier than the last one.
@@ -160,11 +160,11 @@ class HeadingTracker:
         self._stamp = stamp
 
     def loosen(self, segment: str, stddev: float) -> None:
-        """Know less of a sensor's alignment, and of its heading, such as after a slip or when it was switched on.
+        """Inflate the covariance of a sensor's alignment and heading, such as after a slip or when it was switched on.
 
         Args:
-            segment: whose sensor.
-            stddev: radians per axis, added.
+            segment: of the sensor.
+            stddev: radians per axis; its square is added to the variances.
         """
         number = self._number(segment)
         a = self.alignment
@@ -174,7 +174,7 @@ class HeadingTracker:
         self.alignment = Alignment(a.segments, a.rotations, a.headings, covariance)
 
     def orientation_covariance(self, segment: str, rotation: FloatArray) -> FloatArray:
-        """(3, 3) radians squared, of the segment's orientation in its own frame (eq. 8), for its sensor's (3, 3)."""
+        """(3, 3) radians squared: covariance of a segment's orientation in its own frame (eq. 8); rotation as below."""
         number = self._number(segment)
         world = self.alignment.oriented(number, rotation)
         by = self._turning(number, world)
@@ -184,14 +184,14 @@ class HeadingTracker:
     def observe_bone(
         self, stamp: float, segment: str, rotation: FloatArray, direction: FloatArray, stddev: float
     ) -> Innovation | None:
-        """A camera sees a bone (eq. 9).
+        """Update by the direction of a bone that a camera sees (eq. 9).
 
         Args:
             stamp: seconds.
-            segment: that has a :func:`bone_of`.
+            segment: with a :func:`bone_of`.
             rotation: (3, 3) sensor to earth at that time.
-            direction: (3,) in world, of any length; nothing is taken of one that is not finite.
-            stddev: radians of it, per direction.
+            direction: (3,) in world, of any length; ignored if it is not finite.
+            stddev: radians per axis, of the direction.
 
         Raises:
             AlignmentError: a segment without bone or without sensor, or a stamp that comes before the last one.
@@ -209,7 +209,7 @@ class HeadingTracker:
             local = world.T @ seen
             aside = square.T @ local
             size = float(np.linalg.norm(aside))
-            # the angle between, not its sine, which is small of the opposite direction too
+            # the angle, not its sine, which is small for the opposite direction too
             angle = np.arctan2(size, float(axis @ local))
             aside = aside * (angle / size) if size > 1e-9 else np.array([angle, 0.0])
             return aside, -square.T @ so3.skew(axis) @ self._turning(number, world)
@@ -222,19 +222,19 @@ class HeadingTracker:
             return float(np.arctan2(points[0] * seen[1] - points[1] * seen[0], points[:2] @ seen[:2]))
 
         noise = (stddev**2 + TISSUE_STDDEV**2) * np.eye(2)
-        back = (-square.T @ so3.skew(axis)).T  # its pseudoinverse: the rows are square to each other
+        back = (-square.T @ so3.skew(axis)).T  # the pseudoinverse: the rows are orthonormal
         return self._update(stamp, ("bone", segment), linear, noise, CAMERA_TIME, number, turned, back)
 
     def observe_elbow(
         self, stamp: float, side: str, upper: FloatArray, lower: FloatArray, stddev: float = ELBOW_STDDEV
     ) -> Innovation:
-        """An elbow bends and turns about axes that are square (eq. 11).
+        """Update by an elbow, whose axes of flexion and pronation are normal to each other (eq. 11).
 
         Args:
             stamp: seconds.
             side: ``left`` or ``right``.
             upper: (3, 3) the upper arm's sensor to its earth at that time.
-            lower: (3, 3) the forearm's likewise.
+            lower: (3, 3) the forearm's sensor, likewise.
             stddev: radians.
         """
         numbers = self._number(f"upper_arm_{side}"), self._number(f"forearm_{side}")
@@ -253,7 +253,7 @@ class HeadingTracker:
     def observe_range(
         self, stamp: float, parent: str, child: str, rotations: tuple[FloatArray, FloatArray]
     ) -> Innovation | None:
-        """A joint does not leave its range of motion (eq. 12); None where it is within.
+        """Update by a joint beyond its range of motion (eq. 12); None where it is within.
 
         Args:
             stamp: seconds.
@@ -262,7 +262,7 @@ class HeadingTracker:
             rotations: (3, 3) of the two sensors to their earths at that time.
 
         Raises:
-            AlignmentError: no joint between those.
+            AlignmentError: no joint between both.
         """
         limits = _limits(parent, child)
         numbers = self._number(parent), self._number(child)
@@ -307,7 +307,7 @@ class HeadingTracker:
         return self.alignment.segments.index(segment)
 
     def _turning(self, number: int, world: FloatArray) -> FloatArray:
-        """(3, 4 k) the segment's own turning by the error (eq. 8)."""
+        """(3, 4 k) derivative of the segment's orientation by the error (eq. 8)."""
         by = np.zeros((3, len(self.alignment.covariance)))
         by[:, 4 * number : 4 * number + 3] = np.eye(3)
         by[:, 4 * number + 3] = world[2]
@@ -324,7 +324,7 @@ class HeadingTracker:
         turned: Callable[[Alignment], float] | None = None,
         back: FloatArray | None = None,
     ) -> Innovation:
-        """The iterated update; ``turned`` tells by how much a heading that is hardly known is off at first."""
+        """The iterated update; ``turned`` gives the initial error of a heading that is hardly known."""
         self.predict(stamp)
         before = self.alignment
         prior = before.covariance
@@ -345,7 +345,7 @@ class HeadingTracker:
             residual_at, jacobian = linear(before.moved(error, prior))
             gain = prior @ jacobian.T @ np.linalg.inv(jacobian @ prior @ jacobian.T + effective)
             error = gain @ (residual_at + jacobian @ error)
-            # Joseph's form: rounding leaves it positive
+            # Joseph's form stays positive definite under rounding
             left = np.eye(len(prior)) - gain @ jacobian
             covariance = left @ prior @ left.T + gain @ effective @ gain.T
         self.alignment = before.moved(error, covariance)
@@ -353,7 +353,7 @@ class HeadingTracker:
 
 
 def _limits(parent: str, child: str) -> FloatArray:
-    """(3, 2) radians: least and greatest turn of a child in its parent about y, x and z, one after the other."""
+    """(3, 2) radians: least and greatest angle of a child in its parent about y, x and z, in this order."""
     name, _, side = child.rpartition("_")
     if side not in ("left", "right"):
         name, side = child, ""
@@ -361,7 +361,7 @@ def _limits(parent: str, child: str) -> FloatArray:
     if kind not in JOINTS or parent not in (kind[0], f"{kind[0]}_{side}"):
         raise AlignmentError(f"{parent} and {child}: no joint between them has a range")
     y, x, z = JOINTS[kind]
-    if side == "right":  # the mirror image at the sagittal plane
+    if side == "right":  # mirrored at the sagittal plane
         x, z = (-x[1], -x[0]), (-z[1], -z[0])
     return np.radians([y, x, z])
 
@@ -375,7 +375,7 @@ def _against(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 _GIRDLE = 45.0
-"""Degrees by which the clavicle turns about itself, and an elbow and a wrist (15) about axes that the model has not."""
+"""Degrees of a clavicle's rotation about its axis, which the model does not have; 15 for elbow and wrist."""
 
 JOINTS: Final[dict[tuple[str, str], tuple[tuple[float, float], tuple[float, float], tuple[float, float]]]] = {
     ("pelvis", "upper_trunk"): (
@@ -400,5 +400,5 @@ JOINTS: Final[dict[tuple[str, str], tuple[tuple[float, float], tuple[float, floa
         (-15.0, 15.0),
     ),
 }
-"""Degrees about y, x and z of the parent, of joints whose two segments may both carry a sensor; those of the left side.
-A shoulder is missing: it goes nearly everywhere."""
+"""Ranges about y, x and z of the parent, degrees, of joints whose two segments may both carry a sensor; left side.
+The shoulder is missing: its range is nearly unlimited."""

@@ -1,4 +1,4 @@
-"""Whether somebody holds a pose by which sensors can be aligned: by what they feel, and by what a camera sees."""
+"""Detection of a held pose for the alignment, by the sensors' rates and by a camera's skeletons."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from body_tracking.inertial.parameters import AUTO, POSES
 from body_tracking.kinematics.upper_body import UpperBody
 
 _FACING: Final = float(np.radians(8.0))
-"""Radians by which a skeleton's shoulders tell wrongly where a person faces."""
+"""Radians: standard deviation of a person's heading by the shoulders of a skeleton."""
 _CAMERA_CONE: Final = float(np.radians(40.0))
-"""Radians within which a camera sees the arms as a pose has them."""
+"""Radians by which a camera's arms may deviate from those of a pose."""
 _RECENT = 0.5
-"""Seconds since which a pose must have been held."""
+"""Greatest age of the end of a pose, seconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldPose:
-    """A pose, and what was felt in it.
+    """A pose, and the readings during it.
 
     Attributes:
         name: of the parameters' ``POSES``.
         streams: of the sensors, while it was held.
-        facing: radians from world's x, which way a camera saw the person face; None without one.
+        facing: the person's heading by the camera, radians from world's x; None without a camera.
     """
 
     name: str
@@ -47,23 +47,23 @@ class HeldPose:
 
 
 class PoseFinder:
-    """Finds poses of a body model's."""
+    """Finds held poses of a body model."""
 
     def __init__(self, model: UpperBody) -> None:
         self._model = model
         self._rotations = {name: pose_rotations(model, pose) for name, pose in POSES.items()}
 
     def rotations(self, name: str, segments: Sequence[str]) -> FloatArray:
-        """(k, 3, 3) orientations of segments in a pose of somebody who faces x."""
+        """(k, 3, 3) orientations of segments in a pose of a person who faces x."""
         return self._rotations[name][[self._model.segment_names.index(each) for each in segments]]
 
     def covariance(self, held: HeldPose, segments: Sequence[str], stddev: float) -> FloatArray:
-        """(3 k, 3 k) radians squared by which segments are off a pose, and off where the person seems to face.
+        """(3 k, 3 k) radians squared: covariance of segments about a pose, with the error of the camera's heading.
 
         Args:
             held: the pose.
             segments: k names.
-            stddev: radians by which joints are off it, per axis.
+            stddev: radians per axis, of the joints.
         """
         spread = pose_covariance(self._model, POSES[held.name], segments, stddev)
         if held.facing is None:
@@ -75,7 +75,7 @@ class PoseFinder:
     def find(
         self,
         streams: Sequence[Stream],
-        meant: FloatArray,
+        intended: FloatArray,
         wanted: str,
         now: float,
         seen: Sequence[tuple[float, Skeleton]],
@@ -86,15 +86,15 @@ class PoseFinder:
 
         Args:
             streams: k sensors, of the last seconds.
-            meant: (k, 3, 3) segment to sensor, as they were meant to be put on.
+            intended: (k, 3, 3) segment to sensor, intended mountings.
             wanted: of the parameters: one of ``POSES``, or ``auto``.
             now: seconds.
-            seen: skeletons of a camera of the same time with their stamps in seconds; none without a camera.
-            asked: somebody said that the pose is held.
+            seen: skeletons of a camera over the same time with their stamps in seconds; empty without a camera.
+            asked: the user requested the alignment.
 
         Returns:
-            None where it is another one, where the camera sees another one or not which way the person faces, and where
-            neither arms, nor a camera, nor anybody tells a pose from sitting still.
+            None where the sensors or the camera show another pose or no heading, and where without arm sensor, camera
+            and request a pose cannot be distinguished from sitting still.
         """
         periods = still_periods(streams)
         if not periods or periods[-1].end < now - _RECENT:
@@ -102,7 +102,7 @@ class PoseFinder:
         period = periods[-1]
         name = wanted
         if name == AUTO:
-            pose = pose_of(streams, meant, period)
+            pose = pose_of(streams, intended, period)
             if pose is None:
                 return None
             name = next(each for each, letter in POSES.items() if letter == pose)
@@ -112,11 +112,11 @@ class PoseFinder:
             if facing is None or not self._looks_like(seen[-1][1], name):
                 return None
         elif not asked and not any(stream.segment.startswith("upper_arm") for stream in streams):
-            return None  # forearms alone do not tell a pose from hands on a table
+            return None  # with forearms alone a pose looks like hands on a table
         return HeldPose(name, tuple(stream.between(period.begin, period.end) for stream in streams), facing)
 
     def _looks_like(self, skeleton: Skeleton, name: str) -> bool:
-        """Whether a camera sees the arms in a pose, as far as it sees them."""
+        """Whether the arms that a camera sees agree with a pose."""
         facing = _facing(skeleton)
         if facing is None:
             return False
@@ -134,14 +134,14 @@ class PoseFinder:
 
 
 def _faced(period: StillPeriod, seen: Sequence[tuple[float, Skeleton]]) -> float | None:
-    """Radians from world's x, which way the person faced meanwhile, as a camera saw it."""
+    """Mean heading of the person in a period by a camera, radians from world's x."""
     found = [_facing(skeleton) for stamp, skeleton in seen if period.begin <= stamp <= period.end]
     turns = np.exp(1j * np.array([each for each in found if each is not None]))
     return float(np.angle(turns.mean())) if len(turns) else None
 
 
 def _facing(skeleton: Skeleton) -> float | None:
-    """Radians from world's x, which way a person faces, by shoulders and hips."""
+    """Heading of a person by shoulders and hips, radians from world's x."""
     left = body_heading(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
     if not np.isfinite(left).all() or np.linalg.norm(left[:2]) < 0.05:
         return None

@@ -1,20 +1,20 @@
-"""Readings of inertial sensors as separated values, ``.csv`` or ``.csv.gz``: three layouts, told by their header.
+"""Readings of inertial sensors as separated values, ``.csv`` or ``.csv.gz``: three layouts, recognised by the header.
 
 ``own``, a row per reading of a sensor, columns found by name: ``stamp`` (seconds, the sensor's clock); optional
 ``received`` (seconds, the receiver's clock) and ``sensor`` (its name); and of ``orientation_x _y _z _w`` (sensor to
 earth, z up), ``angular_velocity_x _y _z`` (rad/s), ``linear_acceleration_x _y _z`` (m/s2, specific force) and
-``magnetic_field_x _y _z`` (tesla) those that there are, each group whole. An empty group is a quantity that this
-reading does not have. The names are those of ``sensor_msgs``.
+``magnetic_field_x _y _z`` (tesla) any groups, each complete. An empty group means that this reading does not have the
+quantity. The names are those of ``sensor_msgs``.
 
-``LPMS``, what LP-Research's software logs of n sensors side by side: ``IMU_TIMESTAMP(0)_0``, ``IMU_GYROSCOPE(0)_0``...
-Degrees per second, g, microtesla; the acceleration points down at rest, and the quaternion (w, x, y, z) is of the earth
-in the sensor's frame: both are turned about. A row was received when the first sensor's clock showed its stamp.
+``LPMS``, the log of LP-Research's software for n sensors: columns ``IMU_TIMESTAMP(0)_0``, ``IMU_GYROSCOPE(0)_0``... in
+degrees per second, g, microtesla. The acceleration points down at rest, and the quaternion (w, x, y, z) rotates earth
+to sensor: both are inverted. The first sensor's stamp is the time of receipt of a row.
 
 ``RepoIMU``, of Szczesna et al., "Reference data set for accuracy evaluation of orientation estimation algorithms for
 inertial motion capture systems", 2016: two lines of header, semicolons, ``Time``, the reference's orientation, and
-acceleration, rate and magnetic field of one sensor. The latter is normalised, and taken for shares of 50 microtesla.
-Rows were written faster than the sensor spoke: those that repeat its reading are left out. On the pendulum they come
-every 11 ms, rates at 50 Hz and accelerations at 26 Hz; ``Time`` has five digits, so from 100 s on steps of 10 ms.
+acceleration, rate and magnetic field of one sensor. The latter is normalised; it is scaled by 50 microtesla. Rows were
+written faster than the sensor's rate: those that repeat a reading are ignored. On the pendulum, rows come every 11 ms,
+rates at 50 Hz and accelerations at 26 Hz; ``Time`` has five digits, so from 100 s on steps of 10 ms.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _LPMS: Final = re.compile(r"IMU_TIMESTAMP\((\d+)\)_0")
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """A quantity of a sensor: its columns, and by what its numbers are multiplied (a sign for each)."""
+    """A quantity of a sensor: its columns, and the factor of each."""
 
     columns: tuple[int, ...]
     factors: tuple[float, ...]
@@ -64,7 +64,7 @@ class _Group:
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """A sensor's name, or the column that holds it; its other columns, those of quantities by the sample's names."""
+    """A sensor's name or the column of the name, and its other columns; groups by names of the sample's fields."""
 
     name: str | int
     stamp: int
@@ -82,7 +82,7 @@ class _Layout:
 
 
 def is_imu_csv(path: Path) -> bool:
-    """Whether the header of a ``.csv`` or ``.csv.gz`` file is one of inertial readings.
+    """Whether a ``.csv`` or ``.csv.gz`` file has a header of inertial readings.
 
     Raises:
         CsvError: the file cannot be read.
@@ -98,17 +98,17 @@ def is_imu_csv(path: Path) -> bool:
 class ImuCsvRecording:
     """Reads inertial readings, a line at a time.
 
-    Stamps are taken as they are written, also where they repeat or run backwards, and counted. A reading that
-    :class:`~body_tracking.core.imu.ImuSample` refuses is left out, counted, and the first of them is a warning.
+    Stamps that repeat or run backwards are kept, and counted. A reading that :class:`~body_tracking.core.imu.ImuSample`
+    rejects is ignored and counted; the first one adds a warning.
 
     Args:
         path: the file; gzip is recognised by the suffix ``.gz``.
-        names: of the file's sensors, in its order, where the file does not tell them; None: ``imu1``, ``imu2``, ...
-        partial: read a file that is cut off up to its last whole row, with a warning, instead of refusing it.
+        names: of the file's sensors, in its order, for files without names; None: ``imu1``, ``imu2``, ...
+        partial: read a truncated file up to its last complete row, with a warning, instead of raising an error.
 
     Raises:
-        CsvError: while iterating, if anything about the file is not as its layout says.
-        SensorNameError: a name cannot be a sensor's.
+        CsvError: while iterating, if the file violates its layout.
+        SensorNameError: an invalid sensor name.
     """
 
     def __init__(self, path: Path | str, names: Sequence[str] | None = None, partial: bool = False) -> None:
@@ -226,7 +226,7 @@ class ImuCsvRecording:
         return _Layout((_Source(sensor, stamp, received, groups),), len(names), 1, False, len(names) - len(used))
 
     def _places(self, names: list[str], wanted: list[str]) -> tuple[int, ...]:
-        """Where the columns of a group are; empty where it has none.
+        """Indices of a group's columns; empty if the file has none of them.
 
         Raises:
             CsvError: some of them are missing.

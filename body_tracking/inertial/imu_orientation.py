@@ -1,10 +1,10 @@
-"""Orientation of an inertial sensor from its raw data, with a covariance that is meant.
+"""Orientation of an inertial sensor from its raw data, with a consistent covariance.
 
 The orientation is that of VQF (Laidig and Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation
-and magnetic disturbance rejection", Information Fusion 91, 2023), which wants a constant rate and says nothing of how
-certain it is. This adds both: readings with jitter, losses and outages, and an error budget of tilt and heading.
+and magnetic disturbance rejection", Information Fusion 91, 2023), which needs a constant rate and has no covariance.
+This module adds both: readings with jitter, losses and outages, and an error budget of tilt and heading.
 
-Over 500 lines: the orientation filter with the numbers that it was measured with, in one place.
+Over 500 lines: the orientation filter and its measured constants, in one place.
 """
 
 from __future__ import annotations
@@ -23,46 +23,45 @@ from body_tracking.core.imu import STANDARD_GRAVITY, ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 
 OUTAGE_S: Final = 1.0
-"""After a gap this long the tilt is found anew, and the heading is as good as lost."""
+"""A longer gap restarts the tilt, and the heading is as good as lost."""
 _STARTING: Final = 16
-"""Readings from which the rate is taken, before the first orientation."""
+"""Number of readings for the initial rate, before the first orientation."""
 _RATE_OVER: Final = 256
-"""Intervals whose mean tells that a sensor has another rate than at its start."""
+"""Number of intervals whose mean is compared with the initial rate."""
 _RATE_CHANGED: Final = 1.3
 _FORGET_BIAS_S: Final = 10.0
-"""A sensor that was silent for longer may have been switched off; then its bias is another one."""
+"""A longer gap resets the bias: the sensor may have been switched off."""
 _UNIT_OF_BIAS: Final = np.radians(0.01)
 """rad/s: VQF's covariance of the bias is in (0.01 deg/s)^2."""
 _VQF_WANDER: Final = np.radians(0.1) / np.sqrt(100.0)
 """rad/s/sqrt(s): VQF's bias walks 0.1 deg/s within its ``biasForgettingTime``."""
 _CLIPPED: Final = 0.95
-"""Share of the range from which on a rate is taken for clipped: calibration moves the stop by scale and bias."""
+"""Share of the range from which a rate counts as clipped: calibration shifts the limit by scale and bias."""
 _UNIFORM: Final = np.pi / np.sqrt(3.0)
-"""Standard deviation of an angle that may be any."""
+"""Standard deviation of an angle that is uniform over a turn."""
 
 
 class ImuOrientationError(BodyTrackingError):
-    """A reading from which no orientation can be estimated."""
+    """Raised when a reading lacks angular velocity or acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
 class InertialErrors:
-    """What an inertial sensor is taken to err by.
+    """Assumed errors of an inertial sensor, standard deviations per axis.
 
-    Standard deviations per axis; the defaults are those of consumer chips that were calibrated once, as
-    ``simulation.imus`` has them with their sources.
+    The defaults are those of consumer chips that were calibrated once; ``simulated_errors`` has the sources.
 
     Attributes:
         gyro_noise: rad/s/sqrt(Hz).
         gyro_bias: rad/s, turn-on.
-        gyro_wander: rad/s/sqrt(s), by which the bias walks.
+        gyro_wander: rad/s/sqrt(s), random walk of the bias.
         gyro_scale: 1.
         gyro_axes: 1, cross-axis sensitivity.
-        gyro_range: rad/s, at which an axis is clipped.
+        gyro_range: rad/s, limit at which an axis is clipped.
         acc_bias: m/s2.
         acc_scale: 1, scale and cross-axis sensitivity.
-        mag_bias: tesla, what calibration left of hard iron.
-        mag_scale: 1, what it left of soft iron.
+        mag_bias: tesla, hard iron after calibration.
+        mag_scale: 1, soft iron after calibration.
     """
 
     gyro_noise: float = float(np.radians(0.01))
@@ -79,15 +78,15 @@ class InertialErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuOrientation:
-    """Where an inertial sensor pointed at one instant.
+    """Orientation of an inertial sensor at one instant.
 
     Attributes:
         stamp_ns: of the reading.
         orientation: (4,) unit quaternion xyzw, sensor to earth (z up).
         covariance: (3, 3) rad2 about the earth's axes.
-        angular_velocity: (3,) rad/s in the sensor's frame, less the bias.
+        angular_velocity: (3,) rad/s in the sensor's frame, bias subtracted.
         bias: (3,) rad/s in the sensor's frame.
-        at_rest: whether VQF takes the sensor to be at rest.
+        at_rest: VQF's detection of rest.
     """
 
     stamp_ns: int
@@ -102,24 +101,23 @@ class OrientationEstimator:
     """The orientation of one sensor, reading by reading.
 
     Earth: z up. With a magnetometer x is magnetic east and y north, from the first field on. Without one, x and y are
-    such that the first orientation is the shortest turn that makes z vertical; they turn with the heading's drift.
+    such that the first orientation is the shortest rotation that makes z vertical; they turn with the heading's drift.
 
     Time: VQF runs at the rate of the first 16 readings (0.04 s at 400 Hz, 0.64 s at 25 Hz), for which there is no
-    orientation. From one reading to the next rate and acceleration are interpolated linearly, in as many of VQF's steps
-    as are nearest to the interval, and the angle is that of the stamps' own interval: jitter of the stamps then errs by
-    what the rate changes meanwhile, and nothing adds up. Lost readings are so bridged up to 1 s (the angle that may
-    have been missed is in the covariance). After longer, or when the rate turns out to be another one, the tilt is
-    found anew, and the heading goes on with the uncertainty of what may have happened. Time that runs backwards begins
-    everything anew. A stamp that repeats is left out.
+    orientation. Between two readings, rate and acceleration are interpolated linearly over the nearest number of VQF's
+    steps, and the angle is scaled to the interval of the stamps: the error by jitter of the stamps depends on the
+    change of the rate, and does not accumulate. This bridges lost readings for up to 1 s; the covariance includes the
+    angle that may have been missed. A longer gap or a changed rate restarts the tilt and increases the heading's
+    variance. Time that runs backwards restarts everything. Repeated stamps are ignored.
 
-    Range: a rate at the gyroscope's stop says less than the sensor turned. What it hid, for up to half a second, is
-    made up for at the second reading after, by the cubic that goes on from the rates before and after; until then the
-    covariance knows nothing of it. After that, as after lost readings, the accelerometer levels with the weight that
-    the doubt gives it: VQF's low-pass begins anew as the mean of as many readings as the old tilt is still worth.
+    Range: a clipped rate understates the rotation. The hidden angle, for up to half a second, is added at the second
+    reading after clipping, by the cubic through the rates before and after; until then the covariance does not include
+    it. After that, as after lost readings, the accelerometer corrects the tilt with a larger weight: VQF's low-pass
+    restarts as the mean of as many readings as the remaining accuracy of the tilt is worth.
 
     Args:
         magnetometer: use the magnetic field where readings have it.
-        errors: what the sensor is taken to err by.
+        errors: assumed errors of the sensor.
     """
 
     def __init__(self, *, magnetometer: bool = True, errors: InertialErrors | None = None) -> None:
@@ -131,7 +129,6 @@ class OrientationEstimator:
         self._begin()
 
     def _begin(self) -> None:
-        """Know nothing."""
         self._starting: list[ImuSample] = []
         self._latest: ImuSample | None = None
         self._filter: Any = None
@@ -144,22 +141,19 @@ class OrientationEstimator:
 
     @property
     def rate_hz(self) -> float | None:
-        """At which VQF runs; None before the first orientation."""
+        """Rate at which VQF runs; None before the first orientation."""
         return 1.0 / self._step if self._step else None
 
     @property
     def magnetically_disturbed(self) -> bool | None:
-        """Whether the field is another one than that to which the heading belongs, or none is known yet.
-
-        None without a magnetometer.
-        """
+        """Whether the field differs from the heading's reference, or there is none yet; None without a field."""
         return bool(self._filter.getMagDistDetected()) if self._field_seen and self._filter is not None else None
 
     def update(self, sample: ImuSample) -> ImuOrientation | None:
-        """The orientation at a reading; None while the estimator starts, and for a stamp that repeats.
+        """The orientation at a reading; None while the estimator starts, and for a repeated stamp.
 
         Raises:
-            ImuOrientationError: no angular velocity or no acceleration; nothing changes.
+            ImuOrientationError: no angular velocity or no acceleration; the state stays.
         """
         if sample.angular_velocity is None or sample.acceleration is None:
             missing = "angular velocity" if sample.angular_velocity is None else "acceleration"
@@ -195,7 +189,7 @@ class OrientationEstimator:
         return not 1.0 / _RATE_CHANGED < ratio < _RATE_CHANGED
 
     def _restart(self, gap: float) -> None:
-        """Find rate and tilt anew; keep the heading, what is known of bias and field, and the uncertainty."""
+        """Restart rate and tilt; keep heading, bias, field and their variances."""
         if self._filter is not None and self._latest is not None:
             self.restarts += 1
             self._before = self._filter.getQuat9D(), self._filter.state
@@ -211,7 +205,7 @@ class OrientationEstimator:
     def _start(self) -> ImuOrientation:
         """Run VQF over the first readings."""
         intervals = np.array(self._intervals)
-        # one gap among so few would count
+        # without gaps, which would bias the mean of so few
         self._step = float(intervals[intervals <= 3.0 * np.median(intervals)].mean())
         fields = sum(sample.magnetic_field is not None for sample in self._starting)
         spacing = self._step * len(self._starting) / fields if fields and self._magnetometer else self._step
@@ -226,7 +220,7 @@ class OrientationEstimator:
         self._latest = None
         result = self._go_on(first)
         if before is not None and (first.magnetic_field is None or not self._magnetometer):
-            # the turn about the vertical that brings the new orientation nearest to the last
+            # the rotation about the vertical that brings the new orientation nearest to the last
             turn = VQF.quatMultiply(before[0], VQF.quatConj(self._filter.getQuat9D()))
             state = self._filter.state
             state["delta"] += 2.0 * float(np.arctan2(turn[3], turn[0]))
@@ -258,7 +252,7 @@ class OrientationEstimator:
             stretch = interval / (steps * self._step)
             for k in range(steps):
                 share = (k + 0.5) / steps
-                # the angle less the bias's is that of the interval
+                # the angle without the bias is scaled to the interval of the stamps
                 vqf.updateGyr(bias + (old_rate + share * (rate - old_rate) - bias) * stretch)
                 vqf.updateAcc(old_force + (k + 1) / steps * (force - old_force))
             middle = 0.5 * (old_rate + rate)
@@ -286,7 +280,7 @@ class OrientationEstimator:
         )
 
     def _turn_by(self, angle: FloatArray) -> None:
-        """Turn by a rotation vector (3,) in the sensor's frame."""
+        """Rotate VQF's orientation by a rotation vector (3,) in the sensor's frame."""
         state = self._filter.state
         half = 0.5 * angle
         turn = np.concatenate([[np.cos(np.linalg.norm(half))], np.sinc(np.linalg.norm(half) / np.pi) * half])
@@ -294,7 +288,7 @@ class OrientationEstimator:
         self._filter.state = state
 
     def _level_anew(self) -> None:
-        """Let the mean of the acceleration, which is vertical, begin with the weight that the tilt still deserves."""
+        """Restart VQF's low-pass of the acceleration with the weight of the remaining accuracy of the tilt."""
         state, params = self._filter.state, self._filter.params
         worth = max(params["tauAcc"] * self._budget.known_tilt(), _LEAST_WORTH_S) / self._step
         low_pass = np.array(state["accLpState"])
@@ -306,7 +300,7 @@ class OrientationEstimator:
         self._filter.state = state
 
     def _turn_to(self, field: FloatArray) -> None:
-        """Let VQF correct the heading by a magnetic field, and see by how much."""
+        """Let VQF correct the heading by a magnetic field, and pass its gain to the error budget."""
         vqf = self._filter
         self._field_seen = True
         east, north, up = VQF.quatRotate(vqf.getQuat6D(), field)
@@ -327,18 +321,18 @@ class OrientationEstimator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hidden:
-    """What a clipped rate hid: a rotation vector (3,) in the sensor's frame, and its standard deviation, radians."""
+    """The rotation hidden by clipping: a rotation vector (3,) in the sensor's frame, and its deviation, radians."""
 
     angle: FloatArray
     doubt: float
 
 
 class _ClippedRate:
-    """Where the rate of an axis is at its stop, and how far the sensor turned meanwhile.
+    """Detects clipped rates, and estimates the rotation meanwhile.
 
-    The rate of such an axis is taken for the cubic (Hermite) that has the rates and slopes just outside the stretch:
-    with rates a, b, slopes a', b' and duration T it turns by ``T (a + b) / 2 + T^2 (a' - b') / 12``.
-    Slopes want the sensor's own clock, whose steps are even: the jitter of stamps does not average out in them.
+    The rate of a clipped axis is the Hermite cubic with the rates and slopes just outside the clipped period: with
+    rates a, b, slopes a', b' and duration T the angle is ``T (a + b) / 2 + T^2 (a' - b') / 12``. Slopes are computed
+    with the even steps of the sensor's own clock, as the jitter of stamps does not average out in them.
     """
 
     def __init__(self, stop: float) -> None:
@@ -348,7 +342,7 @@ class _ClippedRate:
         self._free = 0
 
     def update(self, interval: float, rate: FloatArray) -> _Hidden | None:
-        """What was hidden, at the second reading after a stretch; None at all others.
+        """The hidden rotation, at the second reading after clipping; None at all others.
 
         Args:
             interval: seconds since the reading before, whole steps of the sensor.
@@ -357,7 +351,7 @@ class _ClippedRate:
         time = (self._readings[-1][0] if self._readings else 0.0) + interval
         self._readings.append((time, rate))
         if self._at_stop(rate).any():
-            # without two readings before there is no slope to go on from
+            # without two readings before there is no slope
             self._open = self._open or len(self._readings) > 2
             self._free = 0
             if not self._open:
@@ -386,13 +380,13 @@ class _ClippedRate:
         turned = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
         cubic = np.diff(CubicHermiteSpline(times[[0, -1]], rates[[0, -1]], slopes).antiderivative()(times), axis=0)
         total = turned.sum(axis=0)
-        # the stop hides what is beyond it
+        # clipping hides only rotation beyond the limit
         beyond = self._at_stop(rates).any(axis=0) & ((cubic.sum(axis=0) - total) * total > 0.0)
         true = np.where(beyond, cubic, turned)
         hidden = np.where(beyond, cubic.sum(axis=0) - total, 0.0)
         share = _HIDDEN * max(1.0, length / _COHERENT_S) ** 2
         doubt = max(_LEAST_HIDDEN * self._stop * length, share * float(np.linalg.norm(hidden)))
-        # the other axes turn about where the sensor really was
+        # the rates of the other axes apply in the corrected orientation
         angle = (_product(turned).inv() * _product(true)).as_rotvec()
         return _Hidden(angle, doubt)
 
@@ -415,42 +409,42 @@ def _wrapped(angle: float) -> float:
     return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-# --- how certain it is
+# --- error budget
 
 _TILT_S: Final = 3.0
 """VQF's ``tauAcc``."""
 _CORRECTION_S: Final = 6.0
-"""Over which the square of the tilt's corrections is averaged."""
+"""Seconds over which the square of the tilt's corrections is averaged."""
 _CORRECTED: Final = 0.1
 """Standard deviation of the tilt by the motion's acceleration, as a multiple of ``tauAcc`` times the RMS correction."""
 _TURNING: Final = 0.5
-"""rad/s: what a sensor is expected to turn by at least, where nobody knows."""
+"""rad/s: least rate that is assumed over a gap."""
 _TURNING_S: Final = 5.0
 _COHERENT_S: Final = 0.3
-"""As long a rate persists: beyond it, linear interpolation over a gap tells nothing."""
+"""Seconds for which a rate persists: over longer gaps, linear interpolation has no value."""
 _HIDDEN: Final = 0.2
-"""Standard deviation of the angle that a clipped rate hid, as a share of it: twice that on swings of 1.2 Hz."""
+"""Standard deviation of the angle hidden by clipping, as a share of it: twice that on swings of 1.2 Hz."""
 _JOINED_S: Final = 0.5
-"""After longer at the stop nobody knows how far the sensor turned."""
+"""Seconds of clipping after which the angle is unknown."""
 _LEAST_HIDDEN: Final = 0.03
-"""The same, at least, as a share of range times duration."""
+"""Least standard deviation of the hidden angle, as a share of range times duration."""
 _LEAST_WORTH_S: Final = 0.3
-"""The tilt is worth at least the mean of so long an acceleration: over less, a motion's own does not average out."""
+"""Least duration in seconds of the restarted low-pass: over less, a motion's acceleration does not average out."""
 _UNKNOWN_FIELD: Final = np.radians(10.0)
-"""Heading by a field of which nothing else is known."""
+"""Standard deviation of a heading by the first field."""
 _DISTURBED_FIELD: Final = np.radians(60.0)
-"""Heading by a field that is known to be disturbed."""
+"""Standard deviation of a heading by a disturbed field."""
 
 
 class _Budget:
     """The variances of tilt and heading.
 
-    Tilt: what the accelerometer errs by, what the motion's acceleration shifts VQF's low-passed vertical by, and what
-    gaps have missed.
+    Tilt: the accelerometer's errors, the shift of VQF's low-passed vertical by the motion's acceleration, and rotation
+    missed in gaps.
 
-    Heading: the integral of what is wrong with the rate. With e the error of the bias, S that of the scales, u the
-    vertical and w the rate in the sensor's frame: ``h' = u . e + u . S w + noise``. VQF's covariance of the bias is P;
-    c is that of h and e. The magnetic field takes its share k of all that and gives its own error for it.
+    Heading: the integral of the rate's error. With e the error of the bias, S that of the scales, u the vertical and w
+    the rate in the sensor's frame: ``h' = u . e + u . S w + noise``. VQF's covariance of the bias is P; c is that of h
+    and e. A magnetic update of gain k scales all of that by 1 - k and adds k times its own error.
     """
 
     def __init__(self, errors: InertialErrors) -> None:
@@ -485,14 +479,14 @@ class _Budget:
             steps: of VQF over them.
             step: seconds of one.
             up: (3,) the vertical in the sensor's frame.
-            rate: (3,) rad/s less the bias.
-            before: VQF's state.
-            after: VQF's state.
+            rate: (3,) rad/s, bias subtracted.
+            before: VQF's state before these.
+            after: VQF's state after these.
         """
         spread = self._bias @ up * interval
         self._by_bias += 2.0 * float(up @ self._cross) * interval + float(up @ spread) * interval
         self._cross += spread
-        # VQF's covariance of the bias tells its gain: P+ = (I - K H) P-; what it learns leaves e, but not h
+        # VQF's covariance of the bias gives its gain: P+ = (I - K H) P-; its updates reduce e, but not h
         p_before = np.reshape(before["biasP"], (3, 3)) * _UNIT_OF_BIAS**2
         p_before = p_before + steps * step * _VQF_WANDER**2 * np.eye(3)
         p_after = np.reshape(after["biasP"], (3, 3)) * _UNIT_OF_BIAS**2
@@ -513,32 +507,32 @@ class _Budget:
             self.lose(interval)
 
     def forget_bias(self) -> None:
-        """The bias may be another one."""
+        """Reset the covariance of the bias."""
         self._bias = self._errors.gyro_bias**2 * np.eye(3)
         self._cross = np.zeros(3)
 
     def lose(self, gap: float) -> None:
-        """A gap of so many seconds: how far the turn may have been another one than the interpolated."""
+        """Add the variance of the interpolated rotation over a gap, seconds."""
         self.doubt(self._turning * gap**2 * min(1.0, gap / _COHERENT_S) ** 2 / 3.0)
 
     def doubt(self, missed: float) -> None:
-        """A turn may have been another one, by so much variance per axis."""
+        """Add the variance of a missed rotation, rad2 per axis."""
         self._missed_tilt += missed
         self._noise = min(self._noise + missed, _UNIFORM**2)
 
     def known_tilt(self) -> float:
-        """Share of the tilt's variance that no missed turn has added."""
+        """Share of the tilt's variance that is not by missed rotation."""
         moved = self._steady + self._moved()
         return 1.0 - self._missed_tilt / moved
 
     def correct(
         self, gain: float, strength: float, dip: float, known: float, known_dip: float, disturbed: bool
     ) -> None:
-        """VQF drew the heading by a share towards what the magnetic field says."""
+        """Apply VQF's magnetic update of the heading; strengths in tesla, dips in radians."""
         level = max(strength * np.cos(dip), 0.05 * strength, 1e-9)
         errors = self._errors
         if known > 0.0:
-            # two components of what is added to the field are seen; the third is the heading's
+            # strength and dip show two components of a disturbance; the third changes the heading
             seen = ((strength - known) ** 2 + (known * _wrapped(dip - known_dip)) ** 2) / 2.0
             off = _DISTURBED_FIELD if disturbed else float(np.sqrt(seen)) / level
         else:
@@ -549,12 +543,12 @@ class _Budget:
         self._swept *= 1.0 - gain
         self._of_field = (1.0 - gain) * self._of_field + gain * off
         static = (errors.mag_bias**2 + (errors.mag_scale * strength) ** 2) / level**2
-        # a tilt that lasts turns what is level of the field; of one that passes the heading's time constant leaves half
+        # a lasting tilt error rotates the field's level part; the heading's time constant halves a passing one
         static += (self._steady + 0.25 * self._moved()) * (strength * np.sin(dip) / level) ** 2
         self._static_field = (1.0 - gain) * self._static_field + gain * float(np.sqrt(static))
 
     def _moved(self) -> float:
-        """Variance of the tilt per axis, of what passes."""
+        """Passing part of the tilt's variance per axis, rad2."""
         moved = (_CORRECTED * _TILT_S) ** 2 * self._corrections + self._errors.gyro_scale**2 * self._turning
         return moved + _TILT_S**2 * float(np.trace(self._bias)) / 3.0 + self._missed_tilt
 

@@ -1,4 +1,4 @@
-"""How inertial sensors are meant to be put on: which way the axes of their cases point on each segment."""
+"""Intended mountings of inertial sensors: the direction of a sensor's axes on each segment."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _USUAL: Final = {
     "forearm": "-z+y",
     "hand": "-z+y",
 }
-"""Of each segment (of a left one) where the sensor's x and z point: sacrum, sternum, back of the head, scapula, outside
-of the arm, back of the hand; z away from the body, x upwards on the trunk and towards the fingers on the arm."""
+"""Directions of the sensor's x and z in the frame of each (left) segment: sacrum, sternum, back of the head, scapula,
+outside of the arm, back of the hand. z points away from the body, x up on the trunk and to the fingers on the arm."""
 
 
 class MountingError(BodyTrackingError):
-    """A way to put a sensor on that is none."""
+    """Raised when the mounting axes are unknown or not two different ones."""
 
 
 def mounting(segment: str, axes: str = "") -> FloatArray:
@@ -34,10 +34,10 @@ def mounting(segment: str, axes: str = "") -> FloatArray:
 
     Args:
         segment: of ``UpperBody.segment_names``.
-        axes: where the sensor's x and z point in the segment's frame, such as ``-z+y``; empty for the usual way.
+        axes: directions of the sensor's x and z in the segment's frame, such as ``-z+y``; empty for the usual ones.
 
     Raises:
-        MountingError: no such segment, or no two different axes.
+        MountingError: no such segment, or not two different axes.
     """
     if segment not in SEGMENTS:
         raise MountingError(f"segment {segment!r}, expected one of {', '.join(SEGMENTS)}")
@@ -57,10 +57,10 @@ def mountings(segments: Sequence[str], given: Sequence[str] = ()) -> FloatArray:
 
     Args:
         segments: k names.
-        given: ``segment:axes`` of those that are not put on in the usual way.
+        given: ``segment:axes`` of sensors that are not worn in the usual way.
 
     Raises:
-        MountingError: something else was given, or of a segment that is not there.
+        MountingError: an entry of another form, or of a segment that is not among these.
     """
     axes = dict.fromkeys(segments, "")
     for entry in given:

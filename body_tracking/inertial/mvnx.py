@@ -2,12 +2,11 @@
 
 XML, read as a stream. A ``normal`` frame has each sensor's orientation (quaternions w, x, y, z, sensor to the suit's
 earth frame with z up), its free acceleration (m/s2 in the earth frame, without gravity), orientation and position of 23
-segments and 22 joints' angles (degrees; x abduction, y rotation, z flexion, as ISB recommends). Before them stand the
+segments and 22 joints' angles (degrees; x abduction, y rotation, z flexion, as ISB recommends). Before these come the
 poses ``identity``, ``tpose`` and ``tpose-isb``. Frames come at the subject's frame rate; stamps are index over rate.
 
-What becomes of it: orientation and specific force of each sensor of the upper body, under the name of its segment, and
-the joints' angles as the file has them. There is no angular rate of sensors in the file, and its magnetic field is
-normalised: neither is read.
+The reader yields orientation and specific force of each sensor of the upper body, under the name of its segment, and
+the file's joint angles. The file has no angular rate of sensors; its normalised magnetic field is not read.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ SEGMENT_OF_SENSOR: Final = {
     "LeftHand": "hand_left",
     "RightHand": "hand_right",
 }
-"""Xsens's names to those of ``UpperBody``; the legs have none."""
+"""Xsens's names to those of ``UpperBody``, which has no legs."""
 
 LEGS: Final = "sensors that are not on the upper body"
 BAD: Final = "readings that no inertial sensor can have made"
@@ -57,12 +56,12 @@ _AXES: Final = "xyz"
 
 
 class MvnxError(BodyTrackingError):
-    """An MVNX file does not have its format; the text names file and frame."""
+    """Raised when an MVNX file violates its format; the message names file and frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MvnxHeader:
-    """What stands before the frames.
+    """The header of a recording.
 
     Attributes:
         version: of the format.
@@ -81,7 +80,7 @@ class MvnxHeader:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MvnxFrame:
-    """One frame; None for what it does not hold.
+    """One frame; None for missing quantities.
 
     Attributes:
         kind: ``normal``, or the name of a pose.
@@ -107,7 +106,7 @@ class MvnxRecording:
 
     Args:
         path: the file; gzip is recognised by the suffix ``.gz``.
-        partial: read a file that is cut off up to its last whole frame, with a warning, instead of refusing it.
+        partial: read a truncated file up to its last complete frame, with a warning, instead of raising an error.
 
     Raises:
         MvnxError: while iterating, if anything about the file is not as the format says.
@@ -119,7 +118,7 @@ class MvnxRecording:
         self.warnings: list[str] = []
         self.progress = 0.0
         self.header: MvnxHeader | None = None
-        """Known once the first frame was read."""
+        """Available once the first frame was read."""
         self._partial = partial
 
     def __iter__(self) -> Iterator[RecordedImu | RecordedAngles]:
@@ -162,7 +161,7 @@ class MvnxRecording:
             yield RecordedImu(segment, stamp_ns, sample)
 
     def frames(self) -> Iterator[MvnxFrame]:
-        """All frames with all they hold, the poses too.
+        """All frames with all their quantities, including the poses.
 
         Raises:
             MvnxError: the file is not as its format says.

@@ -1,4 +1,4 @@
-"""What inertial sensors are taken for: the parameters of :class:`~body_tracking.inertial.tracking.InertialTracker`."""
+"""The parameters of :class:`~body_tracking.inertial.tracking.InertialTracker`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from body_tracking.inertial.alignment import Pose
 AUTO, T_POSE, ARMS_DOWN = "auto", "t_pose", "arms_down"
 OWN, SHARED, REFERENCE = "own", "shared", "reference"
 POSES: Final[Mapping[str, Pose]] = {T_POSE: "t", ARMS_DOWN: "n"}
-"""What poses are called in parameters, and by ``alignment``."""
+"""Names of poses in parameters, and in ``alignment``."""
 
 
 def _choice(default: str, doc: str, *choices: str) -> Any:
@@ -21,7 +21,7 @@ def _choice(default: str, doc: str, *choices: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TrackingParameters:
-    """What inertial sensors are taken for; each field's metadata says what it is, its unit and its range."""
+    """The settings; each field's metadata has its meaning, unit and range."""
 
     pose: str = _choice(
         AUTO,
@@ -47,19 +47,19 @@ class TrackingParameters:
     )
     swap_exchanged: bool = field(
         default=True,
-        metadata={"doc": "take sensors that are found on each other's segments for what they are; false: only tell"},
+        metadata={"doc": "assign exchanged sensors to the segments on which they were found; false: only report them"},
     )
     rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
     orientation_rate: float = number_field(30.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
     largest_stddev: float = number_field(
-        0.6, "tell no orientation that is known less well than this about any axis", "rad", 0.01, 2.0
+        0.6, "publish no orientation with a larger standard deviation about any axis", "rad", 0.01, 2.0
     )
     mounting_stddev: float = number_field(
-        0.17, "by how much sensors are put on otherwise than meant, per axis", "rad", 0.001, 2.0
+        0.17, "standard deviation of sensors from their intended mounting, per axis", "rad", 0.001, 2.0
     )
     pose_stddev: float = number_field(
         0.105,
-        "by how much the person's joints are off the pose, per axis; more for one who cannot hold it",
+        "standard deviation of the person's joints from the pose, per axis; more for a person who cannot hold it",
         "rad",
         0.001,
         1.0,
@@ -67,9 +67,9 @@ class TrackingParameters:
     movement: bool = field(
         default=False,
         metadata={
-            "doc": "half a minute after a pose, learn once from how elbows bend and turn how their sensors sit; "
-            "it tells less than a pose that is held well"
+            "doc": "half a minute after a pose, align the sensors of each arm once by the elbow's movement; "
+            "it is less accurate than a pose that is held well"
         },
     )
-    silent_after: float = number_field(0.5, "a sensor that says nothing for longer is silent", "s", 0.05, 60.0)
-    stature: float = number_field(1.75, "of the person, until a camera has measured the segments", "m", 0.5, 2.5)
+    silent_after: float = number_field(0.5, "a sensor without a reading for longer is silent", "s", 0.05, 60.0)
+    stature: float = number_field(1.75, "of the person; used until a camera has measured the segments", "m", 0.5, 2.5)

@@ -1,13 +1,13 @@
-"""The body model's configuration of the orientations of some of its segments, with its uncertainty.
+"""The body model's configuration from the orientations of some of its segments, with its covariance.
 
-The most probable configuration q, by Gauss-Newton over the segments s that carry a sensor, and with what is known of
-every angle by its range of motion (as weak a measurement as in the skeleton filter):
+The most probable configuration q, by Gauss-Newton over the segments s that carry a sensor, with every angle's range of
+motion as a weak measurement (as in the skeleton filter):
 
     sum_s |log(R_s(q)^T R_s)|^2 / S_s  +  sum_i ((q_i - centre_i) / stddev_i)^2  +  ((T q) / stddev_T)^2            (14)
 
-The last one shares the twist of the trunk. An elbow and a wrist have two angles for a rotation of three; what is left
-is measurement error, spread over both segments by their covariances. Points are not observed: the base stays where it
-is.
+The last term shares the twist of the trunk between its joints. Elbow and wrist have two angles for a rotation of three;
+the rest is measurement error, spread over both segments by their covariances. The position of the base is not observed
+and stays.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import AlignmentError, rotation_vectors
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
@@ -51,13 +50,13 @@ class OrientationKinematics:
         Args:
             rotations: (k, 3, 3) segments to world.
             covariances: (k, 3, 3) radians squared, in the segments' own frames.
-            start: (35,) a configuration to start from, such as that of the frame before; its base is kept.
+            start: (35,) initial configuration, such as that of the frame before; its base is kept.
 
         Returns:
             (35,) configuration, (32, 32) covariance of its tangent, infinite for the position of the base.
 
         Raises:
-            AlignmentError: shapes that do not belong together, or numbers that are not finite.
+            AlignmentError: inconsistent shapes, or numbers that are not finite.
         """
         k = len(self._numbers)
         if rotations.shape != (k, 3, 3) or covariances.shape != (k, 3, 3):
@@ -84,7 +83,7 @@ class OrientationKinematics:
             twist = float(ranges.twist @ soft.values) / np.radians(TWIST_SHARING_STDDEV)
             weighted = np.einsum("kij,kj->ki", weights, off)
             now = float((weighted * off).sum() + away @ away + twist**2)
-            if now > cost + _ENOUGH:  # a step too far: shorter from where it was best
+            if now > cost + _ENOUGH:  # the cost has grown: a shorter step from the best configuration
                 damping = max(10.0 * damping, 1.0)
                 q = best
                 cost = np.inf
@@ -109,51 +108,16 @@ class OrientationKinematics:
         covariance[3:, 3:] = np.linalg.inv(information)
         return best, covariance
 
-    def estimate(
-        self,
-        stamp_ns: int,
-        rotations: FloatArray,
-        covariances: FloatArray,
-        lengths: FloatArray,
-        previous: FloatArray | None = None,
-        frame_id: str = "world",
-    ) -> ModelEstimate:
-        """The same as what angle conventions take; no velocity is known.
-
-        Args:
-            stamp_ns: nanoseconds.
-            rotations: as of :meth:`solve`.
-            covariances: as of :meth:`solve`.
-            lengths: (21,) metres.
-            previous: (35,) the configuration before.
-            frame_id: of the orientations.
-        """
-        model = self._model
-        q, covariance = self.solve(rotations, covariances, previous)
-        whole = np.diag(np.full(2 * model.nv, np.inf))
-        whole[: model.nv, : model.nv] = covariance
-        unknown = np.full(model.nv, np.nan)
-        return ModelEstimate(stamp_ns, frame_id, 0, q, unknown, whole, lengths, np.zeros(len(lengths)))
-
     def _start(self, rotations: FloatArray) -> FloatArray:
-        """Every ball joint as its nearest sensors have it, the other angles at the middle of their ranges."""
+        """Ball joints by the nearest sensors, the other angles at the middle of their ranges."""
         model = self._model
         q = model.neutral()
         own = dict(zip(self._numbers.tolist(), rotations, strict=True))
 
-        def nearest(segment: int) -> FloatArray | None:
-            while segment >= 0:
-                if segment in own:
-                    found: FloatArray = own[segment]
-                    return found
-                segment = PARENTS[segment]
-            return None
-
-        trunk = nearest(model.segment_names.index("upper_trunk"))
-        base = nearest(0)
-        base = trunk if base is None else base
-        if base is None:
-            base = next(iter(own.values())) if trunk is None else trunk
+        trunk = model.segment_names.index("upper_trunk")
+        while trunk > 0 and trunk not in own:
+            trunk = PARENTS[trunk]
+        base = own.get(0, own.get(trunk, rotations[0]))
         q[model.quaternion_of("pelvis")] = so3.matrix_to_quat(base)
         q[model.scalar_q] = self._ranges.centre[model.scalar_v - 6]
         for side in ("left", "right"):

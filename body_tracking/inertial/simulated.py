@@ -1,15 +1,15 @@
-"""What an inertial sensor on a body segment would have said, when, and how wrongly.
+"""Simulated readings of an inertial sensor on a body segment, with errors and transport.
 
-A segment's motion is handed in as a closed function of time; the sensor rides on it, on flesh that gives, and measures
-by what standards call raw and oriented data:
+The segment's motion is a function of time; the sensor is mounted on it over soft tissue, and reports raw or oriented
+data:
 
 - Gyroscope, accelerometer (specific force: +g upwards at rest, REP-145) and magnetometer, in the sensor's own frame:
   white noise, turn-on bias, in-run bias as a Gauss-Markov process, scale and axes, range and resolution.
-- The earth's magnetic field, and iron as dipoles, whose field grows as the segment comes near.
-- A mounting that is not quite the intended one, tissue that sags and swings after its segment and follows its twist
-  only in part, slips, times of being switched off.
-- Orientation as a driver's own fusion reports it: a complementary filter of the very errors of the raw data, to first
-  order in the tilt. So acceleration tilts it, iron turns it, and without magnetometer its heading drifts.
+- The earth's magnetic field, and iron as dipoles.
+- A mounting with errors, soft tissue that sags, oscillates and follows its segment's twist only in part, slips, and
+  periods in which the sensor is switched off.
+- Orientation by a driver's own fusion: a complementary filter of the errors of the same raw data, to first order in the
+  tilt. Acceleration tilts it, iron turns it, and without magnetometer its heading drifts.
 - A clock of its own, jitter, radio packets, lost ones, outages, a transport delay.
 
 Not modelled: the earth's rotation (0.004 deg/s), the sensor's own low-pass filter, g-sensitivity of the gyroscope.
@@ -43,17 +43,17 @@ Motion = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 _MICRO = 1e-6
 _STEP = 1e-4
 """Seconds h of the central differences, whose errors are h^2 (w''/6 + w x w'/3) of the angular rate, h^2 a''/12 of the
-acceleration, and 1e-6 m/s2 by rounding: with 35 rad/s at 5 Hz 1e-4 rad/s, with 100 m/s2 at 5 Hz 1e-4 m/s2. Where the
-jerk jumps, the acceleration is rounded off over so long."""
+acceleration, and 1e-6 m/s2 by rounding: with 35 rad/s at 5 Hz 1e-4 rad/s, with 100 m/s2 at 5 Hz 1e-4 m/s2. A jump of
+the jerk is smoothed over this time."""
 _AT_ONCE = 8192
-"""Instants for which a motion is asked at once: a body model takes a kilobyte for each."""
+"""Instants per call of a motion: a body model takes a kilobyte for each."""
 _GRID = 0.01
-"""Seconds between the points at which the tissue's swing is computed; a cubic spline leads from one to the next."""
+"""Seconds between the points of the tissue's displacement, which a cubic spline interpolates."""
 _TISSUE_LIMIT = 0.012
-"""Metres that tissue gives at most; less and less before."""
+"""Greatest displacement over soft tissue, metres; the displacement saturates towards it."""
 _SLIP_S = 0.2
 _MOST_JITTER = 0.2
-"""Share of the sampling period: later samples stay later."""
+"""Greatest jitter as a share of the sampling period, which keeps the order of samples."""
 _TWIST_FADES = 0.25
 """Square of the cosine of half the swing (120 degrees) beyond which the twist, undefined at 180 degrees, fades."""
 
@@ -65,7 +65,7 @@ class Mounting:
     Attributes:
         position: (3,) metres in the segment's frame.
         quat_xyzw: (4,) unit quaternion, sensor to segment.
-        flesh: share of the tissue's give and of the twist that the skin does not follow; 0 on bare bone.
+        flesh: factor on the tissue's displacement and on the twist that the skin does not follow; 0 on bare bone.
     """
 
     position: FloatArray
@@ -73,7 +73,7 @@ class Mounting:
     flesh: float = 1.0
 
 
-# segment: place as shares of the stature (forward, outward or left, up), where the sensor's z and x point, flesh
+# segment: position as shares of the stature (forward, outward or left, up), directions of the sensor's z and x, flesh
 _PLACES: dict[str, tuple[tuple[float, float, float], str, str, float]] = {
     "pelvis": ((-0.060, 0.0, 0.020), "-x", "+z", 0.4),
     "lower_trunk": ((-0.060, 0.0, 0.070), "-x", "+z", 0.5),
@@ -87,7 +87,7 @@ _PLACES: dict[str, tuple[tuple[float, float, float], str, str, float]] = {
 
 
 def usual_mounting(segment: str, stature: float = 1.75) -> Mounting:
-    """Where sensors are usually worn: sacrum, sternum, back of the head, scapula, outside of the arm, back of the hand.
+    """The usual mounting: sacrum, sternum, back of the head, scapula, outside of the arm, back of the hand.
 
     The sensor's z points away from the body; its x upwards on the trunk, towards the hand on the arm.
 
@@ -109,10 +109,10 @@ def usual_mounting(segment: str, stature: float = 1.75) -> Mounting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slip:
-    """A strap gives way, within 0.2 s.
+    """A slip of the strap, within 0.2 s.
 
     Attributes:
-        at: seconds at which it begins.
+        at: seconds, its beginning.
         turn: (3,) rotation vector of the sensor in the segment's frame, radians.
     """
 
@@ -122,13 +122,13 @@ class Slip:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuTruth:
-    """What is true of each sample.
+    """The true state at each sample.
 
     Attributes:
-        times: (n,) seconds after the start at which it was taken.
-        quat_xyzw: (n, 4) sensor to world, with all that mounting, tissue and slips do.
+        times: (n,) seconds after the start.
+        quat_xyzw: (n, 4) sensor to world, with mounting, tissue and slips.
         positions: (n, 3) metres, the sensor in world.
-        mounting_xyzw: (4,) sensor to segment: the mounting as it is, without tissue and slips.
+        mounting_xyzw: (4,) sensor to segment: the true mounting, without tissue and slips.
         gyro_bias: (n, 3) rad/s, turn-on and in-run.
     """
 
@@ -141,23 +141,23 @@ class ImuTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
-    """The n samples of one sensor that arrived, in order: the numbers of ``sensor_msgs/Imu``, as REP-145 has them.
+    """The n received samples of one sensor, in order: the fields of ``sensor_msgs/Imu`` by REP-145.
 
     Attributes:
         name: of the sensor.
-        stamps_ns: (n,) of its own clock.
-        received_ns: (n,) of the receiver's clock.
+        stamps_ns: (n,) in its own clock.
+        received_ns: (n,) in the receiver's clock.
         angular_velocity: (n, 3) rad/s in the sensor's frame.
         linear_acceleration: (n, 3) m/s2, specific force in the sensor's frame.
         magnetic_field: (n, 3) tesla in the sensor's frame, or None without magnetometer.
         orientation: (n, 4) quaternions xyzw, sensor to (magnetic) east-north-up, or without magnetometer to a level
-            frame with a heading that is another after each switching on; None for raw data.
-        orientation_covariance: (n, 3, 3) rad2 about the axes of that frame; of the heading without magnetometer since
-            the sensor was switched on. For raw data -1 in [0, 0], and 0 elsewhere.
+            frame with another heading after each switching on; None for raw data.
+        orientation_covariance: (n, 3, 3) rad2 about the axes of that frame; without magnetometer, of the heading's
+            drift since the sensor was switched on. For raw data -1 in [0, 0], and 0 elsewhere.
         angular_velocity_covariance: (3, 3) rad2/s2.
         linear_acceleration_covariance: (3, 3) m2/s4.
         magnetic_field_covariance: (3, 3) T2.
-        truth: what is true.
+        truth: the true states.
     """
 
     name: str
@@ -180,19 +180,19 @@ class SimulatedImu:
 
     Attributes:
         name: of the sensor.
-        segment: of ``UpperBody.segment_names``, on which it really is.
-        mounting: where there, as intended.
-        rate_hz: samples per second of its own clock, 50 to 200 as a rule.
+        segment: of ``UpperBody.segment_names``, its true place.
+        mounting: intended mounting there.
+        rate_hz: samples per second of its own clock, usually 50 to 200.
         oriented: the driver reports orientation; otherwise only raw data.
-        magnetometer: it has one, and the driver uses it.
+        magnetometer: the sensor has one, and the driver uses it.
         clock: its clock against the reference clock.
         phase: seconds of its first sample after the start.
-        errors: how much it errs.
-        slips: when its strap gives way.
-        off: (begin, end) seconds during which it is switched off; then it starts with other biases and another heading.
+        errors: of the sensor.
+        slips: of its strap.
+        off: (begin, end) seconds in which it is switched off; it restarts with other biases and another heading.
 
     Raises:
-        ImuSimulationError: a rate that is none, a segment that the body does not have.
+        ImuSimulationError: a rate out of range, or no such segment.
     """
 
     name: str
@@ -214,11 +214,13 @@ class SimulatedImu:
             raise ImuSimulationError(f"{self.name}: a rate of {self.rate_hz} Hz, expected 1 to 1000")
 
     def capture_times(self, duration: float, rng: np.random.Generator) -> FloatArray:
-        """(n,) seconds at which it samples: its rate by its own clock, with jitter, while it is switched on."""
+        """(n,) seconds of its samples: its rate by its own clock, with jitter, while it is switched on."""
         period = 1.0 / (self.rate_hz * (1.0 + self.clock.drift_ppm * 1e-6))
         times = np.arange(self.phase, duration, period)
         times = times + _jitter(self.errors.jitter, period, len(times), rng)
-        times = times[(times >= 2.0 * _STEP) & (times <= duration - 2.0 * _STEP)]  # the motion is known so far
+        times = times[
+            (times >= 2.0 * _STEP) & (times <= duration - 2.0 * _STEP)
+        ]  # the differences need the motion around
         for begin, end in self.off:
             times = times[(times < begin) | (times >= end)]
         return times
@@ -234,17 +236,17 @@ class SimulatedImu:
         surroundings: Surroundings | None = None,
         received_from_ns: int | None = None,
     ) -> ImuSamples:
-        """The samples that arrive.
+        """The received samples.
 
         Args:
-            motion: of the segment, asked for times from 0 to the duration; twice continuously differentiable.
+            motion: of the segment, for times from 0 to the duration; twice continuously differentiable.
             duration: seconds.
             start_ns: time 0 in the reference clock.
-            rng: where all chance comes from.
-            parent: motion of the segment's parent, against which it twists about its z axis; without it the skin
+            rng: for all random numbers.
+            parent: motion of the segment's parent, for the twist about the segment's z axis; without it the skin
                 follows every twist.
             surroundings: the magnetic field.
-            received_from_ns: time 0 in the receiver's clock, if it is not the reference clock.
+            received_from_ns: time 0 in the receiver's clock; None for the reference clock.
         """
         where = Surroundings() if surroundings is None else surroundings
         errors = self.errors
@@ -262,9 +264,9 @@ class SimulatedImu:
         of_acc, of_mag = _Channel.of(errors, "acc", 1.0), _Channel.of(errors, "mag", _MICRO)
         gyro, turn_on, in_run = self._measure(rates, of_gyro, session, rng)
         acc, _, _ = self._measure(forces, of_acc, session, rng)
-        mag, _, _ = self._measure(magnetic, of_mag, np.zeros_like(session), rng)  # iron does not switch off
+        mag, _, _ = self._measure(magnetic, of_mag, np.zeros_like(session), rng)  # hard iron persists over sessions
 
-        # of the turn-on bias the driver leaves what it leaves
+        # turn-on bias after the driver's own estimate
         left = np.radians(errors.driver_bias) * rng.normal(size=(len(self.off) + 1, 3))
         headings = rng.uniform(-np.pi, np.pi, len(self.off) + 1)
         orientation, covariance = None, np.zeros((len(times), 3, 3))
@@ -310,7 +312,7 @@ class SimulatedImu:
     def _sensor_motion(
         self, motion: Motion, parent: Motion | None, duration: float, mounting_xyzw: FloatArray
     ) -> Motion:
-        """The motion of the sensor itself, from that of the bone under it."""
+        """The motion of the sensor from that of the bone under it."""
         place, errors = self.mounting.position, self.errors
         mounted = so3.quat_to_matrix(mounting_xyzw)
         flesh = errors.tissue_sag * self.mounting.flesh
@@ -341,9 +343,9 @@ class SimulatedImu:
         return of_sensor
 
     def _tissue(self, motion: Motion, duration: float, sag: float) -> Callable[[FloatArray], FloatArray]:
-        """Times to (n, 3) metres by which the sensor slides in the segment's frame: it swings, damped, after its place.
+        """Times to (n, 3) metres of the sensor's displacement in the segment's frame, a damped oscillation.
 
-        ``x'' + 2 zeta w x' + w^2 x = -w^2 sag f / g`` with the specific force f of the place; up to what tissue gives.
+        ``x'' + 2 zeta w x' + w^2 x = -w^2 sag f / g`` with the specific force f of the place, saturated.
         """
         grid = np.linspace(_STEP, duration - _STEP, max(round(duration / _GRID), 4))
 
@@ -370,7 +372,7 @@ class SimulatedImu:
     def _measure(
         self, true: FloatArray, channel: _Channel, session: IntArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """True (n, 3) in the sensor's frame to measured ones; their turn-on and their in-run bias, (n, 3) each."""
+        """Measured values of true (n, 3) in the sensor's frame; turn-on and in-run bias, (n, 3) each."""
         n = len(true)
         sensitivity = np.where(np.eye(3, dtype=np.bool_), channel.scale, channel.axes) * rng.normal(size=(3, 3))
         turn_on = channel.bias * rng.normal(size=(len(self.off) + 1, 3))[session]
@@ -390,11 +392,11 @@ class SimulatedImu:
         received_from_ns: int | None,
         rng: np.random.Generator,
     ) -> tuple[StampArray, StampArray, BoolArray]:
-        """(n,) stamps of the own clock, (n,) of the receiver's, and which samples arrive."""
+        """(n,) stamps in the sensor's clock, (n,) in the receiver's, and whether the samples arrive."""
         errors, n = self.errors, len(times)
         stamped = times + _jitter(errors.stamp_jitter, 1.0 / self.rate_hz, n, rng)
         stamps = [self.clock.to_sensor(start_ns + round(time * NANOSECONDS)) for time in stamped.tolist()]
-        # packets are filled from one switching on to the next switching off
+        # a packet has samples of one session only
         first = np.searchsorted(session, session)
         _, packet = np.unique(np.stack([session, (np.arange(n) - first) // errors.packet]), axis=1, return_inverse=True)
         packet = packet.reshape(-1)
@@ -406,7 +408,7 @@ class SimulatedImu:
         for begin in times[:1] + span * rng.random(rng.poisson(errors.outages * span / 60.0)):
             lost |= (full >= begin) & (full < begin + rng.exponential(errors.outage_time))
         arrival = full + errors.delay + errors.delay_jitter * rng.gamma(1.0, size=count)
-        # a connection keeps the order: a packet that is held up holds up those behind it
+        # a connection keeps the order: a delayed packet delays the following ones
         arrival = np.maximum.accumulate(arrival)[packet]
         base = start_ns if received_from_ns is None else received_from_ns
         received = base + np.round(arrival * NANOSECONDS).astype(np.int64)
@@ -425,7 +427,7 @@ class _Channel(NamedTuple):
 
     @classmethod
     def of(cls, errors: ImuErrors, name: str, unit: float) -> _Channel:
-        """Of ``gyro``, ``acc`` or ``mag``, whose errors have this unit."""
+        """The channel ``gyro``, ``acc`` or ``mag``, whose errors have this unit in SI."""
         noise, bias, in_run, most = (
             unit * getattr(errors, f"{name}_{kind}", 0.0) for kind in ("noise", "bias", "instability", "range")
         )
@@ -434,7 +436,7 @@ class _Channel(NamedTuple):
 
 
 def _in_parts(motion: Motion) -> Motion:
-    """The motion, asked for not too many times at once."""
+    """The motion, evaluated in parts of bounded size."""
 
     def parts(times: FloatArray) -> tuple[FloatArray, FloatArray]:
         answers = [motion(part) for part in np.array_split(times, max(-(-len(times) // _AT_ONCE), 1))]
@@ -444,9 +446,8 @@ def _in_parts(motion: Motion) -> Motion:
 
 
 def _kinematics(motion: Motion, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Rotations (n, 3, 3), positions (n, 3), angular rates in the own frame (n, 3) and accelerations in world (n, 3).
-
-    By central differences of the motion, which is a closed function of time.
+    """Rotations (n, 3, 3), positions (n, 3), angular rates in the own frame (n, 3) and accelerations in world (n, 3),
+    by central differences of the motion.
     """
     n = len(times)
     rotations, positions = motion(np.concatenate([times - _STEP, times, times + _STEP]))
@@ -457,7 +458,7 @@ def _kinematics(motion: Motion, times: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _twist(rotations: FloatArray) -> FloatArray:
-    """(n,) radians by which (n, 3, 3) rotations turn about z (swing-twist), faded where they turn z nearly over."""
+    """(n,) radians: twist of (n, 3, 3) rotations about z (swing-twist), faded near a swing of 180 degrees."""
     quats = so3.matrix_to_quat(rotations)
     z, w = quats[:, 2], quats[:, 3]
     result: FloatArray = 2.0 * np.arctan2(z, w) * minimum_jerk((z**2 + w**2) / _TWIST_FADES)
@@ -469,7 +470,7 @@ def _jitter(stddev: float, period: float, n: int, rng: np.random.Generator) -> F
 
 
 def _gauss_markov(n: int, correlated: float, rng: np.random.Generator) -> FloatArray:
-    """(n, 3) of unit variance, correlated over so many samples, from its steady state on."""
+    """(n, 3) stationary Gauss-Markov process of unit variance; ``correlated`` is its time constant in samples."""
     keep = np.exp(-1.0 / correlated)
     drive = rng.normal(size=(n, 3))
     drive[1:] *= np.sqrt(1.0 - keep**2)

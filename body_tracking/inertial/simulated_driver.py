@@ -1,4 +1,4 @@
-"""Orientation as the driver of an inertial sensor reports it, and what it states of its uncertainty."""
+"""Simulated orientation and covariance by the driver of an inertial sensor."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ def fuse(
     where: Surroundings,
     heading: float,
 ) -> FloatArray:
-    """(n, 4) what turns the true orientation in world into the reported one.
+    """(n, 4) quaternions from the true orientation in world to the reported one.
 
     To first order the error e, a rotation vector in world, of a complementary filter (Mahony 2008) is
-    ``e' = u - (e - e_ref) / tau``: driven by the errors u of the angular rate, drawn to what acceleration and
-    magnetic field say.
+    ``e' = u - (e - e_ref) / tau``, with the errors u of the angular rate and the reference e_ref by acceleration and
+    magnetic field.
 
     Args:
         errors: of the sensor.
         rate_hz: samples per second.
         times: (n,) seconds.
         drift: (n, 3) rad/s, errors of the angular rate in world.
-        force: (n, 3) m/s2, the measured specific force, turned to world by the true orientation.
+        force: (n, 3) m/s2, the measured specific force, rotated to world by the true orientation.
         magnetic: (n, 3) tesla likewise, or None.
         where: for the direction of magnetic north.
-        heading: radians, of a driver without magnetometer at the start.
+        heading: radians, initial heading of a driver without magnetometer.
     """
     steps = np.diff(times, prepend=times[:1])
     moved = drift * steps[:, None]
-    # what turns the mean force upwards: e x f = g z - f
+    # the rotation of the force to the vertical: e x f = g z - f
     level = np.stack([force[:, 1], -force[:, 0]], axis=-1) / STANDARD_GRAVITY
     fades = np.exp(-1.0 / (rate_hz * errors.tilt_time))
     tilt = _low_pass((1.0 - fades) * level + moved[:, :2], fades, level[0])
@@ -54,7 +54,7 @@ def fuse(
     if magnetic is None:
         turned += heading
     else:
-        # as unit complex numbers, which have no jump at half a turn, beside the heading by the gyroscope alone
+        # relative to the heading by the gyroscope, as unit complex numbers without a jump at half a turn
         seen = rotate(so3.quat_to_matrix(tilted), magnetic)
         north = (seen[:, 0] + 1j * seen[:, 1]) * np.exp(-1j * where.north)
         to_north = np.exp(-1j * (np.angle(north) + turned))
@@ -68,10 +68,10 @@ def fuse(
 def stated_covariance(
     errors: ImuErrors, magnetometer: bool, times: FloatArray, rotations: FloatArray, rates: FloatArray
 ) -> FloatArray:
-    """(n, 3, 3) rad2: what the driver states of its orientation.
+    """(n, 3, 3) rad2: the driver's stated covariance.
 
-    Constants of the data sheet; without magnetometer, besides, the variance of the heading's drift by noise,
-    biases and scales (each of known deviation) over the very motion since the start.
+    Constants of the data sheet; without magnetometer also the variance of the heading's drift by noise, biases and
+    scales (each of known deviation) over the motion since the start.
     """
     tilt, heading = np.radians([errors.stated_tilt, errors.stated_heading]) ** 2
     variance = np.full(len(times), heading)
@@ -92,13 +92,13 @@ def stated_covariance(
 
 
 def rotate(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n, 3) vectors turned by (n, 3, 3) rotations."""
+    """(n, 3) vectors rotated by (n, 3, 3)."""
     result: FloatArray = (rotations @ vectors[..., None])[..., 0]
     return result
 
 
 def _low_pass(values: NDArray[Any], fades: float, first: Any) -> NDArray[Any]:
-    """x[k] = fades x[k-1] + values[k] along the first axis, real or complex, from x[0] = first on."""
+    """x[k] = fades x[k-1] + values[k] along the first axis, real or complex, with x[0] = first."""
     driven = np.concatenate([np.asarray(first)[None], values[1:]])
     result: NDArray[Any] = lfilter([1.0], [1.0, -fades], driven, axis=0)
     return result

@@ -1,4 +1,4 @@
-"""How much an inertial sensor errs: the parameters of ``imus``, and sets of them for known devices."""
+"""Errors of simulated inertial sensors, and sets of them for known devices."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ STANDARD_GRAVITY: Final = 9.80665
 
 
 class ImuSimulationError(BodyTrackingError):
-    """An inertial sensor was described, or moved, as none can be."""
+    """Raised for parameters or segments that a simulated inertial sensor cannot have."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImuErrors:
-    """How much an inertial sensor errs; each field's metadata says what it is, its unit and its range.
+    """Errors of an inertial sensor; each field's metadata has its meaning, unit and range.
 
-    Noise densities are those of IEEE Std 952 (Allan deviation N / sqrt(tau), N sqrt(rate) per sample). Deviations of
-    what stays are per axis, and drawn anew for each recording; biases anew at each switching on. The defaults are
-    :data:`CONSUMER`.
+    Noise densities are those of IEEE Std 952 (Allan deviation N / sqrt(tau), N sqrt(rate) per sample). Constant errors
+    are drawn per axis for each recording, biases at each switching on. The defaults are :data:`CONSUMER`.
 
     Raises:
         ImuSimulationError: a value out of its range.
@@ -35,7 +34,7 @@ class ImuErrors:
     gyro_scale: float = number_field(0.01, "stddev of the scale of the angular rate", "1", 0.0, 0.2)
     gyro_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the angular rate", "1", 0.0, 0.2)
     gyro_range: float = number_field(
-        2000.0, "greatest angular rate, of 16 bits; inf: any, exactly", "deg/s", 1.0, np.inf
+        2000.0, "greatest angular rate, of 16 bits; inf: unlimited, exact", "deg/s", 1.0, np.inf
     )
     acc_noise: float = number_field(0.003, "noise density of the acceleration", "m/s2/sqrt(Hz)", 0.0, 1.0)
     acc_bias: float = number_field(0.1, "stddev of the turn-on bias of the acceleration", "m/s2", 0.0, 5.0)
@@ -43,18 +42,22 @@ class ImuErrors:
     acc_scale: float = number_field(0.005, "stddev of the scale of the acceleration", "1", 0.0, 0.2)
     acc_axes: float = number_field(0.005, "stddev of each cross-axis sensitivity of the acceleration", "1", 0.0, 0.2)
     acc_range: float = number_field(
-        16.0 * STANDARD_GRAVITY, "greatest acceleration, of 16 bits; inf: any, exactly", "m/s2", 1.0, np.inf
+        16.0 * STANDARD_GRAVITY,
+        "greatest acceleration, of 16 bits; inf: unlimited, exact",
+        "m/s2",
+        1.0,
+        np.inf,
     )
     mag_noise: float = number_field(0.05, "noise density of the magnetic field", "uT/sqrt(Hz)", 0.0, 10.0)
-    mag_bias: float = number_field(1.0, "stddev of what calibration leaves of hard iron", "uT", 0.0, 100.0)
+    mag_bias: float = number_field(1.0, "stddev of hard iron after calibration", "uT", 0.0, 100.0)
     mag_scale: float = number_field(0.01, "stddev of scale and cross-axis sensitivities of the field", "1", 0.0, 0.5)
-    mag_range: float = number_field(4912.0, "greatest field, of 16 bits; inf: any, exactly", "uT", 50.0, np.inf)
+    mag_range: float = number_field(4912.0, "greatest field, of 16 bits; inf: unlimited, exact", "uT", 50.0, np.inf)
     instability_time: float = number_field(300.0, "correlation time of the in-run biases", "s", 1.0, 1e5)
 
     tilt_time: float = number_field(3.0, "time constant of the driver's levelling", "s", 0.01, 1e3)
     heading_time: float = number_field(9.0, "time constant of the driver's heading", "s", 0.01, 1e4)
     driver_bias: float = number_field(
-        0.03, "stddev of the turn-on bias that the driver's own estimate leaves", "deg/s", 0.0, 5.0
+        0.03, "stddev of the turn-on bias after the driver's own estimate", "deg/s", 0.0, 5.0
     )
     stated_tilt: float = number_field(1.5, "stddev of the tilt that the driver states", "deg", 0.0, 90.0)
     stated_heading: float = number_field(
@@ -63,12 +66,12 @@ class ImuErrors:
 
     misalignment: float = number_field(5.0, "stddev of the mounting's rotation per axis", "deg", 0.0, 90.0)
     tissue_sag: float = number_field(
-        0.003, "how far the sensor sags on the flesh in its own weight; 0: bone", "m", 0.0, 0.02
+        0.003, "static displacement over soft tissue by the sensor's weight; 0: bone", "m", 0.0, 0.02
     )
-    tissue_frequency: float = number_field(8.0, "natural frequency of the sensor on the flesh", "Hz", 1.0, 12.0)
-    tissue_damping: float = number_field(0.25, "damping ratio of it", "1", 0.01, 2.0)
+    tissue_frequency: float = number_field(8.0, "natural frequency of the sensor on soft tissue", "Hz", 1.0, 12.0)
+    tissue_damping: float = number_field(0.25, "damping ratio of the sensor on soft tissue", "1", 0.01, 2.0)
     tissue_turn: float = number_field(
-        15.0, "turn of the sensor as it slides over the flesh: one over its radius", "rad/m", 0.0, 100.0
+        15.0, "rotation of the sensor per displacement: one over the radius of the limb", "rad/m", 0.0, 100.0
     )
     twist_share: float = number_field(0.2, "share of a segment's twist that the skin does not follow", "1", 0.0, 1.0)
 
@@ -80,8 +83,8 @@ class ImuErrors:
     lost: float = number_field(0.005, "probability that a packet is lost", "1", 0.0, 1.0)
     outages: float = number_field(0.2, "outages of the radio", "1/min", 0.0, 60.0)
     outage_time: float = number_field(0.5, "mean duration of an outage", "s", 0.0, 60.0)
-    delay: float = number_field(0.015, "time from sampling to receipt, at least", "s", 0.0, 10.0)
-    delay_jitter: float = number_field(0.005, "what is added to it on average", "s", 0.0, 10.0)
+    delay: float = number_field(0.015, "least time from sampling to receipt", "s", 0.0, 10.0)
+    delay_jitter: float = number_field(0.005, "mean of the additional random delay", "s", 0.0, 10.0)
 
     def __post_init__(self) -> None:
         check_fields(self, "IMU errors", ImuSimulationError)
@@ -91,8 +94,8 @@ CONSUMER: Final = ImuErrors()
 """A chip like the MPU-9250 on a strap, over Bluetooth.
 
 Data sheet PS-MPU-9250A-01: 0.01 deg/s and 300 ug per root hertz, ranges; 3 % scale and 2 % cross-axis tolerance are
-taken for three standard deviations and less, as of a sensor that was calibrated once. Turn-on biases are what a change
-of temperature by 1 to 7 K leaves of such a calibration (0.24 deg/s and 1.5 mg per kelvin).
+taken as three standard deviations and less, for a sensor that was calibrated once. Turn-on biases are those by a change
+of temperature of 1 to 7 K since the calibration (0.24 deg/s and 1.5 mg per kelvin).
 """
 
 GOOD: Final = ImuErrors(
@@ -129,8 +132,8 @@ GOOD: Final = ImuErrors(
 )
 """A motion tracker like those of Xsens, calibrated one by one, with tight straps.
 
-Data sheet of the MTi-1: 0.007 deg/s and 120 ug per root hertz, bias stability 10 deg/h and 0.03 mg. Radio as of its
-wireless kin, the MTw.
+Data sheet of the MTi-1: 0.007 deg/s and 120 ug per root hertz, bias stability 10 deg/h and 0.03 mg. Radio as of the
+wireless MTw.
 """
 
 IDEAL: Final = replace(
@@ -144,4 +147,4 @@ IDEAL: Final = replace(
     },
     packet=1,
 )
-"""No errors at all; a driver's fusion is still tilted by acceleration and turned by iron."""
+"""No errors; acceleration and iron still affect a driver's fusion."""

@@ -36,15 +36,15 @@ SEGMENTS = Parameter(
 MOUNTINGS = Parameter(
     "mountings",
     (),
-    "SEGMENT:AXES of sensors that are not put on as usual: where their x and z point on the hanging arm or the upright "
-    "trunk of somebody who looks along x with y to the left, as in forearm_left:-z+y",
+    "SEGMENT:AXES of sensors that are not worn as usual: where their x and z point on the hanging arm or the upright "
+    "trunk of a person who faces x with y to the left, as in forearm_left:-z+y",
 )
 _SETTABLE = ("pose", "camera", "clock", "magnetometer", "rate", "pose_stddev", "movement", "stature")
 IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters, only=_SETTABLE))
 _READINGS = 64
-"""Readings of a sensor that may wait while the node is busy: a sixth of a second of the fastest ones."""
+"""Queue of readings per sensor: a sixth of a second of the fastest ones."""
 _FIELD_NS = NANOSECONDS // 20
-"""A magnetic field goes with a reading no further away than this."""
+"""Greatest difference of stamps between a reading and its magnetic field."""
 
 
 class ImuStage(Stage):
@@ -74,7 +74,7 @@ class ImuStage(Stage):
         self._mags = {each.mag: each.segment for each in sensors}
         self._fields: dict[str, tuple[int, FloatArray]] = {}
         self._refused: Counter[str] = Counter()
-        # of several people, who is nearest to the reference sensor wears them
+        # of several people, the one nearest to the reference sensor is the wearer
         self._wearer = HeldSubject(HOLD) if values["subject"] == ALL else SubjectSelector()
         reference = str(values["reference"]) or next(iter(names_in(values["sensors"])), "")
         self._reference = graph.skeleton_topic(reference) if reference else ""
@@ -83,7 +83,7 @@ class ImuStage(Stage):
         for each in sensors:
             ports.append(Port(each.mag, Field(), qos, _READINGS, absolute=each.absolute))
             ports += [Port(topic, Reading(), qos, _READINGS, absolute=each.absolute) for topic in each.imu]
-        # the reference sensor's frames first: what they say of its clock holds for the skeleton that is made of them
+        # the reference sensor's frames first: their clock offset holds for the skeletons fused from them
         frames = [self._reference] if reference else []
         self.inputs = (*ports, *(skeleton_input(topic, values) for topic in (*frames, graph.FUSED)))
         self.outputs = (
@@ -99,16 +99,16 @@ class ImuStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         if topic in self._mags:
-            # goes with the next reading of its sensor
+            # for the next reading of its sensor
             self._fields[self._mags[topic]] = payload[0], payload[2]
         elif topic in self._readings:
             return self._read(self._readings[topic], payload, now.ros_ns)
         elif topic == self._reference:
-            self.tracker.hear(payload[0].stamp_ns, now.ros_ns)
+            self.tracker.take_camera_frame(payload[0].stamp_ns, now.ros_ns)
         else:
             wearer = self._wearer.pick(payload)
             if wearer is not None:
-                self.tracker.see(wearer, now.ros_ns)
+                self.tracker.take_skeleton(wearer, now.ros_ns)
         return ()
 
     def _read(self, segment: str, sample: ImuSample, received_ns: int) -> Iterable[Output]:
@@ -116,33 +116,33 @@ class ImuStage(Stage):
         if field is not None:
             sample = replace(sample, magnetic_field=field)
         try:
-            told = self.tracker.add(segment, sample, received_ns, skeleton=self.wanted(graph.IMU_SKELETON))
+            output = self.tracker.add(segment, sample, received_ns, skeleton=self.wanted(graph.IMU_SKELETON))
         except BodyTrackingError:
             self._refused[f"refused of {segment}"] += 1
             raise
         outputs = []
-        if told.orientation is not None:
-            # its segment is another one where two sensors were found to be exchanged
-            topic = graph.orientation_topic(told.orientation.segment)
-            outputs.append(Output(topic, told.orientation, told.orientation.stamp_ns))
-        if told.skeleton is not None:
-            outputs.append(Output(graph.IMU_SKELETON, (told.skeleton,), told.skeleton.stamp_ns))
+        if output.orientation is not None:
+            # of exchanged sensors the segment differs from the stated one
+            topic = graph.orientation_topic(output.orientation.segment)
+            outputs.append(Output(topic, output.orientation, output.orientation.stamp_ns))
+        if output.skeleton is not None:
+            outputs.append(Output(graph.IMU_SKELETON, (output.skeleton,), output.skeleton.stamp_ns))
         return outputs
 
     def _field_at(self, segment: str, at_ns: int) -> FloatArray | None:
-        """The latest field, once, if it is of about the same time."""
+        """The latest field, once, if its stamp is near the reading's."""
         stamp_ns, vector = self._fields.pop(segment, (0, None))
         return vector if vector is not None and abs(at_ns - stamp_ns) < _FIELD_NS else None
 
     def refused(self, topic: str) -> None:
-        """A message of a sensor is none."""
+        """Count an invalid message of a sensor."""
         if topic in self._readings:
             self._refused[f"refused of {self._readings[topic]}"] += 1
         elif topic in self._mags:
             self._refused[f"refused fields of {self._mags[topic]}"] += 1
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """What is wrong with which sensor, and how well they are aligned."""
+        """Problems by sensor, counters, and standard deviations of the alignments."""
         problems = self.tracker.problems(ros_ns)
         values: dict[str, object] = {f"problem {number}": line for number, line in enumerate(problems, start=1)}
         values |= self.tracker.counters

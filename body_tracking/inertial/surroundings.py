@@ -1,4 +1,4 @@
-"""The magnetic field where inertial sensors are worn."""
+"""The magnetic field around simulated inertial sensors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Iron:
         position: (3,) metres in world.
         moment: (3,) A m2 in world.
         radius: metres; inside, the field is as on the surface.
-        since, until: seconds between which it is there; it comes and goes in half a second before and after.
+        since, until: seconds of its presence; it fades in and out within half a second before and after.
     """
 
     position: FloatArray
@@ -51,13 +51,13 @@ class Iron:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What the sensors feel of the place.
+    """The magnetic field of a place.
 
     Attributes:
         strength: tesla, of the earth's magnetic field.
         dip: radians by which it points below the horizon.
         north: radians from world's x, counter-clockwise, to magnetic north; at a quarter turn world is east-north-up.
-        iron: what disturbs the field.
+        iron: disturbances of the field.
     """
 
     strength: float = 48e-6

@@ -1,9 +1,8 @@
-"""From the clocks of worn sensors to the one in which everything comes out.
+"""From the clocks of worn sensors to the output clock: the camera's, or that of receipt without a camera.
 
-That is the camera's, or that of receipt where there is none. The times of receipt tell what a clock is off to within
-what transports differ by; motion tells that difference, beside a camera. Where the camera's own frames are heard, they
-tell of its clock, and its skeletons do not: those come later by what was made of them meanwhile, which is another time
-in every run.
+Times of receipt give the offset of a clock up to the difference of the transports' delays; with a camera, motion gives
+this difference. The camera's own frames are used for its clock where they arrive. Its fused skeletons come later by the
+processing time, which differs from run to run.
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.parameters import REFERENCE, SHARED
 
 _TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
-"""Seconds by which transports differ, per root second by which that changes, and that motion tells at best."""
+"""Standard deviations of the transports' difference (seconds), of its random walk (seconds per root second), and the
+least of an offset by motion (seconds)."""
 
 
 @dataclass(slots=True)
 class _Transport:
-    """Seconds by which a sensor's stamps come later than by the times of receipt, and how sure that is."""
+    """Seconds by which a sensor's stamps are later than the times of receipt say, and the variance of that."""
 
     offset: float = 0.0
     variance: float = _TRANSPORTS**2
@@ -29,7 +29,7 @@ class _Transport:
     found: bool = False
 
     def correct(self, stamp: float, offset: float, stddev: float) -> None:
-        """By what motion tells (a scalar Kalman filter)."""
+        """Update by an offset from motion (a scalar Kalman filter)."""
         self.variance += _TRANSPORTS_WALK**2 * max(0.0, stamp - self.stamp)
         gain = self.variance / (self.variance + stddev**2 + _OFFSET_FLOOR**2)
         self.offset += gain * (offset - self.offset)
@@ -38,10 +38,10 @@ class _Transport:
 
 
 class SensorClocks:
-    """How far the clocks of several sensors are off.
+    """Offsets of the clocks of several sensors.
 
     Args:
-        kind: of :class:`~body_tracking.inertial.parameters.TrackingParameters`: whose clocks they are.
+        kind: of :class:`~body_tracking.inertial.parameters.TrackingParameters`: ``own``, ``shared`` or ``reference``.
         sensors: their names.
     """
 
@@ -54,29 +54,29 @@ class SensorClocks:
 
     @property
     def camera_known(self) -> bool:
-        """Whether anything is known of a camera's clock."""
+        """Whether the offset of a camera's clock is known."""
         return self._frame_ns is not None or self._camera.delay_ns is not None
 
     @property
     def found(self) -> dict[str, float]:
-        """Seconds, of the sensors of which motion has told something: by how much later they are than by receipt."""
+        """Seconds by which stamps are later than the times of receipt say, for the sensors corrected by motion."""
         return {name: each.offset for name, each in self._transports.items() if each.found}
 
-    def take(self, stamp_ns: int, received_ns: int) -> None:
-        """Note a reading, of whichever sensor; each notes its own clock besides."""
+    def take_reading(self, stamp_ns: int, received_ns: int) -> None:
+        """Take the times of a reading of any sensor; each sensor also has its own :class:`ReceiptClock`."""
         if self._kind == SHARED:
             self._all.add(stamp_ns, received_ns)
 
-    def hear(self, stamp_ns: int, received_ns: int) -> bool:
-        """Note a frame of the camera itself; whether another clock counts from now on."""
+    def take_camera_frame(self, stamp_ns: int, received_ns: int) -> bool:
+        """Take the times of a frame of the camera itself; True if the output clock changes."""
         before, self._frame_ns = self._frame_ns, stamp_ns
         if before is None or jumped_back(stamp_ns, before):
             self._camera.reset()
         known = self._camera.delay_ns is not None
         return not self._camera.add(stamp_ns, received_ns) or not known
 
-    def see(self, stamp_ns: int, received_ns: int, jumped: bool) -> bool:
-        """Note a skeleton of the camera, whose time has jumped or not; whether it has, or its clock was set."""
+    def take_skeleton(self, stamp_ns: int, received_ns: int, jumped: bool) -> bool:
+        """Take the times of a camera's skeleton; True if its time has jumped or its clock was set."""
         if self._frame_ns is not None:
             return jumped
         if jumped:
@@ -88,7 +88,7 @@ class SensorClocks:
 
         Args:
             sensor: its name.
-            own: its clock, that has been told of a reading.
+            own: its clock, with at least one reading.
         """
         if self._kind == REFERENCE:
             return 0
@@ -97,13 +97,13 @@ class SensorClocks:
         return delay - (0 if camera is None else camera) - round(self._transport(sensor).offset * NANOSECONDS)
 
     def correct(self, sensor: str, stamp: float, offset: float, stddev: float) -> None:
-        """Take what motion tells.
+        """Take an offset by motion.
 
         Args:
             sensor: its name.
-            stamp: seconds, when.
-            offset: seconds by which its stamps still are too late after :meth:`offset_ns`.
-            stddev: seconds, of that.
+            stamp: seconds, time of the measurement.
+            offset: seconds by which its stamps are still late after :meth:`offset_ns`.
+            stddev: seconds, of the offset.
         """
         transport = self._transport(sensor)
         transport.correct(stamp, transport.offset + offset, stddev)

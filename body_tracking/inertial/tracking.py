@@ -1,11 +1,11 @@
 """Inertial sensors as a source: readings in, orientations of segments and a skeleton in ``world`` out.
 
 Puts together what the other modules of this package find: each sensor's orientation in an earth of its own (``worn``),
-its alignment and heading by a pose, by elbows and by what a camera sees (``held_pose``, ``alignment``, ``heading``),
-its clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
+its alignment and heading by a pose, by elbows and by a camera's bones (``held_pose``, ``alignment``, ``heading``), its
+clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
 
-Headings: with a camera, ``world`` is its; without one, x is where the person faced in the pose, and what is common to
-all headings drifts, and says so.
+Headings: with a camera, ``world`` is the camera's. Without one, x is where the person faced in the pose; the common
+part of all headings drifts, and the covariance grows with it.
 
 Over 500 lines: the inertial issue rewrites tracking and slips.
 """
@@ -40,79 +40,79 @@ from body_tracking.inertial.clock import clock_offset, turning_of_bone, turning_
 from body_tracking.inertial.detection import SlipDetector, assign, likelihood_by_motion, likelihood_by_pose
 from body_tracking.inertial.heading import HEADING_WALK, JOINTS, HeadingTracker, bone_of
 from body_tracking.inertial.held_pose import HeldPose, PoseFinder
-from body_tracking.inertial.mounting import mountings as meant_mountings
+from body_tracking.inertial.mounting import mountings as intended_mountings
 from body_tracking.inertial.parameters import ARMS_DOWN, AUTO, REFERENCE, T_POSE, TrackingParameters
 from body_tracking.inertial.timing import SensorClocks
-from body_tracking.inertial.worn import UNKNOWN_HEADING, Felt, WornSensor
+from body_tracking.inertial.worn import UNKNOWN_HEADING, OrientedReading, WornSensor
 from body_tracking.kinematics.upper_body import UpperBody
 
 _STEP_NS = NANOSECONDS // 10
-"""How often what changes slowly is looked at."""
+"""Period of the slow estimates: bones, poses, elbows, clocks."""
 _AHEAD_OF = 0.85
-"""Share of the period of orientations from which on the next reading has one. Of 100 Hz every third one comes after
+"""Share of the output period after which the next orientation is published. Every third reading of 100 Hz comes after
 nine tenths of the period of 30 Hz, and stamps jitter."""
 _POSE_S, _POSE_EVERY_S = 1.6, 0.25
-"""Seconds of readings in which a pose is looked for, and how often."""
+"""Seconds of readings in which a pose is searched, and seconds between searches."""
 _ASKED_S = 15.0
-"""Seconds within which a pose that was asked for must be held."""
+"""Seconds within which a requested pose must be held."""
 _CAMERA_LASTS = 12.0
-"""Times as long as ``heading`` has it that a camera misreads a bone alike, by where it takes people's joints to be."""
+"""Factor on ``heading.CAMERA_TIME``: a camera's joint offsets persist longer than its other errors."""
 _CAMERA_SLIPS = 3.0
-"""The same for what looks like a slip: of what lasts longer, part is there before and after."""
+"""The same factor for slips: part of the longer-lasting errors is the same before and after one."""
 _ALONE_S = 5.0
-"""Seconds after which a camera that has shown nobody is not waited for."""
+"""Seconds after which the tracker starts without a camera's skeleton."""
 _FRESH_NS = NANOSECONDS // 2
 _PENDING_NS = NANOSECONDS // 20
-"""A skeleton waits so long for the readings around it."""
+"""Time that a skeleton waits for the readings around it."""
 _ELBOW_S = 0.5
-_MOVED_S, _MOVED_RATE, _MOVEMENT_TELLS = 30.0, 10.0, 0.5
-"""Seconds of an elbow's movement that are looked at, readings per second of them, and nats that they must be worth."""
+_MOVED_S, _MOVED_RATE, _LEAST_INFORMATION = 30.0, 10.0, 0.5
+"""Seconds of an elbow's movement in a fit, readings per second of it, and least information of the fit in nats."""
 _DRIFT_S, _LOST = 1.0, 0.05
-"""Seconds between two looks at drift, and rad2 at once by which a heading is lost rather than drifts."""
+"""Seconds between updates of the drift, and rad2 at once from which a heading is lost instead of drifting."""
 _CLOCK_EVERY_S, _CHECK_EVERY_S, _LOOK_BACK_S = 3.0, 5.0, 30.0
 _CLOCK_WINDOW = 0.5
 _SLIP_WINDOWS = 6.0, 18.0
-"""Seconds: large slips are seen soon, those hardly larger than a camera's errors late."""
+"""Seconds of the two detectors: the short one finds large slips soon, the long one those near a camera's errors."""
 _NAMED_S = 60.0
-"""Seconds for which a slip is told."""
-_POSE_TELLS = 20.0
-"""Logarithm of a likelihood ratio at most, that a pose tells of where a sensor is: later it may be put elsewhere."""
+"""Seconds for which a slip is reported."""
+_POSE_LIMIT = 20.0
+"""Upper bound of the log likelihood ratio of a pose for the place of a sensor, which may be moved later."""
 _FAR_HEADING = 0.5
-"""Radians of a heading's deviation from which it counts as unknown."""
+"""Radians of a heading's standard deviation from which it counts as unknown."""
 _MAGNETIC_WALK = 0.1 * HEADING_WALK
 _RATE_STDDEV, _RATE_SHARE = 0.05, 0.1
-"""rad/s, and share of itself, that a segment's rate is off, mostly by the flesh."""
+"""rad/s, and share of the rate: standard deviation of a segment's rate, mostly by soft tissue."""
 _EYE3 = np.eye(3)
 
 
 class InertialTrackingError(BodyTrackingError):
-    """Sensors that cannot be tracked as was asked for."""
+    """Raised when the segments with sensors are unknown, repeated or none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
-    """What follows from a reading.
+class TrackerOutput:
+    """The output of one reading.
 
     Attributes:
-        orientation: of the sensor's segment, or None.
-        skeleton: the whole body, when one is due, or None.
+        orientation: of the sensor's segment; None if it is not due or too uncertain.
+        skeleton: the whole body; None if it is not due.
     """
 
     orientation: SegmentOrientation | None = None
     skeleton: Skeleton | None = None
 
 
-_NOTHING: Final = Told()
+_NO_OUTPUT: Final = TrackerOutput()
 
 
 class InertialTracker:
-    """Feeds on readings of several sensors, and on skeletons in ``world`` where a camera sees the person.
+    """Tracks orientations of segments from readings of several sensors and, optionally, a camera's skeletons.
 
     Args:
         segments: of ``UpperBody.segment_names``, each with a sensor.
-        parameters: how.
-        mountings: ``segment:axes`` of sensors that are not put on in the usual way (``mounting``).
-        world: name of the frame of what comes out.
+        parameters: defaults where None.
+        mountings: ``segment:axes`` of sensors that are not worn in the usual way (``mounting``).
+        world: name of the output frame.
 
     Attributes:
         counters: what happened since the construction, for diagnostics.
@@ -120,7 +120,7 @@ class InertialTracker:
 
     Raises:
         InertialTrackingError: no segment, one twice or an unknown one.
-        MountingError: a mounting that is none.
+        MountingError: an invalid mounting.
     """
 
     def __init__(
@@ -134,10 +134,10 @@ class InertialTracker:
         self._model = UpperBody()
         unknown = [name for name in segments if name not in self._model.segment_names]
         if unknown or not segments or len(set(segments)) < len(segments):
-            what = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
-            raise InertialTrackingError(f"segments with inertial sensors: {what}")
+            problem = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
+            raise InertialTrackingError(f"segments with inertial sensors: {problem}")
         self.segments = tuple(segments)
-        self._meant = meant_mountings(self.segments, mountings)
+        self._intended = intended_mountings(self.segments, mountings)
         self._world = world
         self.counters: Counter[str] = Counter()
         self._poses = PoseFinder(self._model)
@@ -145,7 +145,7 @@ class InertialTracker:
         self._begin()
 
     def _begin(self) -> None:
-        """Know nothing of the person and of time."""
+        """Set the initial state of person and time."""
         self._magnetic = np.zeros(len(self.segments), dtype=np.bool_)
         self._tracker = self._new_tracker(self._unaligned(self.segments))
         self._last = 0.0
@@ -160,7 +160,7 @@ class InertialTracker:
         self._received_ns: int | None = None
         self._newest_ns: int | None = None
         self._due: dict[str, float] = {}
-        self._told_ns: dict[str, int] = {}
+        self._published_ns: dict[str, int] = {}
         self._skeleton_ns: int | None = None
         self._slips: dict[str, tuple[float, str]] = {}
         self._exchanged: dict[str, str] = {}
@@ -171,9 +171,9 @@ class InertialTracker:
         self._elbows: set[str] = set()
 
     def _unaligned(self, segments: Sequence[str]) -> Alignment:
-        """Sensors put on as they were meant to, of any heading."""
+        """Intended mountings with unknown headings."""
         prior = np.tile([self.parameters.mounting_stddev**2] * 3 + [UNKNOWN_HEADING], len(segments))
-        meant = self._meant[[self.segments.index(name) for name in segments]]
+        meant = self._intended[[self.segments.index(name) for name in segments]]
         return Alignment(tuple(segments), meant, np.zeros(len(segments)), np.diag(prior))
 
     @staticmethod
@@ -181,25 +181,25 @@ class InertialTracker:
         return tuple(SlipDetector(segment, window=window) for window in _SLIP_WINDOWS)
 
     def reset(self) -> None:
-        """Begin anew, as after a jump of time; the counters stay."""
+        """Start again, as after a jump of time; the counters stay."""
         for name, sensor in self._sensors.items():
             sensor.segment = name
             sensor.reset()
         self._begin()
 
     def align(self) -> str:
-        """Align anew in the next pose that is held; what is said to who asked."""
+        """Align again in the next pose that is held; returns the instruction for the caller."""
         self._asked_until = self._last + _ASKED_S
-        what = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
-        return f"hold {what}, for a second and within the next {_ASKED_S:.0f} s"
+        pose = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
+        return f"hold {pose}, for a second and within the next {_ASKED_S:.0f} s"
 
     @property
     def alignment(self) -> Alignment:
-        """The present one, of ``segments``."""
+        """The current alignment of ``segments``."""
         return self._tracker.alignment
 
     def problems(self, now_ns: int) -> tuple[str, ...]:
-        """A line for each thing that is wrong now.
+        """One line for each current problem.
 
         Args:
             now_ns: the time in the clock of receipt.
@@ -224,7 +224,7 @@ class InertialTracker:
         return tuple(lines)
 
     def state(self) -> dict[str, float]:
-        """How well alignments and headings are known, degrees, and what motion tells of clocks, milliseconds."""
+        """Standard deviations of alignments and headings, degrees, and clock offsets by motion, milliseconds."""
         stddev = np.degrees(self.alignment.stddev)
         values = {}
         for number, name in enumerate(self.segments):
@@ -235,14 +235,14 @@ class InertialTracker:
 
     # --- readings
 
-    def add(self, segment: str, sample: ImuSample, received_ns: int, *, skeleton: bool = True) -> Told:
+    def add(self, segment: str, sample: ImuSample, received_ns: int, *, skeleton: bool = True) -> TrackerOutput:
         """Take one reading.
 
         Args:
-            segment: on which the sensor is said to be.
-            sample: what it said.
-            received_ns: when, in a clock common to all sensors and to the camera.
-            skeleton: tell the whole body when it is due, which has to be fitted.
+            segment: stated place of the sensor.
+            sample: the reading.
+            received_ns: time of receipt, in a clock common to all sensors and to the camera.
+            skeleton: fit and return the whole body when it is due.
 
         Raises:
             InertialTrackingError: no such segment.
@@ -252,40 +252,37 @@ class InertialTracker:
             raise InertialTrackingError(f"{segment}: no inertial sensor is expected there")
         self._receive(received_ns)
         sensor = self._sensors[segment]
-        felt = sensor.take(sample, received_ns)
-        self._clocks.take(sample.stamp_ns, received_ns)
-        if felt is None or sensor.problems:
-            return _NOTHING
-        stamp_ns = self._to_reference(sensor, felt.stamp_ns)
+        reading = sensor.take(sample, received_ns)
+        self._clocks.take_reading(sample.stamp_ns, received_ns)
+        if reading is None or sensor.problems:
+            return _NO_OUTPUT
+        stamp_ns = self._to_reference(sensor, reading.stamp_ns)
         if self._waits_for_camera(received_ns):
-            return _NOTHING
+            return _NO_OUTPUT
         now = self._advance(stamp_ns)
         self._note_heading(sensor, now)
         if now >= self._due.get("step", -np.inf):
             self._due["step"] = now + _STEP_NS / NANOSECONDS
             self._step(now, stamp_ns)
-        return Told(self._orientation(sensor, felt, stamp_ns), self._skeleton(stamp_ns) if skeleton else None)
+        return TrackerOutput(
+            self._orientation(sensor, reading, stamp_ns), self._skeleton(stamp_ns) if skeleton else None
+        )
 
-    def hear(self, stamp_ns: int, received_ns: int) -> None:
-        """Note when a frame of the camera whose clock is that of ``world`` was received.
+    def take_camera_frame(self, stamp_ns: int, received_ns: int) -> None:
+        """Take the time of receipt of a frame of the camera whose clock is that of ``world``.
 
         Args:
-            stamp_ns: of the frame, whatever is in it.
-            received_ns: as above.
+            stamp_ns: of the frame.
+            received_ns: as of :meth:`add`.
         """
         if not self.parameters.camera:
             return
         self._receive(received_ns)
-        if self._clocks.hear(stamp_ns, received_ns):
+        if self._clocks.take_camera_frame(stamp_ns, received_ns):
             self._rebase()
 
-    def see(self, skeleton: Skeleton, received_ns: int) -> None:
-        """Take a camera's skeleton in ``world``; left out with the parameter ``camera`` false.
-
-        Args:
-            skeleton: in ``world``.
-            received_ns: as above.
-        """
+    def take_skeleton(self, skeleton: Skeleton, received_ns: int) -> None:
+        """Take a camera's skeleton in ``world``; ignored with the parameter ``camera`` false."""
         if not self.parameters.camera:
             return
         self._receive(received_ns)
@@ -294,7 +291,7 @@ class InertialTracker:
         if newest is not None and skeleton.stamp_ns <= newest and not back:
             self.counters["camera's late frames"] += 1
             return
-        jumped = self._clocks.see(skeleton.stamp_ns, received_ns, back)
+        jumped = self._clocks.take_skeleton(skeleton.stamp_ns, received_ns, back)
         if jumped:
             self.counters["camera's time jumped"] += 1
             self._pending.clear()
@@ -306,7 +303,7 @@ class InertialTracker:
         self._seen.append(skeleton)
         while skeleton.stamp_ns - self._seen[0].stamp_ns > _LOOK_BACK_S * NANOSECONDS:
             self._seen.popleft()
-        self._body.see(skeleton)
+        self._body.take_skeleton(skeleton)
 
     def _receive(self, received_ns: int) -> None:
         if jumped_back(received_ns, self._received_ns):
@@ -317,7 +314,7 @@ class InertialTracker:
             self._first_ns = received_ns
 
     def _waits_for_camera(self, received_ns: int) -> bool:
-        """Until its first skeleton nobody knows which clock and which world are meant."""
+        """The camera's first skeleton defines the reference clock and ``world``."""
         if not self.parameters.camera or self._newest_ns is not None:
             return False
         assert self._first_ns is not None
@@ -326,7 +323,7 @@ class InertialTracker:
     # --- time
 
     def _to_reference(self, sensor: WornSensor, stamp_ns: int) -> int:
-        """A stamp of a sensor in the clock of what comes out."""
+        """A stamp of a sensor in the output clock."""
         return stamp_ns + self._offset_ns(sensor)
 
     def _offset_ns(self, sensor: WornSensor) -> int:
@@ -336,11 +333,11 @@ class InertialTracker:
         return next(name for name, each in self._sensors.items() if each is sensor)
 
     def _rebase(self) -> None:
-        """Another clock counts from now on."""
+        """Start times again after a change of the output clock."""
         self._tracker = self._new_tracker(self.alignment)
         self._epoch_ns, self._last, self._since = None, 0.0, 0.0
         self._due.clear()
-        self._told_ns.clear()
+        self._published_ns.clear()
         self._skeleton_ns = None
         self._slips.clear()
         self._detectors = {name: self._new_detectors(name) for name in self.segments}
@@ -350,31 +347,31 @@ class InertialTracker:
         return HeadingTracker(alignment, heading_walk=np.where(self._magnetic, _MAGNETIC_WALK, HEADING_WALK))
 
     def _advance(self, stamp_ns: int) -> float:
-        """Seconds since the beginning; never less than before."""
+        """Seconds since the start, not decreasing."""
         if self._epoch_ns is None:
             self._epoch_ns = stamp_ns
         self._last = max(self._last, (stamp_ns - self._epoch_ns) / NANOSECONDS)
         return self._last
 
     def _note_heading(self, sensor: WornSensor, now: float) -> None:
-        """Hand on that a sensor's heading is lost, and that it has a magnetometer."""
+        """Pass the loss of a sensor's heading and the presence of a magnetometer to the heading tracker."""
         number = self.segments.index(sensor.segment)
         if sensor.growth > _LOST:
-            self._unsure(number, sensor.growth, now)
+            self._inflate_heading(number, sensor.growth, now)
             sensor.growth = 0.0
         if sensor.has_field != self._magnetic[number]:
             self._magnetic[number] = sensor.has_field
             self._tracker = self._new_tracker(self.alignment)
 
     def _note_drift(self, now: float) -> None:
-        """Hand on what headings have drifted by in the last second, beyond what they are taken to."""
+        """Add the drift of the last second in excess of the assumed random walk."""
         for sensor in self._sensors.values():
             excess, sensor.growth = sensor.growth - HEADING_WALK**2 * _DRIFT_S, 0.0
             if excess > 0.0:
-                self._unsure(self.segments.index(sensor.segment), excess, now)
+                self._inflate_heading(self.segments.index(sensor.segment), excess, now)
 
-    def _unsure(self, number: int, variance: float, now: float) -> None:
-        """Know less of a heading, by rad2; no less than nothing."""
+    def _inflate_heading(self, number: int, variance: float, now: float) -> None:
+        """Add rad2 to the variance of a heading, up to that of an unknown one."""
         self._tracker.predict(max(now, self._last))
         a = self.alignment
         covariance = a.covariance.copy()
@@ -383,7 +380,7 @@ class InertialTracker:
         self._tracker.alignment = Alignment(a.segments, a.rotations, a.headings, covariance)
 
     def _step(self, now: float, stamp_ns: int) -> None:
-        """Everything that need not be done for every reading."""
+        """Run the slow estimates that are due."""
         while self._pending and self._pending[0].stamp_ns < max(stamp_ns, self._newest_ns or 0) - _PENDING_NS:
             self._compare(self._pending.popleft(), now)
         if self._is_due("drift", now, _DRIFT_S):
@@ -399,14 +396,14 @@ class InertialTracker:
         if self._is_due("exchange", now, _CHECK_EVERY_S):
             self._look_for_exchange(now, stamp_ns)
 
-    def _is_due(self, what: str, now: float, every: float) -> bool:
-        if now < self._due.get(what, 0.0):
+    def _is_due(self, task: str, now: float, every: float) -> bool:
+        if now < self._due.get(task, 0.0):
             return False
-        self._due[what] = now + every
+        self._due[task] = now + every
         return True
 
-    def _listening(self, stamp_ns: int) -> list[tuple[int, WornSensor]]:
-        """Those sensors that said something of use lately, with the numbers of their segments."""
+    def _active(self, stamp_ns: int) -> list[tuple[int, WornSensor]]:
+        """Sensors with a recent usable reading, and the numbers of their segments."""
         found = []
         for sensor in self._sensors.values():
             latest = sensor.latest
@@ -416,28 +413,28 @@ class InertialTracker:
                 found.append((self.segments.index(sensor.segment), sensor))
         return sorted(found, key=lambda each: each[0])
 
-    def _stream(self, sensor: WornSensor, felt: Sequence[Felt]) -> Stream:
-        """Readings in the clock of what comes out, in seconds since the beginning."""
+    def _stream(self, sensor: WornSensor, readings: Sequence[OrientedReading]) -> Stream:
+        """Readings in the output clock, in seconds since the start."""
         assert self._epoch_ns is not None
         offset = self._offset_ns(sensor) - self._epoch_ns
         return Stream(
             sensor.segment,
-            np.array([(each.stamp_ns + offset) / NANOSECONDS for each in felt]),
-            np.array([each.rotation for each in felt]).reshape(-1, 3, 3),
-            np.array([each.rate for each in felt]).reshape(-1, 3),
+            np.array([(each.stamp_ns + offset) / NANOSECONDS for each in readings]),
+            np.array([each.rotation for each in readings]).reshape(-1, 3, 3),
+            np.array([each.rate for each in readings]).reshape(-1, 3),
         )
 
-    def _recent(self, sensor: WornSensor, stamp_ns: int, seconds: float) -> list[Felt]:
+    def _recent(self, sensor: WornSensor, stamp_ns: int, seconds: float) -> list[OrientedReading]:
         return sensor.history(stamp_ns - round(seconds * NANOSECONDS) - self._offset_ns(sensor))
 
     # --- a camera
 
     def _compare(self, skeleton: Skeleton, now: float) -> None:
-        """Headings, alignments and slips by the bones of a skeleton."""
+        """Update headings, alignments and slip detectors by the bones of a skeleton."""
         if not self._is_due("bones", now, 0.9 * _STEP_NS / NANOSECONDS):
             return
         variance, valid = joint_variances(skeleton), skeleton.valid
-        for _, sensor in self._listening(skeleton.stamp_ns):
+        for _, sensor in self._active(skeleton.stamp_ns):
             segment = sensor.segment
             bone, rotation = bone_of(segment), sensor.at(skeleton.stamp_ns - self._offset_ns(sensor))
             if bone is None or rotation is None or not (valid[bone.start] and valid[bone.end]):
@@ -447,12 +444,12 @@ class InertialTracker:
             if length < 0.05:
                 continue
             stddev = float(np.sqrt(variance[bone.start] + variance[bone.end])) / length
-            told = self._tracker.observe_bone(now, segment, rotation, way, stddev * np.sqrt(_CAMERA_LASTS))
-            if told is None or sensor.disturbed or self._stddev(sensor) > _FAR_HEADING:
+            innovation = self._tracker.observe_bone(now, segment, rotation, way, stddev * np.sqrt(_CAMERA_LASTS))
+            if innovation is None or sensor.disturbed or self._stddev(sensor) > _FAR_HEADING:
                 continue
-            off = float(np.sqrt(0.5 * told.covariance.trace() - (_CAMERA_LASTS - _CAMERA_SLIPS) * stddev**2))
+            off = float(np.sqrt(0.5 * innovation.covariance.trace() - (_CAMERA_LASTS - _CAMERA_SLIPS) * stddev**2))
             for detector in self._detectors[segment]:
-                slip = detector.update(now, told.turn, off)
+                slip = detector.update(now, innovation.turn, off)
                 if slip is not None:
                     self._slipped(segment, now, float(np.linalg.norm(slip.turn)))
                     break
@@ -466,7 +463,7 @@ class InertialTracker:
         self._detectors[segment] = self._new_detectors(segment)
 
     def _bones(self, segments: Sequence[str]) -> list[Series | None]:
-        """How fast the camera has seen bones turn."""
+        """Turning rates of bones in the camera's recent skeletons."""
         assert self._epoch_ns is not None
         stamps = np.array([(each.stamp_ns - self._epoch_ns) / NANOSECONDS for each in self._seen])
         positions = np.array([np.where(each.valid[:, None], each.positions, np.nan) for each in self._seen])
@@ -480,60 +477,58 @@ class InertialTracker:
         return found
 
     def _turning(self, number: int, sensor: WornSensor, stamp_ns: int) -> Series | None:
-        """How fast a sensor has felt its bone turn."""
-        felt = self._recent(sensor, stamp_ns, _LOOK_BACK_S)
+        """Turning rate of a bone by its sensor's recent readings."""
+        readings = self._recent(sensor, stamp_ns, _LOOK_BACK_S)
         bone = bone_of(sensor.segment)
-        if len(felt) < 2 or bone is None:
+        if len(readings) < 2 or bone is None:
             return None
-        stream = self._stream(sensor, felt)
+        stream = self._stream(sensor, readings)
         return turning_of_sensor(stream.stamps, stream.rates, self.alignment.rotations[number] @ bone.axis)
 
     def _look_at_clock(self, now: float, stamp_ns: int) -> None:
-        """Of one sensor after the other, by how much its stamps are off those of the camera."""
-        listening = self._listening(stamp_ns)
-        if not self._seen or not listening or self.parameters.clock == REFERENCE:
+        """Estimate the offset of one sensor's stamps from the camera's by motion; the sensors take turns."""
+        active = self._active(stamp_ns)
+        if not self._seen or not active or self.parameters.clock == REFERENCE:
             return
         self._turn += 1
-        number, sensor = listening[self._turn % len(listening)]
-        felt, (seen,) = self._turning(number, sensor, stamp_ns), self._bones([sensor.segment])
-        if felt is None or seen is None:
+        number, sensor = active[self._turn % len(active)]
+        measured, (seen,) = self._turning(number, sensor, stamp_ns), self._bones([sensor.segment])
+        if measured is None or seen is None:
             return
-        found = clock_offset(seen, felt, window=_CLOCK_WINDOW)
+        found = clock_offset(seen, measured, window=_CLOCK_WINDOW)
         if found is not None and sensor.segment not in self._exchanged.values():
             self._clocks.correct(self._stated(sensor), now, found.offset, found.stddev)
             self.counters["clocks by motion"] += 1
 
     def _look_for_exchange(self, now: float, stamp_ns: int) -> None:
-        """Whether sensors feel what the camera sees of each other's bones."""
-        listening = [each for each in self._listening(stamp_ns) if bone_of(each[1].segment) is not None]
-        if len(self._seen) < 2 or len(listening) < 2:
+        """Compare the turning rates of all sensors with those of all bones."""
+        active = [each for each in self._active(stamp_ns) if bone_of(each[1].segment) is not None]
+        if len(self._seen) < 2 or len(active) < 2:
             return
-        felt = [self._turning(number, sensor, stamp_ns) for number, sensor in listening]
-        kept = [number for number, each in enumerate(felt) if each is not None]
-        segments = [listening[number][1].segment for number in kept]
-        table = likelihood_by_motion([each for each in felt if each is not None], self._bones(segments))
+        measured = [self._turning(number, sensor, stamp_ns) for number, sensor in active]
+        kept = [number for number, each in enumerate(measured) if each is not None]
+        segments = [active[number][1].segment for number in kept]
+        table = likelihood_by_motion([each for each in measured if each is not None], self._bones(segments))
         for row, number in enumerate(kept):
-            said = self._by_pose.get(self._stated(listening[number][1]), {})
-            table[row] += [said.get(segment, 0.0) for segment in segments]
+            by_pose = self._by_pose.get(self._stated(active[number][1]), {})
+            table[row] += [by_pose.get(segment, 0.0) for segment in segments]
         found = assign(segments, table)
         if found.exchanged:
-            self._exchange([listening[number][1] for number in kept], found.segments)
+            self._exchange([active[number][1] for number in kept], found.segments)
 
     def _note_pose(self, sensors: Sequence[WornSensor], table: FloatArray) -> None:
-        """Keep what a pose tells of where each sensor is, beside what motion will."""
+        """Keep the log likelihoods of a pose, to add them to those of motion."""
         for sensor, row in zip(sensors, table, strict=True):
-            worth = np.maximum(row - row.max(), -_POSE_TELLS)
-            self._by_pose[self._stated(sensor)] = dict(
-                zip((each.segment for each in sensors), worth.tolist(), strict=True)
-            )
+            bounded = np.maximum(row - row.max(), -_POSE_LIMIT).tolist()
+            self._by_pose[self._stated(sensor)] = dict(zip((each.segment for each in sensors), bounded, strict=True))
 
     def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> None:
-        """Sensors are on other segments than was thought."""
-        moved = [(sensor, segment) for sensor, segment in zip(sensors, segments, strict=True)]
-        moved = [(sensor, segment) for sensor, segment in moved if sensor.segment != segment]
+        """Assign sensors to the segments on which they were found."""
+        pairs = zip(sensors, segments, strict=True)
+        moved = [(sensor, segment) for sensor, segment in pairs if sensor.segment != segment]
         for sensor, segment in moved:
             stated = self._stated(sensor)
-            self._slips.pop(segment, None)  # it looked like one
+            self._slips.pop(segment, None)  # the exchange looked like a slip
             self.counters["exchanged sensors"] += 1
             if segment == stated:
                 self._exchanged.pop(stated, None)
@@ -551,66 +546,66 @@ class InertialTracker:
     # --- a pose
 
     def _look_for_pose(self, now: float, stamp_ns: int) -> None:
-        """Align in a pose, where none has aligned the sensors yet or somebody has asked for it."""
+        """Align in a pose that is held now, for the first time or when requested."""
         asked = self._asked_until is not None and now <= self._asked_until
         if self._asked_until is not None and not asked:
-            self.counters["poses asked for in vain"] += 1
+            self.counters["requested poses not held"] += 1
             self._asked_until = None
         if self.aligned and not asked:
             return
-        listening = self._listening(stamp_ns)
-        late = len(listening) == len(self.segments) or now > _ALONE_S
-        if not listening or not late:
+        active = self._active(stamp_ns)
+        complete = len(active) == len(self.segments)
+        if not active or not (complete or now > _ALONE_S):
             return
-        streams = [self._stream(sensor, self._recent(sensor, stamp_ns, _POSE_S)) for _, sensor in listening]
+        streams = [self._stream(sensor, self._recent(sensor, stamp_ns, _POSE_S)) for _, sensor in active]
         if any(len(stream.stamps) < 2 for stream in streams):
             return
         seen = self._seen[-1] if self._seen and abs(self._seen[-1].stamp_ns - stamp_ns) < _FRESH_NS else None
         if self._seen and seen is None:
-            return  # the camera knows where the person faces, but not now
+            return  # the heading must come from the camera, which has no recent skeleton
         assert self._epoch_ns is not None
-        lately = [
+        recent = [
             ((each.stamp_ns - self._epoch_ns) / NANOSECONDS, each)
             for each in self._seen
             if stamp_ns - each.stamp_ns < 2.0 * _POSE_S * NANOSECONDS
         ]
-        meant = self._meant[[number for number, _ in listening]]
-        held = self._poses.find(streams, meant, self.parameters.pose, now, lately, asked=asked)
+        intended = self._intended[[number for number, _ in active]]
+        held = self._poses.find(streams, intended, self.parameters.pose, now, recent, asked=asked)
         if held is not None:
-            self._align(held, listening)
+            self._align(held, active)
             self._asked_until = None
 
-    def _align(self, held: HeldPose, listening: Sequence[tuple[int, WornSensor]]) -> None:
-        """The sensors that were there are aligned by a pose; of others nothing changes."""
-        numbers = [number for number, _ in listening]
+    def _align(self, held: HeldPose, active: Sequence[tuple[int, WornSensor]]) -> None:
+        """Align the active sensors by a pose; the others keep their alignment."""
+        numbers = [number for number, _ in active]
         segments = [self.segments[number] for number in numbers]
         measured = np.array([mean_rotation(stream.rotations) for stream in held.streams])
         posed = self._poses.rotations(held.name, segments)
         magnetic = bool(self._magnetic[numbers].all())
         if len(segments) > 1 and (held.facing is None or magnetic):
-            table = likelihood_by_pose(segments, measured, posed, self._meant[numbers], common_heading=magnetic)
-            self._note_pose([sensor for _, sensor in listening], table)
+            table = likelihood_by_pose(segments, measured, posed, self._intended[numbers], common_heading=magnetic)
+            self._note_pose([sensor for _, sensor in active], table)
             found = assign(segments, table)
             if found.exchanged:
-                self._exchange([sensor for _, sensor in listening], found.segments)
+                self._exchange([sensor for _, sensor in active], found.segments)
                 if self.parameters.swap_exchanged:
-                    return  # aligned as what they are the next time
+                    return  # the next pose aligns them under their new segments
         a = self.alignment
         places = [4 * number + 3 for number in numbers]
         own = a.covariance[np.ix_(places, places)]
         headings: FloatArray | None = None
         if held.facing is not None and float(own.diagonal().max()) < _FAR_HEADING**2:
             headings = a.headings[numbers]
-        elif all(sensor.has_field and not sensor.disturbed for _, sensor in listening):
-            # all face the same way, whichever that is
-            variances = [felt.covariance[2, 2] for _, sensor in listening if (felt := sensor.latest) is not None]
+        elif all(sensor.has_field and not sensor.disturbed for _, sensor in active):
+            # all headings agree, at an unknown value
+            variances = [reading.covariance[2, 2] for _, sensor in active if (reading := sensor.latest) is not None]
             headings, own = np.zeros(len(numbers)), UNKNOWN_HEADING + np.diag(variances)
         part = align_in_pose(
             segments,
             measured,
             posed,
             self._poses.covariance(held, segments, self.parameters.pose_stddev),
-            mountings=self._meant[numbers],
+            mountings=self._intended[numbers],
             mounting_stddev=self.parameters.mounting_stddev,
             headings=headings,
             heading_covariance=None if headings is None else own,
@@ -627,91 +622,91 @@ class InertialTracker:
     # --- joints
 
     def _constrain(self, now: float, stamp_ns: int) -> None:
-        """What elbows and ranges of motion tell of alignments and headings (eq. 11 and 12 of ``heading``)."""
-        there = {
+        """Update by elbows and ranges of motion (eq. 11 and 12 of ``heading``)."""
+        rotations = {
             sensor.segment: rotation
-            for _, sensor in self._listening(stamp_ns)
+            for _, sensor in self._active(stamp_ns)
             if self._stddev(sensor) < self.parameters.largest_stddev
             and (rotation := sensor.at(stamp_ns - self._offset_ns(sensor))) is not None
         }
         for side in ("left", "right"):
-            upper, lower = there.get(f"upper_arm_{side}"), there.get(f"forearm_{side}")
+            upper, lower = rotations.get(f"upper_arm_{side}"), rotations.get(f"forearm_{side}")
             if upper is not None and lower is not None:
                 self._tracker.observe_elbow(now, side, upper, lower)
         for parent, child in _joints():
-            if parent in there and child in there:
-                self._tracker.observe_range(now, parent, child, (there[parent], there[child]))
+            if parent in rotations and child in rotations:
+                self._tracker.observe_range(now, parent, child, (rotations[parent], rotations[child]))
 
     def _look_at_movement(self, now: float, stamp_ns: int) -> None:
-        """Once after a pose or a slip, what an elbow's movement tells of how its sensors sit (eq. 5 of ``alignment``).
+        """Align by an elbow's movement, once after a pose or a slip (eq. 5 of ``alignment``).
 
-        Once, because what such a fit has wrong, by the flesh and by the person's own axes, it has wrong each time.
+        Only once: the errors of such a fit, by soft tissue and by the person's own axes, are the same each time.
         """
         if now - self._since < _MOVED_S:
             return
-        there = {sensor.segment: sensor for _, sensor in self._listening(stamp_ns)}
+        worn = {sensor.segment: sensor for _, sensor in self._active(stamp_ns)}
         for side in sorted(self._elbows):
-            upper, lower = there.get(f"upper_arm_{side}"), there.get(f"forearm_{side}")
+            upper, lower = worn.get(f"upper_arm_{side}"), worn.get(f"forearm_{side}")
             if upper is None or lower is None or max(self._stddev(upper), self._stddev(lower)) > _FAR_HEADING:
                 continue
             streams = [self._stream(each, self._recent(each, stamp_ns, _MOVED_S)) for each in (upper, lower)]
             fit = align_by_elbow(self.alignment, side, streams[0], streams[1].thinned(_MOVED_RATE))
-            if fit is None or fit.information < _MOVEMENT_TELLS:
+            if fit is None or fit.information < _LEAST_INFORMATION:
                 continue
             self._tracker.predict(max(now, self._last))
             self._tracker.alignment = fit.alignment
             self._elbows.discard(side)
             self.counters["alignments by an elbow's movement"] += 1
-            return  # the other one the next time: it takes a while
+            return  # a fit takes long: one side per step
 
-    # --- what comes out
+    # --- output
 
     def _stddev(self, sensor: WornSensor) -> float:
-        """Radians, of the worst known axis of a sensor's segment, by alignment and heading."""
+        """Radians, the largest standard deviation of a sensor's alignment and heading."""
         number = self.segments.index(sensor.segment)
         variances = self.alignment.covariance.diagonal()[4 * number : 4 * number + 4]
         return float(np.sqrt(variances.max()))
 
-    def _placed(self, number: int, felt: Felt, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(3, 3) a segment's orientation in world, and its (3, 3) covariance about the axes of world."""
+    def _placed(self, number: int, reading: OrientedReading, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(3, 3) orientation of a segment in world, and its (3, 3) covariance about the axes of world."""
         a = self.alignment
         world = a.oriented(number, rotation)
         own = self._tracker.orientation_covariance(self.segments[number], rotation)
         earth = yaw(a.headings[number])
-        covariance = world @ (own + TISSUE_STDDEV**2 * _EYE3) @ world.T + earth @ felt.covariance @ earth.T
+        covariance = world @ (own + TISSUE_STDDEV**2 * _EYE3) @ world.T + earth @ reading.covariance @ earth.T
         return world, 0.5 * (covariance + covariance.T)
 
-    def _orientation(self, sensor: WornSensor, felt: Felt, stamp_ns: int) -> SegmentOrientation | None:
-        last = self._told_ns.get(sensor.segment)
+    def _orientation(self, sensor: WornSensor, reading: OrientedReading, stamp_ns: int) -> SegmentOrientation | None:
+        last = self._published_ns.get(sensor.segment)
         if (
             last is not None
             and -JUMP_BACK_NS < stamp_ns - last < _AHEAD_OF * NANOSECONDS / self.parameters.orientation_rate
         ):
             return None
         number = self.segments.index(sensor.segment)
-        world, covariance = self._placed(number, felt, felt.rotation)
+        world, covariance = self._placed(number, reading, reading.rotation)
         if float(np.sqrt(covariance.diagonal().max())) > self.parameters.largest_stddev:
             return None
-        self._told_ns[sensor.segment] = stamp_ns
-        rate = self.alignment.rotations[number].T @ felt.rate
+        self._published_ns[sensor.segment] = stamp_ns
+        rate = self.alignment.rotations[number].T @ reading.rate
         return SegmentOrientation(
             stamp_ns,
             f"imu_{sensor.segment}",
             sensor.segment,
             _orthonormal(world),
             covariance,
-            rate if felt.rate_told else None,
+            rate if reading.rate_measured else None,
             rate_variance(rate),
             self._world,
         )
 
     def _skeleton(self, stamp_ns: int) -> Skeleton | None:
-        """The body that fits all orientations, when one is due."""
+        """The body that fits all orientations; None if it is not due."""
         period = NANOSECONDS / self.parameters.rate
         if self._skeleton_ns is not None and stamp_ns - self._skeleton_ns < 0.98 * period:
             return None
         rotations, covariances, segments = [], [], []
-        for number, sensor in self._listening(stamp_ns):
+        for number, sensor in self._active(stamp_ns):
             rotation = sensor.at(stamp_ns - self._offset_ns(sensor))
             if rotation is None or self._stddev(sensor) > np.sqrt(UNKNOWN_HEADING) - 0.01:
                 continue
@@ -727,17 +722,17 @@ class InertialTracker:
 
 
 def rate_variance(rate: FloatArray) -> float:
-    """rad2/s2 per axis, by which the rate (3,) of a segment is off that its sensor tells."""
+    """rad2/s2 per axis: variance of a segment's rate (3,) as measured by its sensor."""
     return float((_RATE_STDDEV + _RATE_SHARE * np.linalg.norm(rate)) ** 2)
 
 
 def _orthonormal(rotation: FloatArray) -> FloatArray:
-    """A product of many rotations, without what rounding has added up to."""
+    """A product of many rotations without its accumulated rounding errors."""
     return so3.quat_to_matrix(so3.matrix_to_quat(rotation))
 
 
 def _joints() -> list[tuple[str, str]]:
-    """Pairs of segments whose joint has a range that both sensors may tell of."""
+    """Pairs of segments whose joint has a range of motion in :data:`JOINTS`."""
     found = []
     for parent, child in JOINTS:
         if child in ("upper_trunk", "head"):

@@ -1,7 +1,7 @@
-"""One inertial sensor that somebody wears: its orientation, its clock by receipt, and what is wrong with it.
+"""One worn inertial sensor: its orientation, its clock by receipt, and its problems.
 
-What a driver or VQF states of the heading's drift grows for ever without a magnetometer. Whoever keeps headings over
-time must not count it twice: such growth is handed over once, apart from the covariance.
+Without a magnetometer the heading variance that a driver or VQF states grows without bound. A filter of headings must
+not count it twice: the growth is handed over once, apart from the covariance.
 """
 
 from __future__ import annotations
@@ -21,67 +21,70 @@ from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.imu_orientation import OUTAGE_S, OrientationEstimator
 
 HISTORY_S: Final = 40.0
-"""Seconds for which readings are kept."""
+"""Seconds of readings in the history."""
 NEAR_NS: Final = NANOSECONDS // 20
-"""How far from a reading its rate tells the orientation."""
+"""Time over which an orientation is extrapolated by its rate."""
 UNKNOWN_HEADING: Final = np.pi**2 / 3.0
 """rad2: any heading."""
 _OTHER_FRAME = 50
-"""Readings of another frame in a row from which on it is the sensor's."""
+"""Readings of another frame in a row after which that frame is accepted."""
 _SPACING_NS = NANOSECONDS // 55
-"""Between readings that are kept: 50 of a second are enough for what they are kept for."""
+"""Least time between readings in the history: 50 per second are enough."""
 _STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2
-"""rad2: of a driver that states no covariance."""
+"""rad2: covariance for a driver that states none."""
 _FIELDS = 100
-"""Readings from which the strength of the undisturbed field is taken."""
+"""Number of readings for the strength of the undisturbed field."""
 _FIELD_S = 0.5
+"""Seconds of the low-pass of the field's strength."""
 _DISTURBED = 0.15
-"""Share of its strength by which a disturbed field is another one, lastingly over half a second."""
+"""Share of its strength by which a low-passed field differs when it is disturbed."""
 _ELSEWHERE_S = 60.0
-"""After so long the field is no disturbed one, but that of another place."""
+"""Seconds after which a different field is taken as that of another place."""
 _TURNED, _TURNED_S = float(np.radians(60.0)) ** 2, 10.0
-"""rad2 by which a disturbed field may turn the heading of a driver that is believed to follow it, and within what."""
+"""rad2 added to the heading of a driver that follows a disturbed field, and the time constant of this in seconds."""
 
 
 class WornSensorError(BodyTrackingError):
-    """A reading that cannot be of this sensor."""
+    """Raised when a reading has another frame than the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Felt:
-    """How a sensor was turned at one instant.
+class OrientedReading:
+    """Orientation and rate of a sensor at one instant.
 
     Attributes:
-        stamp_ns: of its own clock.
+        stamp_ns: in the sensor's clock.
         rotation: (3, 3) sensor to earth (z up, a heading of its own).
-        covariance: (3, 3) rad2 about the earth's axes; of the heading what does not grow for ever.
+        covariance: (3, 3) rad2 about the earth's axes; for the heading, the bounded part.
         rate: (3,) rad/s in the sensor's frame.
-        rate_told: the sensor told it; else it is the difference of two orientations, or nothing.
+        rate_measured: False if the rate is the difference of two orientations, or zero.
     """
 
     stamp_ns: int
     rotation: FloatArray
     covariance: FloatArray
     rate: FloatArray
-    rate_told: bool = True
+    rate_measured: bool = True
 
 
 class WornSensor:
     """Takes the readings of one sensor.
 
-    Readings with an orientation are taken as they are; of others the orientation is estimated, as long as none with one
-    comes beside them.
+    A driver's orientation is used as it is. Raw readings are ignored while oriented ones arrive; otherwise VQF
+    estimates the orientation.
 
     Args:
-        segment: on which it is, as far as known.
+        segment: stated segment of the sensor.
         magnetometer: use the magnetic field.
 
     Attributes:
-        segment: as above; may be corrected.
+        segment: current segment; changes when sensors are found to be exchanged.
         clock: its clock by receipt.
-        growth: rad2 by which the heading has become less sure, until somebody takes it.
+        latest: the last reading; None before the first one.
+        growth: rad2 of heading variance since the caller last reset it to zero.
+        has_field: whether readings have a magnetic field that is used.
         counters: what happened.
-        received_ns: of the last reading; None before a first one.
+        received_ns: receipt of the last reading; None before the first one.
     """
 
     def __init__(self, segment: str, *, magnetometer: bool = True) -> None:
@@ -97,8 +100,8 @@ class WornSensor:
 
     def _begin(self) -> None:
         self._estimator = OrientationEstimator(magnetometer=self._magnetometer)
-        self._kept: deque[Felt] = deque()
-        self.latest: Felt | None = None
+        self._kept: deque[OrientedReading] = deque()
+        self.latest: OrientedReading | None = None
         self.growth = 0.0
         self._level: float | None = None
         self._stated = 0.0
@@ -114,28 +117,28 @@ class WornSensor:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What its readings show to be wrong with them."""
+        """Problems found in the readings."""
         return self._watch.problems
 
     @property
     def disturbed(self) -> bool:
-        """Whether the magnetic field is another one than that to which the heading belongs."""
-        # VQF takes ten seconds and more to be sure of the undisturbed field
+        """Whether the magnetic field differs from the one that the heading refers to."""
+        # VQF takes ten seconds and more to accept an undisturbed field
         by_vqf = self._oriented_ns is None and self._field_known and bool(self._estimator.magnetically_disturbed)
         return by_vqf or self._off_field() > _DISTURBED
 
     def reset(self) -> None:
-        """Forget all readings, because time began anew."""
+        """Forget all readings, after a jump of time."""
         self._begin()
         self._watch = ImuWatch()
         self._frame, self._strange = None, 0
         self.received_ns = None
 
-    def take(self, sample: ImuSample, received_ns: int) -> Felt | None:
-        """The orientation at a reading; None where there is none, or the reading is of no use.
+    def take(self, sample: ImuSample, received_ns: int) -> OrientedReading | None:
+        """The orientation at a reading; None for an unusable reading, and while the estimator starts.
 
         Raises:
-            WornSensorError: of another frame than those before; after many of these it is the sensor's.
+            WornSensorError: another frame than before, until many readings in a row have it.
             ImuOrientationError: neither orientation nor rate and acceleration.
         """
         self._check_frame(sample.frame_id)
@@ -154,41 +157,41 @@ class WornSensor:
             self._begin()
             self.clock.add(sample.stamp_ns, received_ns)
             self.growth = UNKNOWN_HEADING
-        self._look_at_field(sample)
-        felt = self._given(sample) if sample.orientation is not None else self._estimated(sample)
+        self._check_field(sample)
+        reading = self._given(sample) if sample.orientation is not None else self._estimated(sample)
         for problem in self._watch.add(sample):
             self.counters[problem.partition(":")[0]] += 1
-        if felt is None:
+        if reading is None:
             return None
-        self._count_growth(felt)
-        covariance = felt.covariance
+        self._count_growth(reading)
+        covariance = reading.covariance
         if not self.has_field:
             assert self._level is not None
-            # what the heading shares with the tilt shrinks with it
+            # scales the covariances of heading and tilt with it
             scale = np.array([1.0, 1.0, np.sqrt(self._level / max(float(covariance[2, 2]), 1e-12))])
             covariance = covariance * np.outer(scale, scale)
         elif self._turned:
             covariance = covariance + np.diag([0.0, 0.0, self._turned])
-        self.latest = felt = replace(felt, covariance=covariance)
-        if not self._kept or felt.stamp_ns - self._kept[-1].stamp_ns >= _SPACING_NS:
-            self._kept.append(felt)
-            while felt.stamp_ns - self._kept[0].stamp_ns > HISTORY_S * NANOSECONDS:
+        self.latest = reading = replace(reading, covariance=covariance)
+        if not self._kept or reading.stamp_ns - self._kept[-1].stamp_ns >= _SPACING_NS:
+            self._kept.append(reading)
+            while reading.stamp_ns - self._kept[0].stamp_ns > HISTORY_S * NANOSECONDS:
                 self._kept.popleft()
-        return felt
+        return reading
 
-    def history(self, since_ns: int) -> list[Felt]:
-        """What was kept from a stamp of the sensor's clock on, 50 a second."""
-        return [felt for felt in self._kept if felt.stamp_ns >= since_ns]
+    def history(self, since_ns: int) -> list[OrientedReading]:
+        """Readings since a stamp of the sensor's clock, about 50 per second."""
+        return [reading for reading in self._kept if reading.stamp_ns >= since_ns]
 
     def at(self, stamp_ns: int) -> FloatArray | None:
-        """(3, 3) sensor to earth at a stamp of its clock, by the nearest reading and its rate; None far from any."""
+        """(3, 3) sensor to earth at a stamp of its clock, extrapolated from the nearest reading; None far from any."""
         nearest = self.latest
         if nearest is None:
             return None
-        for felt in reversed(self._kept):
-            if abs(felt.stamp_ns - stamp_ns) < abs(nearest.stamp_ns - stamp_ns):
-                nearest = felt
-            if felt.stamp_ns < stamp_ns:
+        for reading in reversed(self._kept):
+            if abs(reading.stamp_ns - stamp_ns) < abs(nearest.stamp_ns - stamp_ns):
+                nearest = reading
+            if reading.stamp_ns < stamp_ns:
                 break
         elapsed_ns = stamp_ns - nearest.stamp_ns
         if abs(elapsed_ns) > NEAR_NS:
@@ -213,17 +216,17 @@ class WornSensor:
         self._frame, self._strange = frame, 0
 
     def _receive(self, sample: ImuSample, received_ns: int) -> None:
-        """Look at the clock, and for how long nothing came."""
+        """Update the clock, and count outages."""
         if not self.clock.add(sample.stamp_ns, received_ns):
             self.counters["clock set"] += 1
             self._kept.clear()
         if self.received_ns is not None and received_ns - self.received_ns > OUTAGE_S * NANOSECONDS:
             self.counters["outages"] += 1
             if sample.orientation is not None and not self.has_field:
-                self.growth += UNKNOWN_HEADING  # a driver that begins anew has another heading
+                self.growth += UNKNOWN_HEADING  # a restarted driver has another heading
         self.received_ns = received_ns
 
-    def _given(self, sample: ImuSample) -> Felt:
+    def _given(self, sample: ImuSample) -> OrientedReading:
         assert sample.orientation is not None
         self._oriented_ns = sample.stamp_ns
         covariance = _STATED if sample.orientation_covariance is None else sample.orientation_covariance
@@ -235,20 +238,22 @@ class WornSensor:
                 elapsed = (sample.stamp_ns - self.latest.stamp_ns) / NANOSECONDS
                 if elapsed < OUTAGE_S:
                     rate = rotation_vectors(self.latest.rotation.T @ rotation) / elapsed
-        return Felt(sample.stamp_ns, rotation, covariance, rate, sample.angular_velocity is not None)
+        return OrientedReading(sample.stamp_ns, rotation, covariance, rate, sample.angular_velocity is not None)
 
-    def _estimated(self, sample: ImuSample) -> Felt | None:
+    def _estimated(self, sample: ImuSample) -> OrientedReading | None:
         if self._off_field() > _DISTURBED:
-            # VQF, as long as it knows no undisturbed field, would take this one for it
+            # before it knows the undisturbed field, VQF would take this one as such
             sample = replace(sample, magnetic_field=None)
         found = self._estimator.update(sample)
         if found is None:
             return None
         self._field_known |= self._estimator.magnetically_disturbed is False
-        return Felt(found.stamp_ns, so3.quat_to_matrix(found.orientation), found.covariance, found.angular_velocity)
+        return OrientedReading(
+            found.stamp_ns, so3.quat_to_matrix(found.orientation), found.covariance, found.angular_velocity
+        )
 
-    def _count_growth(self, felt: Felt) -> None:
-        stated = float(felt.covariance[2, 2])
+    def _count_growth(self, reading: OrientedReading) -> None:
+        stated = float(reading.covariance[2, 2])
         if self._level is None:
             self._level = self._stated = stated
         self._level = min(self._level, stated)
@@ -256,8 +261,8 @@ class WornSensor:
             self.growth += max(0.0, stated - self._stated)
         self._stated = stated
 
-    def _look_at_field(self, sample: ImuSample) -> None:
-        """Whether the field is as strong as it was at first, and what a driver's heading may make of another one."""
+    def _check_field(self, sample: ImuSample) -> None:
+        """Compare the field's strength with that at the start; inflate a driver's heading in a disturbed field."""
         field = sample.magnetic_field
         if field is None or not self._magnetometer:
             return
@@ -278,7 +283,7 @@ class WornSensor:
         else:
             self._off_s = 0.0
         if sample.orientation is None:
-            return  # VQF's covariance has it
+            return  # VQF's covariance includes it
         towards = _TURNED if self._off_field() > _DISTURBED else 0.0
         self._turned += (1.0 - float(np.exp(-elapsed / _TURNED_S))) * (towards - self._turned)
 

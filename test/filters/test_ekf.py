@@ -1,4 +1,4 @@
-"""The extended filter follows people it was never told of, knows how well, and survives what sensors do."""
+"""The extended filter follows unknown people with consistent covariances, and survives bad input."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ SETTLED = 1.0
 """Seconds after which the filter knows noise, pose and velocities."""
 
 
-def somebody(seed: int, seconds: float, rate: float = 30.0, tempo: float | None = None) -> Truth:
+def random_truth(seed: int, seconds: float, rate: float = 30.0, tempo: float | None = None) -> Truth:
     rng = np.random.default_rng(seed)
     person = RandomPerson.draw(rng)
     return truth_of(person, RandomMotion(rng, seconds, tempo), capture_times(seconds, rng, rate))
@@ -114,7 +114,7 @@ def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFi
 
 @pytest.mark.parametrize("noise", [0.005, 0.02, 0.05])
 def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -> None:
-    truth = somebody(1, 3.0)
+    truth = random_truth(1, 3.0)
     observation = measured(truth, noise)
     estimator = ExtendedKalmanFilter()
     outputs = run(estimator, observation.skeletons)
@@ -143,7 +143,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     considered, ignored = [], []
     count = draws(8, 60)
     for seed in range(count):
-        truth = somebody(100 + seed, 1.0, rate=15.0)
+        truth = random_truth(100 + seed, 1.0, rate=15.0)
         offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
         frames = [
             replace(frame, positions=frame.positions + offsets, covariances=stated)
@@ -168,7 +168,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
 def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
     """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
     rng = np.random.default_rng(3)
-    truth = somebody(3, 3.0)
+    truth = random_truth(3, 3.0)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
     offsets = {name: 0.04 * rng.normal(size=(N_JOINTS, 3)) for name in "abcd"}
     estimator = ExtendedKalmanFilter()
@@ -188,7 +188,7 @@ def test_its_uncertainty_is_true() -> None:
     for_angles, for_points, for_lengths = [], [], []
     distance, dimension, frames = 0.0, 0, 0
     for seed in range(draws(2, 10)):
-        truth = somebody(20 + seed, 6.0)
+        truth = random_truth(20 + seed, 6.0)
         observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
         estimator = ExtendedKalmanFilter()
         for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
@@ -214,7 +214,7 @@ def test_its_uncertainty_is_true() -> None:
 
 
 def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
-    truth = somebody(2, 8.0)
+    truth = random_truth(2, 8.0)
     estimator = ExtendedKalmanFilter(EkfParameters(settle_time=4.0))
     found = []
     for skeleton in measured(truth).skeletons:
@@ -235,7 +235,7 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
 
 def test_lengths_come_from_many_poses_once_there_are_some() -> None:
     """After some seconds the lengths change once a second at most, and the rest of the state follows them."""
-    truth = somebody(14, 10.0)
+    truth = random_truth(14, 10.0)
     observation = measured(truth)
     estimator = ExtendedKalmanFilter()
     both = np.append(OBSERVED, np.arange(MODEL.nv, MODEL.nv + len(MODEL.length_names)))
@@ -258,7 +258,7 @@ def test_lengths_come_from_many_poses_once_there_are_some() -> None:
 
 
 def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
-    truth = somebody(16, 12.0)
+    truth = random_truth(16, 12.0)
     skeletons = list(measured(truth).skeletons)
     # as a Kinect does with a person seen from behind: left and right change places for some seconds
     turned = [
@@ -272,7 +272,7 @@ def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
 
 
 def test_another_person_of_another_size_is_learnt_anew() -> None:
-    truth = somebody(18, 16.0)
+    truth = random_truth(18, 16.0)
     skeletons = [
         replace(each, positions=0.65 * each.positions) if time > 8.0 else each
         for each, time in zip(measured(truth).skeletons, truth.times, strict=True)
@@ -294,7 +294,7 @@ def test_it_depends_neither_on_the_origin_of_world_nor_on_the_side(
     signs: list[float], order: IntArray, origin: FloatArray
 ) -> None:
     here, there = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for skeleton in measured(somebody(3, 3.0), outliers=0.02).skeletons:
+    for skeleton in measured(random_truth(3, 3.0), outliers=0.02).skeletons:
         one = here.update(skeleton)
         moved = skeleton.positions[order] * signs + origin
         other = there.update(replace(skeleton, positions=moved, states=skeleton.states[order]))
@@ -419,16 +419,16 @@ def test_late_frames_count_in_what_is_predicted_and_in_the_next_frame() -> None:
         before.take(skeleton, sensor)
     for skeleton, sensor in others + frames[in_time:]:
         late.take(skeleton, sensor)
-    expected, told = before.predict(last.stamp_ns), late.predict(last.stamp_ns)
-    assert expected is not None and told is not None
-    assert_same(expected[1], told[1], 1e-12)
+    expected, predicted = before.predict(last.stamp_ns), late.predict(last.stamp_ns)
+    assert expected is not None and predicted is not None
+    assert_same(expected[1], predicted[1], 1e-12)
     for estimator in (before, late):
         assert estimator.take(last, its_sensor)
     assert_same(known(before), known(late), 1e-12)
 
 
 def test_what_is_too_late_is_dropped_and_counted() -> None:
-    skeletons = measured(somebody(7, 2.0)).skeletons
+    skeletons = measured(random_truth(7, 2.0)).skeletons
     held, others = skeletons[40], [*skeletons[:40], *skeletons[41:50]]
     estimator = ExtendedKalmanFilter()
     feed(estimator, others)
@@ -442,7 +442,7 @@ def test_what_is_too_late_is_dropped_and_counted() -> None:
 @pytest.mark.parametrize("after", [*range(4, 12), 18])
 def test_an_older_frame_that_is_repeated_counts_once(repeated: int, after: int) -> None:
     """Also that by which the filter was started."""
-    skeletons = measured(somebody(8, 0.6)).skeletons
+    skeletons = measured(random_truth(8, 0.6)).skeletons
     once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     feed(once, skeletons)
     feed(twice, skeletons[:after])
@@ -454,7 +454,7 @@ def test_an_older_frame_that_is_repeated_counts_once(repeated: int, after: int) 
 
 
 def test_a_start_in_another_order_is_the_same_start() -> None:
-    skeletons = measured(somebody(8, 1.0)).skeletons
+    skeletons = measured(random_truth(8, 1.0)).skeletons
     in_order, shuffled = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     feed(in_order, skeletons)
     feed(shuffled, [skeletons[k] for k in (1, 0, 3, 2)] + list(skeletons[4:]))
@@ -462,7 +462,7 @@ def test_a_start_in_another_order_is_the_same_start() -> None:
 
 
 def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
-    truth = somebody(10, 9.0)
+    truth = random_truth(10, 9.0)
     observation = measured(truth, gaps=((3.0, 7.0),))
     estimator = ExtendedKalmanFilter()
     outputs: list[Skeleton | None] = [None] * len(truth.times)
@@ -482,7 +482,7 @@ def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
 
 
 def test_a_prediction_grows_uncertain_ends_and_changes_nothing() -> None:
-    skeletons = measured(somebody(14, 2.0)).skeletons
+    skeletons = measured(random_truth(14, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
     assert estimator.predict(START_NS) is None
     outputs = run(estimator, skeletons)
@@ -504,7 +504,7 @@ def test_a_prediction_grows_uncertain_ends_and_changes_nothing() -> None:
 
 
 def test_a_prediction_continues_the_movement() -> None:
-    """Of somebody who moves evenly: better than to stay where he was."""
+    """Of a person in smooth motion: better than the last pose."""
     rng = np.random.default_rng(15)
     lengths = RandomPerson.draw(rng).lengths
     rate = np.zeros(MODEL.nv)
@@ -523,7 +523,7 @@ def test_a_prediction_continues_the_movement() -> None:
 
 @pytest.mark.parametrize("missing", [ARMS["LEFT"], EVERYTHING], ids=["an arm", "everybody"])
 def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...]) -> None:
-    truth = somebody(16, 4.0, tempo=0.6)
+    truth = random_truth(16, 4.0, tempo=0.6)
     lost = np.isin(POINTS, missing)
     during = (truth.times >= 2.0) & (truth.times < 2.5)
     estimator = ExtendedKalmanFilter()
@@ -550,7 +550,7 @@ def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...])
 
 @pytest.mark.parametrize("seed", range(draws(3, 12)))
 def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) -> None:
-    truth = somebody(50 + seed, 1.5)
+    truth = random_truth(50 + seed, 1.5)
     rng = np.random.default_rng(seed)
     wrong = np.zeros(MODEL.nv)
     wrong[6:] = np.radians(rng.uniform(-60.0, 60.0, MODEL.nv - 6))
@@ -566,7 +566,7 @@ def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[i
     found: list[tuple[int, Truth, str]] = []
     seed = 0
     while len(found) < count:
-        truth = somebody(seed, seconds)
+        truth = random_truth(seed, seconds)
         then = int(np.searchsorted(truth.times, bent_at))
         angles = MODEL.difference(MODEL.neutral(), truth.q[then])
         found += [
@@ -578,7 +578,7 @@ def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[i
 
 @pytest.mark.parametrize(("begin", "noise"), [(0.0, 0.006), (0.0, 0.013), (0.0, 0.025), (0.7, 0.006), (0.7, 0.02)])
 def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
-    """From the start, or later, as if a movement that nobody saw had ended in the wrong pose: after 1.5 s at most."""
+    """From the start, or later, as if an unseen movement had ended in the wrong pose: after 1.5 s at most."""
     seconds, end = (1.2, 0.5) if begin == 0.0 else (2.5, 2.2)
     for seed, truth, side in bent_hands(draws(2, 6 if begin else 10), seconds, begin):
         estimator, turned = ExtendedKalmanFilter(), begin == 0.0
@@ -601,7 +601,7 @@ def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
     """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
     for seed in range(320, 320 + draws(2, 12)):
-        truth = somebody(seed, 2.4, tempo=1.6)
+        truth = random_truth(seed, 2.4, tempo=1.6)
         for arm in ARMS.values():
             estimator = ExtendedKalmanFilter()
             outputs = run(estimator, measured(truth, 0.008, dropouts=(Dropout(1.0, 2.0, arm),)).skeletons)
@@ -613,7 +613,7 @@ def test_outliers_hardly_matter() -> None:
     clean: list[float] = []
     bad: list[float] = []
     for seed in range(draws(1, 2)):
-        truth = somebody(60 + seed, 5.0)
+        truth = random_truth(60 + seed, 5.0)
         for errors, share in ((clean, 0.0), (bad, 0.05)):
             estimator = ExtendedKalmanFilter()
             outputs = run(estimator, measured(truth, seed=seed, outliers=share).skeletons)
@@ -644,7 +644,7 @@ def damaged(skeleton: Skeleton, field: str, value: float, rng: np.random.Generat
 )
 def test_damaged_numbers_do_no_harm(field: str, value: float) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
-    truth = somebody(70, 1.8)
+    truth = random_truth(70, 1.8)
     rng = np.random.default_rng(1)
     skeletons = list(measured(truth).skeletons)
     for k in range(0, len(skeletons), 3):
@@ -660,7 +660,7 @@ def test_damaged_numbers_do_no_harm(field: str, value: float) -> None:
 
 
 def test_without_a_trunk_there_is_no_start() -> None:
-    truth = somebody(71, 1.5)
+    truth = random_truth(71, 1.5)
     trunk = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
     estimator = ExtendedKalmanFilter()
     outputs = run(estimator, measured(truth, dropouts=(Dropout(0.0, 0.7, trunk),)).skeletons)
@@ -699,12 +699,12 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
         if not estimator.take(skeleton):
             continue
         estimate = known(estimator)
-        told = angles_of(estimate, MODEL, "model")
-        columns = [told.names.index(name) for name in UNOBSERVED]
-        angles.append(told.position[columns])
+        joint_angles = angles_of(estimate, MODEL, "model")
+        columns = [joint_angles.names.index(name) for name in UNOBSERVED]
+        angles.append(joint_angles.position[columns])
         learnt.append(estimate.lengths)
-        assert (told.position_stddev[columns] > 0.95 * least).all()
-        assert (told.position_stddev[columns] < most).all()
+        assert (joint_angles.position_stddev[columns] > 0.95 * least).all()
+        assert (joint_angles.position_stddev[columns] < most).all()
     # averages over a second: the noise of one frame is no drift
     averages = np.stack(angles)[: len(angles) // 30 * 30].reshape(-1, 30, len(UNOBSERVED)).mean(axis=1)
     assert np.degrees(np.abs(averages - averages[0]).max()) < 10.0
@@ -718,9 +718,9 @@ def posture_stddev(q: FloatArray, lengths: FloatArray) -> tuple[FloatArray, Floa
     First where it counts twice and all points are known exactly, then by the prior alone.
     """
     prior, lines = PosturePrior(MODEL, Ranges(MODEL)), MODEL.linearise(q, lengths)
-    tells = np.append(prior.postural, [True] * 3)
+    used = np.append(prior.postural, [True] * 3)
     stddev = np.concatenate([prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], prior.tilt_stddev])
-    rows = prior.rows(q, lines).gradients[tells] / stddev[tells, None]
+    rows = prior.rows(q, lines).gradients[used] / stddev[used, None]
     _, singular, axes = np.linalg.svd(lines.jacobian.reshape(-1, MODEL.nv), full_matrices=False)
     free = axes[singular < 1e-6 * singular[0]].T
     assert free.shape[1] == 2
@@ -730,7 +730,7 @@ def posture_stddev(q: FloatArray, lengths: FloatArray) -> tuple[FloatArray, Floa
 
 
 def test_a_covariance_that_is_none_any_more_starts_the_pose_anew() -> None:
-    skeletons = measured(somebody(8, 2.0)).skeletons
+    skeletons = measured(random_truth(8, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
     feed(estimator, skeletons[:20])
     assert estimator._state is not None

@@ -45,7 +45,7 @@ def test_every_filter_is_made_with_the_parameters_of_its_own_prefix() -> None:
     assert settings["schlagenhauf_ekf"]["calibration_frames"] == 7
 
 
-def test_who_models_the_body_says_so() -> None:
+def test_only_the_ekf_is_a_model_filter() -> None:
     assert [name for name in FILTERS if isinstance(make_filter(name), ModelFilter)] == ["ekf"]
 
 
@@ -138,7 +138,7 @@ def test_it_starts_anew_as_a_fresh_one(name: str, cause: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_what_is_repeated_or_late_counts_once_and_what_was_handed_out_stays(name: str) -> None:
+def test_repeated_and_late_frames_are_ignored_and_outputs_do_not_change(name: str) -> None:
     once, twice = fed(name), fed(name)
     handed_out = []
     for each in FRAMES:
@@ -156,7 +156,7 @@ def test_what_is_repeated_or_late_counts_once_and_what_was_handed_out_stays(name
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_a_person_who_is_nowhere_is_never_found(name: str) -> None:
+def test_frames_without_a_joint_give_no_output(name: str) -> None:
     tested, nowhere = fed(name), np.full((N_JOINTS, 3), np.nan)
     for each in FRAMES[:30]:
         assert tested.update(replace(each, positions=nowhere, states=np.zeros_like(TRACKED))) is None
@@ -171,7 +171,7 @@ def test_predictions_follow_a_silence_with_the_stamps_of_frames_that_did_not_com
     stamp, now = 5_000_000_000, 7_000_000_000
     prediction.arrived(stamp, now)
     assert prediction.due(now + 99_999_999) is None
-    # Whoever asks late gets all that was due, as if he had asked in time.
+    # a late caller gets the same stamps as one in time
     asked = now + 200_000_000
     found = []
     while (due := prediction.due(asked)) is not None:

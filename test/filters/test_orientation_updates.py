@@ -1,4 +1,4 @@
-"""Orientations of segments in the extended filter: what they tell, what their sources err by, and how sure it is."""
+"""Orientations of segments in the extended filter: their information, the errors of their sources, and covariances."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Person:
         return result
 
 
-def somebody(
+def worn_person(
     seed: int, seconds: float, noise: float = 0.015, without: Sequence[Joint] = (), tempo: float = 1.0
 ) -> Person:
     rng = np.random.default_rng([seed, 5])
@@ -84,10 +84,9 @@ def somebody(
 
 @dataclass(frozen=True)
 class Source:
-    """How a sensor errs: misalignment, heading, deviation and time of what persists; a slip at some time.
+    """Errors of a sensor: misalignment, heading, deviation and time of persistent errors; a slip at some time.
 
-    Where ``spin`` is given, it tells angular velocities that err by so many rad/s, about the axes that it takes for its
-    segment's.
+    With ``spin``, it reports angular velocities with errors of so many rad/s, about its misaligned axes.
     """
 
     segment: str
@@ -118,12 +117,12 @@ class Source:
         measured = turned @ so3.quat_to_matrix(so3.exp(self.slow * slow))
         measured = measured @ rotations[:, SEGMENT_NUMBER[self.segment]] @ mounting
         stamps = START_NS + np.round(times * NANOSECONDS).astype(np.int64)
-        told = [
+        drawn = [
             SegmentOrientation(int(stamp), f"imu_{self.segment}", self.segment, each, self.stated**2 * np.eye(3))
             for stamp, each in zip(stamps, measured, strict=True)
         ]
         if self.spin is None:
-            return told
+            return drawn
         step = 1e-4
         after = MODEL.forward(person.motion.configuration(times + step), person.body.lengths).rotations
         turned = rotations[:, SEGMENT_NUMBER[self.segment]].swapaxes(-1, -2) @ after[:, SEGMENT_NUMBER[self.segment]]
@@ -131,7 +130,7 @@ class Source:
         rates += self.spin * rng.normal(size=rates.shape)
         return [
             replace(each, angular_velocity=rate, angular_velocity_variance=self.spin**2)
-            for each, rate in zip(told, rates, strict=True)
+            for each, rate in zip(drawn, rates, strict=True)
         ]
 
 
@@ -159,8 +158,8 @@ def followed(
     """Errors (n, 32) and covariances (n, 32, 32) at the frames after so many seconds."""
     errors, covariances = [], []
     for each in events:
-        told = give(estimator, each)
-        if told and isinstance(each, Skeleton) and each.stamp_ns > START_NS + after * NANOSECONDS:
+        taken = give(estimator, each)
+        if taken and isinstance(each, Skeleton) and each.stamp_ns > START_NS + after * NANOSECONDS:
             estimate = known(estimator)
             errors.append(MODEL.difference(estimate.q, person.at(estimate.stamp_ns)))
             covariances.append(estimate.covariance[: MODEL.nv, : MODEL.nv])
@@ -284,7 +283,7 @@ def test_what_a_source_states_of_itself_is_what_is_known_of_it_at_first_and_late
 
 
 def test_the_forearms_rotation_is_found_where_points_cannot_tell() -> None:
-    person = somebody(1, 4.0, 0.001, HANDS)
+    person = worn_person(1, 4.0, 0.001, HANDS)
     sources = [Source(segment, stated=1e-3) for segment in FOREARMS]
     blind, seeing = ExtendedKalmanFilter(PERFECT), ExtendedKalmanFilter(PERFECT)
     by_points, _ = followed(blind, person.skeletons, person)
@@ -296,7 +295,7 @@ def test_the_forearms_rotation_is_found_where_points_cannot_tell() -> None:
 
 
 def test_a_misalignment_is_found_over_movement_and_its_covariance_covers_it() -> None:
-    person = somebody(2, 9.0, 0.01)
+    person = worn_person(2, 9.0, 0.01)
     source = Source("upper_arm_left", (0.15, -0.15, 0.15), 0.1)  # 15 degrees
     p = EkfParameters(misalignment_stddev=0.14, heading_stddev=0.17)
     estimator = ExtendedKalmanFilter(p)
@@ -309,8 +308,8 @@ def test_a_misalignment_is_found_over_movement_and_its_covariance_covers_it() ->
 
 
 def test_what_nothing_tells_keeps_its_deviation() -> None:
-    """Without hands, a forearm's misalignment about its own axis cannot be told from its rotation."""
-    person = somebody(3, 6.0, 0.01, HANDS)
+    """Without hands, a forearm's misalignment about its own axis cannot be distinguished from its rotation."""
+    person = worn_person(3, 6.0, 0.01, HANDS)
     source = Source("forearm_left", (0.1, 0.05, 0.2))
     p = EkfParameters(misalignment_stddev=0.14)
     estimator = ExtendedKalmanFilter(p)
@@ -323,7 +322,7 @@ def test_what_nothing_tells_keeps_its_deviation() -> None:
 
 def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None:
     """Else the next orientation would find the segment turned, and correct the source by a part of it, each time."""
-    person = somebody(13, 2.0, 0.01, HANDS)
+    person = worn_person(13, 2.0, 0.01, HANDS)
     estimator = ExtendedKalmanFilter()
     feed(estimator, in_order(person.skeletons, Source("forearm_left", stated=0.01).measure(person)))
     held = estimator._state
@@ -345,7 +344,7 @@ ALL_BUT_HANDS = ("pelvis", "upper_trunk", "head", "upper_arm_left", "forearm_lef
 
 
 def still(posture: dict[str, float], seconds: float, until: dict[str, float] | None = None) -> list[SegmentOrientation]:
-    """What seven sources that do not err, and do not know it, say of somebody who does not move; until when each."""
+    """What seven sources that do not err, and do not know it, report of a person who does not move; until when each."""
     step = np.zeros(MODEL.nv)
     step[[NAMES.index(name) for name in posture]] = np.radians(list(posture.values()))
     rotations = MODEL.forward(MODEL.integrate(MODEL.neutral(), step), MODEL.default_lengths()).rotations
@@ -364,7 +363,7 @@ def still(posture: dict[str, float], seconds: float, until: dict[str, float] | N
 
 
 def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
-    """The middle of a range is told again and again, wrong by the same each time: as if seldom (before: 13 degrees)."""
+    """The prior at the middle of a range has the same error each time, and is applied rarely (before: 13 degrees)."""
     posture = {"lumbar_flexion": 30.0, "thoracic_flexion": 15.0, "lumbar_axial": 12.0, "clavicle_elevation_left": 20.0}
     estimator = ExtendedKalmanFilter()
     events = still(posture, 12.0)
@@ -388,7 +387,7 @@ def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:
 
 @pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, 0.35)])
 def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, float]) -> None:
-    person = somebody(4, 7.0, 0.01)
+    person = worn_person(4, 7.0, 0.01)
     source = Source("upper_arm_right", slip=(3.5, turn))
     estimator = ExtendedKalmanFilter()
     errors, covariances = followed(estimator, in_order(person.skeletons, source.measure(person)), person, 3.5)
@@ -429,14 +428,14 @@ def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turn
 
 
 def turned_away(person: Person, begin: float, end: float) -> list[Skeleton]:
-    """Frames that have left and right exchanged for some time, as of somebody who has turned the back to a camera."""
+    """Frames that have left and right swapped for some time, as of a person who turned the back to a camera."""
     return [
         each.mirrored() if begin < (each.stamp_ns - START_NS) / NANOSECONDS < end else each for each in person.skeletons
     ]
 
 
 def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -> None:
-    person = somebody(3, 5.5)
+    person = worn_person(3, 5.5)
     worn = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05)
     estimator = ExtendedKalmanFilter()
     errors, covariances = followed(estimator, in_order(turned_away(person, 2.5, 5.0), worn.measure(person)), person)
@@ -446,7 +445,7 @@ def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -
     assert rms(errors[:, 3:6]) < 1.5 * rms(unturned[:, 3:6])
     assert np.linalg.eigvalsh(covariances[-1])[0] > 0.0
 
-    # one that knows nothing but the camera cannot tell
+    # with the camera alone the swap is not detected
     alone = ExtendedKalmanFilter()
     errors, _ = followed(alone, turned_away(person, 2.5, 5.0), person)
     assert alone.counters["sides_swapped"] == 0
@@ -463,7 +462,7 @@ def test_filter_that_began_turned_round_recovers_in_most_cases() -> None:
     count = draws(2, 200)
     turned = 0
     for seed in range(count):
-        person = somebody(seed, 8.0)
+        person = worn_person(seed, 8.0)
         worn = [Source(f"forearm_{side}", (0.02, 0.0, 0.02)) for side in ("left", "right")]
         events = in_order(turned_away(person, -1.0, 1.0), *(each.measure(person) for each in worn))
         errors, _ = followed(ExtendedKalmanFilter(), events, person, 7.9)
@@ -473,7 +472,7 @@ def test_filter_that_began_turned_round_recovers_in_most_cases() -> None:
 
 def test_a_doubt_about_the_sides_fades_with_time_and_not_with_frames() -> None:
     """Or it would be forgotten the sooner the more cameras there are."""
-    estimator, person = ExtendedKalmanFilter(), somebody(3, 1.0)
+    estimator, person = ExtendedKalmanFilter(), worn_person(3, 1.0)
     followed(estimator, person.skeletons, person)
     state = estimator._state
     assert state is not None
@@ -491,10 +490,15 @@ def arm_bent_to_the_wrong_side(seconds: float) -> list[Skeleton]:
     positions = np.full((25, 3), np.nan)
     positions[MODEL.joints] = MODEL.forward(seen, MODEL.default_lengths()).positions
     rng, tracked = np.random.default_rng(14), np.full(25, 2, np.uint8)
-    told = np.tile(0.04**2 * np.eye(3), (25, 1, 1))  # as one that states how much it errs
+    covariances = np.tile(0.04**2 * np.eye(3), (25, 1, 1))  # as by a sensor that states its errors
     return [
         Skeleton(
-            START_NS + k * NANOSECONDS // 30, "world", positions + 0.003 * rng.normal(size=(25, 3)), tracked, 0, told
+            START_NS + k * NANOSECONDS // 30,
+            "world",
+            positions + 0.003 * rng.normal(size=(25, 3)),
+            tracked,
+            0,
+            covariances,
         )
         for k in range(round(30 * seconds))
     ]
@@ -530,7 +534,7 @@ def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera
 
 
 def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
-    person = somebody(15, 1.0, 0.01)
+    person = worn_person(15, 1.0, 0.01)
     far = Source("forearm_left", misalignment=(1.2, 0.0, 0.0)).measure(person)
     estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=50.0))
     soon = START_NS + round(0.8 * EkfParameters().slip_after * NANOSECONDS)
@@ -548,7 +552,7 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | N
     p, normalised = EkfParameters(), []
     for seed in range(draws(1, 3)):
         rng = np.random.default_rng([seed, 8])
-        person = somebody(30 + seed, 5.0)
+        person = worn_person(30 + seed, 5.0)
         sources = [
             Source(
                 segment,
@@ -571,7 +575,7 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | N
 
 
 def test_angular_velocities_correct_velocities_and_nothing_else() -> None:
-    person = somebody(15, 2.0)
+    person = worn_person(15, 2.0)
     orientations = Source("forearm_left", (0.05, 0.0, 0.1), spin=0.05).measure(person)
     estimator = ExtendedKalmanFilter(EkfParameters(rate_factor=0.0))
     feed(estimator, in_order(person.skeletons, orientations))
@@ -598,7 +602,7 @@ def test_how_quickly_joints_turn_is_known_better_by_rates() -> None:
     observed = [NAMES.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left")]
     errors = np.empty((draws(2, 6), 2))
     for number in range(len(errors)):
-        person = somebody(16 + number, 2.5, tempo=3.0)
+        person = worn_person(16 + number, 2.5, tempo=3.0)
         for place, spin in enumerate((None, 0.05)):
             sources = [Source(segment, spin=spin, rate=30.0) for segment in ("forearm_left", "upper_arm_left")]
             estimator, off = ExtendedKalmanFilter(), []
@@ -614,16 +618,16 @@ def test_how_quickly_joints_turn_is_known_better_by_rates() -> None:
 
 
 def test_a_rate_that_cannot_be_is_left_out_and_counted() -> None:
-    person = somebody(17, 2.0)
+    person = worn_person(17, 2.0)
     orientations = Source("forearm_left", spin=0.05).measure(person)
     wild = [
         replace(each, angular_velocity=np.array([50.0, -40.0, 30.0])) if k % 7 == 5 else each
         for k, each in enumerate(orientations)
     ]
     estimates = []
-    for told in (orientations, wild):
+    for fed in (orientations, wild):
         estimator = ExtendedKalmanFilter()
-        errors, _ = followed(estimator, in_order(person.skeletons, told), person, 1.0)
+        errors, _ = followed(estimator, in_order(person.skeletons, fed), person, 1.0)
         estimates.append(rms(errors))
     assert estimator.counters["rates_rejected"] > 5
     assert estimates[1] < 1.1 * estimates[0]
@@ -633,7 +637,7 @@ def test_a_rate_that_cannot_be_is_left_out_and_counted() -> None:
 
 
 def two_sources() -> list[Skeleton | SegmentOrientation]:
-    person = somebody(5, 1.6)
+    person = worn_person(5, 1.6)
     sources = [Source(segment, (0.05, 0.0, 0.1), 0.1, 0.05) for segment in ("forearm_left", "head")]
     return in_order(person.skeletons, *(source.measure(person) for source in sources))
 
@@ -678,7 +682,7 @@ def test_orientations_that_are_taken_before_a_frame_needs_them_make_no_differenc
 
 
 def test_orientations_of_one_stamp_count_alike_in_any_order() -> None:
-    person = somebody(6, 1.5)
+    person = worn_person(6, 1.5)
     results = []
     for order in (1, -1):
         estimator = ExtendedKalmanFilter()
@@ -699,8 +703,8 @@ def test_orientations_of_one_stamp_count_alike_in_any_order() -> None:
     assert_allclose(results[0].covariance, results[1].covariance, rtol=0.0, atol=1e-9)
 
 
-def test_what_comes_in_vain_is_counted() -> None:
-    person = somebody(7, 2.5)
+def test_ignored_orientations_are_counted() -> None:
+    person = worn_person(7, 2.5)
     events = in_order(person.skeletons, Source("forearm_left").measure(person))
     estimator = ExtendedKalmanFilter()
     feed(estimator, events)
@@ -719,7 +723,7 @@ def test_what_comes_in_vain_is_counted() -> None:
 
 
 def test_a_fast_source_counts_no_more_often_than_it_may() -> None:
-    person = somebody(8, 1.6)
+    person = worn_person(8, 1.6)
     estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=20.0))
     feed(estimator, in_order(person.skeletons, Source("head", rate=400.0).measure(person)))
     assert estimator.counters["orientations"] > 550
@@ -728,7 +732,7 @@ def test_a_fast_source_counts_no_more_often_than_it_may() -> None:
 
 @pytest.mark.parametrize(("name", "silent"), [("imu_forearm_left", 1.0), ("imu_head", 0.0)], ids=["another", "moved"])
 def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgotten(name: str, silent: float) -> None:
-    person = somebody(9, 3.4)
+    person = worn_person(9, 3.4)
     turn = START_NS + NANOSECONDS
     early = [each for each in Source("head").measure(person) if each.stamp_ns < turn]
     late = [
@@ -750,7 +754,7 @@ def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgott
 
 def test_a_pose_is_found_from_orientations() -> None:
     """But for how it is drawn to the middle of its ranges, and upright."""
-    person = somebody(10, 1.0)
+    person = worn_person(10, 1.0)
     posture = MODEL.forward(person.truth.q[0], person.body.lengths)
     measured = [
         SegmentOrientation(0, name, name, rotation, 1e-4 * np.eye(3))
@@ -764,7 +768,7 @@ def test_a_pose_is_found_from_orientations() -> None:
 
 
 def test_orientations_alone_tell_the_angles_and_that_nothing_tells_the_place() -> None:
-    person = somebody(11, 5.0)
+    person = worn_person(11, 5.0)
     segments = ("pelvis", "upper_trunk", "head", *FOREARMS, "upper_arm_left", "upper_arm_right")
     estimator = ExtendedKalmanFilter(PERFECT)
     events = in_order(*(Source(segment, stated=1e-3).measure(person) for segment in segments))
@@ -787,7 +791,7 @@ def test_orientations_alone_tell_the_angles_and_that_nothing_tells_the_place() -
 
 
 def test_a_camera_that_comes_later_places_the_body() -> None:
-    person = somebody(12, 3.0)
+    person = worn_person(12, 3.0)
     frames = [each for each in person.skeletons if each.stamp_ns > START_NS + 1.5 * NANOSECONDS]
     sources = [Source(segment, stated=0.01) for segment in ("pelvis", *FOREARMS)]
     estimator = ExtendedKalmanFilter()

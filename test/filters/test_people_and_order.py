@@ -111,7 +111,7 @@ def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events
 
 
 @pytest.mark.parametrize("busy", [0.03, 0.08, 0.15])
-def test_who_is_busy_for_long_takes_what_came_meanwhile_in_its_order(
+def test_a_busy_filter_takes_queued_frames_in_the_order_of_their_stamps(
     events: list[Event], never_predicting: Staged, busy: float
 ) -> None:
     waiting, _, ordered = never_predicting
@@ -190,7 +190,7 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
     assert stages["together"].tracked == ids[:2]
     for number in (1, 2):
         mine = [each for each in filtered["together"] if each.body == number]
-        # whoever is alone is the first of those who are there
+        # a single person is the first one
         other = filtered[f"alone {number}"]
         assert len(mine) == len(other) > 20
         for one, same in zip(mine, other, strict=True):
@@ -205,7 +205,7 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
 
 
 def _fused(seen: Skeleton) -> Skeleton:
-    """As the fusion tells of somebody: in world, with a number from 1 on and with covariances."""
+    """As the fusion publishes a person: in world, with a number from 1 on and with covariances."""
     covariances = np.broadcast_to(1e-4 * np.eye(3), (25, 3, 3))
     return replace(seen, positions=level_pose("").apply(seen.positions), body=seen.body + 1, covariances=covariances)
 

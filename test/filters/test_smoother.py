@@ -52,27 +52,29 @@ def recorded(
 def lagged(
     frames: Recording, lag_s: float, parameters: EkfParameters | None = None
 ) -> list[tuple[Skeleton, ModelEstimate]]:
-    """All that a fixed-lag smoother tells of a recording."""
+    """All outputs of a fixed-lag smoother for a recording."""
     live = FixedLagSmoother(lag_s, parameters)
-    return told_live(live, frames) + live.flush()
+    return live_outputs(live, frames) + live.flush()
 
 
 def filtered(frames: Recording, parameters: EkfParameters | None = None) -> list[tuple[Skeleton, ModelEstimate]]:
-    """All that the filter tells of a recording."""
-    return told_live(ExtendedKalmanFilter(parameters), frames)
+    """All outputs of the filter for a recording."""
+    return live_outputs(ExtendedKalmanFilter(parameters), frames)
 
 
-def told_live(live: FixedLagSmoother | ExtendedKalmanFilter, frames: Recording) -> list[tuple[Skeleton, ModelEstimate]]:
-    told = []
+def live_outputs(
+    live: FixedLagSmoother | ExtendedKalmanFilter, frames: Recording
+) -> list[tuple[Skeleton, ModelEstimate]]:
+    outputs = []
     for sensor, skeleton in frames:
         result = live.update(skeleton, sensor)
         if result is not None:
             assert live.estimate is not None
-            told.append((result, live.estimate))
-    return told
+            outputs.append((result, live.estimate))
+    return outputs
 
 
-def told_by(smoothed: Smoothed) -> list[tuple[Skeleton, ModelEstimate]]:
+def outputs_of(smoothed: Smoothed) -> list[tuple[Skeleton, ModelEstimate]]:
     return [
         (skeleton, estimate)
         for skeleton, estimate in zip(smoothed.skeletons, smoothed.estimates, strict=True)
@@ -134,9 +136,9 @@ def test_equals_the_rts_smoother_of_filterpy_where_the_filter_is_linear() -> Non
         live.update(skeleton)
         if ekf._state is not None:
             states.append(ekf._state)
-    # the first of them were not told, as the filter waited to know the noise
-    told = live.flush()
-    assert len(told) == len(states) > 30
+    # the first of them were not returned, as the filter waited to know the noise
+    outputs = live.flush()
+    assert len(outputs) == len(states) > 30
 
     origin = states[0]
     slow_sizes = [s.crosses.shape[1] for s in states]
@@ -177,7 +179,7 @@ def test_equals_the_rts_smoother_of_filterpy_where_the_filter_is_linear() -> Non
         np.array(means), np.array(covariances), transitions, noises
     )
     corrected = np.abs(expected - means).max(axis=0)[:NV].max()
-    for number, (_, estimate) in enumerate(told):
+    for number, (_, estimate) in enumerate(outputs):
         assert_allclose(MODEL.difference(origin.q, estimate.q), expected[number, :NV], atol=1e-2 * corrected)
         keep = np.r_[0:NV, NV + NL : size]
         scale = np.sqrt(np.diag(expected_covariances[number])[keep])
@@ -218,10 +220,10 @@ def test_a_lag_as_long_as_the_recording_is_the_full_smoother_and_none_the_filter
     _, frames = recorded(4, 2.0, 0.01)
     shares: list[float] = []
     monkeypatch.setattr(smoother, "_SECTION", 13)
-    full = told_by(smooth(frames, learn=False, progress=shares.append))
+    full = outputs_of(smooth(frames, learn=False, progress=shares.append))
     assert_same(full, lagged(frames, LONG), 1e-9)
     assert_same(lagged(frames, 0.0), filtered(frames), 1e-12)
-    assert np.ptp([estimate.lengths for _, estimate in told_by(smooth(frames))], axis=0).max() < 1e-9
+    assert np.ptp([estimate.lengths for _, estimate in outputs_of(smooth(frames))], axis=0).max() < 1e-9
     assert shares == sorted(shares)
     assert len(shares) >= len(frames) // 13
     assert shares[-1] == 1.0
@@ -229,7 +231,7 @@ def test_a_lag_as_long_as_the_recording_is_the_full_smoother_and_none_the_filter
 
 def gained(before: list[tuple[Skeleton, ModelEstimate]], after: list[tuple[Skeleton, ModelEstimate]]) -> FloatArray:
     """(n, 64, 64) by how much the covariances are smaller, as shares of the variances before."""
-    old, new = (np.array([estimate.covariance for _, estimate in told]) for told in (before, after))
+    old, new = (np.array([estimate.covariance for _, estimate in outputs]) for outputs in (before, after))
     scale = np.sqrt(np.diagonal(old, axis1=1, axis2=2))
     return np.asarray((old - new) / (scale[:, :, None] * scale[:, None, :]))
 
@@ -268,13 +270,13 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
     inside = []
     for seed in range(11, 11 + draws(1, 4)):  # of ten recordings at 5 mm: 0.69-0.75, 0.68-0.74 and 0.97-0.99
         truth, frames = recorded(seed, 4.0, noise)
-        for name, told in (
+        for name, outputs in (
             ("filter", filtered(frames)),
             ("lag", lagged(frames, 0.2)),
-            ("full", told_by(smooth(frames))),
+            ("full", outputs_of(smooth(frames))),
         ):
             # the first second finds the person, the last 0.2 s of the live one have no later frames
-            for skeleton, estimate in told:
+            for skeleton, estimate in outputs:
                 at = instant(truth, skeleton)
                 if 1.0 < truth.times[at] < 3.8:
                     errors[name].append(skeleton.positions[MODEL.joints] - truth.positions[at])
@@ -290,14 +292,14 @@ def test_is_nearer_to_the_truth_than_the_filter_and_says_by_how_much(noise: floa
 
 
 def test_bridges_a_dropout_from_both_sides() -> None:
-    """Where an arm is out of sight, what comes after tells where it was."""
+    """Where an arm is out of sight, later frames show where it was."""
     arm = ARMS["LEFT"]
     dropout = Dropout(2.0, 2.5, arm)
     errors: dict[str, list[FloatArray]] = {"filter": [], "full": []}
     for seed in range(20, 20 + draws(1, 5)):
         truth, frames = recorded(seed, 3.5, 0.005, MeasurementErrors(0.005, dropouts=(dropout,)))
-        for name, told in (("filter", filtered(frames)), ("full", lagged(frames, LONG))):
-            for skeleton, _ in told:
+        for name, outputs in (("filter", filtered(frames)), ("full", lagged(frames, LONG))):
+            for skeleton, _ in outputs:
                 at = instant(truth, skeleton)
                 if 2.0 <= truth.times[at] < 2.5:
                     errors[name].append(
@@ -317,9 +319,9 @@ def test_a_gap_splits() -> None:
     assert_array_equal(np.unique(result.stretches[: len(before)]), [-1, 0])
     assert_array_equal(np.unique(result.stretches[len(before) :]), [1])
     assert result.counters["gaps"] == 1
-    alone = told_by(smooth(before, learn=False))
-    assert_same(told_by(result)[: len(alone)], alone, 1e-9)
-    assert_same(lagged(frames, LONG), told_by(result), 1e-9)
+    alone = outputs_of(smooth(before, learn=False))
+    assert_same(outputs_of(result)[: len(alone)], alone, 1e-9)
+    assert_same(lagged(frames, LONG), outputs_of(result), 1e-9)
     assert set(smooth(frames).stretches) == {0, 1}
 
 
@@ -332,9 +334,11 @@ def test_a_restart_splits() -> None:
     result = smooth(moved, learn=False)
     assert result.counters["restarts"] >= 1
     assert result.stretches.max() >= 1
-    told = told_by(result)
-    first = [pair for pair in told if pair[0].stamp_ns < moved[jump][1].stamp_ns]
-    errors = [s.positions[MODEL.joints] - truth.positions[k + len(moved) - len(told)] for k, (s, _) in enumerate(first)]
+    outputs = outputs_of(result)
+    first = [pair for pair in outputs if pair[0].stamp_ns < moved[jump][1].stamp_ns]
+    errors = [
+        s.positions[MODEL.joints] - truth.positions[k + len(moved) - len(outputs)] for k, (s, _) in enumerate(first)
+    ]
     assert np.sqrt(np.mean(np.square(errors))) < 0.01
 
 
@@ -384,19 +388,19 @@ def test_a_late_frame_takes_its_place() -> None:
     assert late != two
     in_time = lagged(two, LONG)
     for lag_s in (0.15, LONG):
-        told = lagged(late, lag_s)
-        assert [skeleton.stamp_ns for skeleton, _ in told] == [skeleton.stamp_ns for skeleton, _ in in_time]
-    assert_same(told, in_time, 1e-9)
+        outputs = lagged(late, lag_s)
+        assert [skeleton.stamp_ns for skeleton, _ in outputs] == [skeleton.stamp_ns for skeleton, _ in in_time]
+    assert_same(outputs, in_time, 1e-9)
 
 
 def test_reset_forgets() -> None:
     _, frames = recorded(16, 1.0, 0.01)
     live = FixedLagSmoother(0.1)
-    told = told_live(live, frames)
+    outputs = live_outputs(live, frames)
     live.reset()
     assert live.estimate is None
     assert live.flush() == []
-    assert_same(told_live(live, frames), told, 0.0)
+    assert_same(live_outputs(live, frames), outputs, 0.0)
 
 
 # --- borders
@@ -420,12 +424,12 @@ def test_a_recording_of_nobody_says_nothing() -> None:
     empty = smooth([])
     assert (empty.skeletons, empty.estimates, len(empty.stretches)) == ((), (), 0)
     nothing = np.full((N_JOINTS, 3), np.nan)
-    nobody = [("", Skeleton(k * NANOSECONDS // 30, "world", nothing, np.zeros(N_JOINTS, np.uint8))) for k in range(9)]
-    result = smooth(nobody)
+    empty = [("", Skeleton(k * NANOSECONDS // 30, "world", nothing, np.zeros(N_JOINTS, np.uint8))) for k in range(9)]
+    result = smooth(empty)
     assert set(result.skeletons) == set(result.estimates) == {None}
     assert_array_equal(result.stretches, -1)
     live = FixedLagSmoother(0.1)
-    assert [live.update(skeleton) for _, skeleton in nobody] == [None] * 9
+    assert [live.update(skeleton) for _, skeleton in empty] == [None] * 9
     assert live.estimate is None
     assert live.flush() == []
 

@@ -1,4 +1,4 @@
-"""What filters make of sensors that take joints to be elsewhere, after somebody has held a T-pose before them."""
+"""Filters correct sensors' offsets of the joint centres after a T-pose."""
 
 from __future__ import annotations
 

@@ -39,16 +39,16 @@ def turnings(seed: int, noise: float) -> tuple[list[Series], list[Series]]:
     own = np.array([np.interp(times, knots, np.abs(rng.normal(size=len(knots)))) for _ in WORN])
     own[2] += 0.7 * own[1]
     own[4] += 0.7 * own[3]
-    felt = [turning(times, np.abs(each + noise * rng.normal(size=len(times)))) for each in own]
+    measured = [turning(times, np.abs(each + noise * rng.normal(size=len(times)))) for each in own]
     seen = [turning(times[::2], np.abs(each[::2] + noise * rng.normal(size=len(times[::2])))) for each in own]
-    return felt, seen
+    return measured, seen
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], LEFT_RIGHT, UPPER_LOWER], ids=["none", "left_right", "upper_lower"])
 def test_a_skeleton_shows_which_sensors_are_exchanged(order: list[int]) -> None:
     for seed in range(3):
-        felt, seen = turnings(seed, 0.3)
-        found = assign(WORN, likelihood_by_motion([felt[number] for number in order], [None, *seen[1:]]))
+        measured, seen = turnings(seed, 0.3)
+        found = assign(WORN, likelihood_by_motion([measured[number] for number in order], [None, *seen[1:]]))
         assert found.segments == tuple(WORN[number] for number in order)
         assert {frozenset(pair) for pair in found.exchanged} == {
             frozenset((WORN[n], WORN[m])) for n, m in enumerate(order) if n != m
@@ -56,7 +56,7 @@ def test_a_skeleton_shows_which_sensors_are_exchanged(order: list[int]) -> None:
 
 
 def held(rng: np.random.Generator, order: list[int]) -> FloatArray:
-    """What sensors put on in an order measure in a T-pose of somebody."""
+    """Measurements of sensors worn in an order in a T-pose."""
     pose = pose_rotations(MODEL, "t")[NUMBERS]
     off = rng.multivariate_normal(np.zeros(15), pose_covariance(MODEL, "t", WORN)).reshape(5, 3)
     mounted = MEANT @ so3.quat_to_matrix(so3.exp(np.radians(6.0) * rng.normal(size=(5, 3))))

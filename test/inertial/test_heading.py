@@ -1,4 +1,4 @@
-"""Headings: found by what a camera sees, held by joints, and never told better than they are known."""
+"""Headings are found with a camera, held by joints, and have consistent covariances."""
 
 from __future__ import annotations
 

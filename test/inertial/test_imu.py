@@ -84,12 +84,12 @@ def arm(
         t = k / hertz
         angle = np.radians(60.0) * np.sin(2.0 * t)
         speed = np.radians(60.0) * 2.0 * np.cos(2.0 * t)
-        felt = np.array([gravity * np.sin(angle), 0.3 * speed**2, gravity * np.cos(angle)])
+        specific_force = np.array([gravity * np.sin(angle), 0.3 * speed**2, gravity * np.cos(angle)])
         yield ImuSample(
             round(t * NANOSECONDS),
             "imu_link",
             angular_velocity=rate * np.array([0.0, -speed, 0.0]),
-            acceleration=force * felt,
+            acceleration=force * specific_force,
         )
 
 

@@ -204,15 +204,17 @@ def test_after_lost_readings_the_accelerometer_levels_the_sooner() -> None:
 
 @pytest.mark.parametrize("stamp_jitter", [0.0, 0.004])
 def test_what_a_clipped_rate_hid_is_made_up_for(stamp_jitter: float) -> None:
-    """Where the range is told: the swings have up to 286 degrees per second."""
+    """With the gyroscope range known: the swings have up to 286 degrees per second."""
     samples = measured(replace(IDEAL, gyro_range=250.0, stamp_jitter=stamp_jitter), 10.0, motion=pivot)
     assert (np.abs(samples.angular_velocity) > np.radians(249.9)).any(axis=1).mean() > 0.1
-    told, untold = (Run(samples, errors=errors) for errors in (InertialErrors(gyro_range=np.radians(250.0)), None))
-    settled = told.times > 1.0
-    assert np.square(told.tilt[settled]).mean() < 0.25 * np.square(untold.tilt[settled]).mean()
-    assert np.square(told.heading).mean() < 0.1 * np.square(untold.heading).mean()
-    assert (np.abs(told.tilt) < 2.0 * told.tilt_stddev).mean() > 0.95
-    assert (np.abs(told.heading) < 2.0 * np.maximum(told.heading_stddev, 0.1)).mean() > 0.95
+    limited, unlimited = (
+        Run(samples, errors=errors) for errors in (InertialErrors(gyro_range=np.radians(250.0)), None)
+    )
+    settled = limited.times > 1.0
+    assert np.square(limited.tilt[settled]).mean() < 0.25 * np.square(unlimited.tilt[settled]).mean()
+    assert np.square(limited.heading).mean() < 0.1 * np.square(unlimited.heading).mean()
+    assert (np.abs(limited.tilt) < 2.0 * limited.tilt_stddev).mean() > 0.95
+    assert (np.abs(limited.heading) < 2.0 * np.maximum(limited.heading_stddev, 0.1)).mean() > 0.95
 
 
 def test_a_rate_that_stays_at_its_stop_leaves_the_heading_unknown() -> None:

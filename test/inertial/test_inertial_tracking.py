@@ -1,4 +1,4 @@
-"""A tracker of inertial sensors says no more than it knows, names what is wrong, and goes on."""
+"""The inertial tracker has consistent covariances, reports problems, and recovers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from body_tracking.inertial.alignment import pose_rotations, rotation_vectors
 from body_tracking.inertial.mounting import mounting, mountings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import Slip, usual_mounting
-from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, Told
+from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackerOutput
 from body_tracking.inertial.worn import ReceiptClock
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS
 
@@ -48,7 +48,7 @@ def wrists() -> Iterator[Fed]:
     )
 
 
-def test_two_forearms_beside_a_camera_are_told_within_what_is_stated(wrists: Fed) -> None:
+def test_orientations_of_two_forearms_with_a_camera_are_within_their_stated_deviation(wrists: Fed) -> None:
     for segment in FOREARMS:
         assert covered(wrists, segment, 4.0).mean() > 0.95
         error, _ = wrists.errors(segment, 4.0)
@@ -59,15 +59,15 @@ def test_two_forearms_beside_a_camera_are_told_within_what_is_stated(wrists: Fed
     assert not {line for line in lines(wrists, 6.0) if line}
 
 
-def test_what_comes_out_has_the_cameras_clock_and_rates_and_comes_no_more_often_than_asked(wrists: Fed) -> None:
+def test_orientations_have_the_cameras_clock_correct_rates_and_at_most_the_requested_frequency(wrists: Fed) -> None:
     for segment in FOREARMS:
-        told = [each for each in wrists.orientations if each.segment == segment]
-        steps = np.diff([each.stamp_ns for each in told]) / NANOSECONDS
+        published = [each for each in wrists.orientations if each.segment == segment]
+        steps = np.diff([each.stamp_ns for each in published]) / NANOSECONDS
         # of 50 readings a second every second one is no more often than 30 times
         assert (steps > 0.8 / TrackingParameters().orientation_rate).all()
         assert np.median(steps) == pytest.approx(2.0 / 50.0, rel=0.1)
         # the rate is that at which the orientation changes
-        before, after = told[len(told) // 2 : len(told) // 2 + 2]
+        before, after = published[len(published) // 2 : len(published) // 2 + 2]
         turned = so3.log(so3.matrix_to_quat(before.rotation.T @ after.rotation))
         assert before.angular_velocity is not None
         expected = before.angular_velocity * (after.stamp_ns - before.stamp_ns) / NANOSECONDS
@@ -76,7 +76,7 @@ def test_what_comes_out_has_the_cameras_clock_and_rates_and_comes_no_more_often_
     assert abs(wrists.orientations[-1].stamp_ns - last) < 0.2 * NANOSECONDS
 
 
-def test_the_skeleton_has_its_forearms_and_says_what_it_guesses(wrists: Fed) -> None:
+def test_the_skeleton_has_its_forearms_and_states_inferred_joints(wrists: Fed) -> None:
     assert len(wrists.skeletons) > 200
     skeleton = wrists.skeletons[-1]
     assert skeleton.frame_id == "world"
@@ -98,9 +98,11 @@ def test_a_sensor_that_is_switched_off_is_named_and_comes_back() -> None:
     fed = feed(recorded("forearm_rolling", (sensor("forearm_left"), off), seed=4))
     assert any(line.startswith("forearm_right: silent") for line in lines(fed, 6.8, 8.8))
     assert not any("silent" in line for line in lines(fed, 9.8))
-    told = [(each.stamp_ns - START_NS) / NANOSECONDS for each in fed.orientations if each.segment == "forearm_right"]
-    assert not [stamp for stamp in told if 6.2 < stamp < 8.9]
-    if [stamp for stamp in told if stamp > 9.5]:
+    published = [
+        (each.stamp_ns - START_NS) / NANOSECONDS for each in fed.orientations if each.segment == "forearm_right"
+    ]
+    assert not [stamp for stamp in published if 6.2 < stamp < 8.9]
+    if [stamp for stamp in published if stamp > 9.5]:
         error, stddev = fed.errors("forearm_right", 9.5)
         assert ((np.abs(error) < np.radians(10.0)) | (np.abs(error) < 2.0 * stddev)).mean() > 0.95
     assert covered(fed, "forearm_left", 4.0).mean() > 0.95
@@ -116,7 +118,7 @@ def test_a_slip_by_20_degrees_is_named() -> None:
     assert covered(fed, "forearm_right", 18.0).mean() > 0.9
 
 
-def test_two_exchanged_sensors_are_named_and_taken_for_what_they_are(wrists: Fed) -> None:
+def test_two_exchanged_sensors_are_reported_and_reassigned(wrists: Fed) -> None:
     assert wrists.tracker.counters["exchanged sensors"] == 0
     crossed = sensor("forearm_left", "forearm_right"), sensor("forearm_right", "forearm_left")
     fed = feed(recorded("reaching", crossed, SECONDS, seed=4))
@@ -134,7 +136,7 @@ A defect of the tracker where it is missed: people hold a T-pose worse than it a
 
 @pytest.mark.slow
 def test_swapped_wrist_sensors_are_named_from_the_pose_where_the_field_gives_headings() -> None:
-    """Of arms that move alike, nothing else can tell; the share is no smaller than the known one."""
+    """Where both arms move alike only the pose shows it; the share is no smaller than the known one."""
     count = 40
     named = 0
     for seed in range(count):
@@ -179,7 +181,7 @@ def test_without_a_camera_a_pose_aligns_and_what_drifts_is_stated() -> None:
 
 
 @pytest.mark.slow
-def test_how_elbows_move_finds_straps_that_are_turned_where_the_pose_is_not_trusted() -> None:
+def test_elbow_movement_corrects_rotated_straps_where_the_pose_is_not_trusted() -> None:
     """Of people who roll their forearms, whose sensors are turned by 12 degrees about each axis."""
     segments = ("upper_trunk", "upper_arm_left", "forearm_left")
     before_and_after = []
@@ -206,7 +208,7 @@ def test_how_elbows_move_finds_straps_that_are_turned_where_the_pose_is_not_trus
 
 def elbow_error(fed: Fed, since: float) -> float:
     """Radians RMS, of the left forearm's orientation against its upper arm's; without a camera stamps are receipts."""
-    told = {
+    published = {
         segment: {
             round(10.0 * (each.stamp_ns - RECEIVED_FROM_NS) / NANOSECONDS): each
             for each in fed.orientations
@@ -215,10 +217,10 @@ def elbow_error(fed: Fed, since: float) -> float:
         for segment in ("upper_arm_left", "forearm_left")
     }
     errors = []
-    for tenth in sorted(set(told["upper_arm_left"]) & set(told["forearm_left"])):
+    for tenth in sorted(set(published["upper_arm_left"]) & set(published["forearm_left"])):
         found, true = [], []
         for segment in ("upper_arm_left", "forearm_left"):
-            each = told[segment][tenth]
+            each = published[segment][tenth]
             found.append(each.rotation)
             true.append(fed.true_rotations([each.stamp_ns - RECEIVED_FROM_NS + START_NS])[0, SEGMENTS.index(segment)])
         errors.append(rotation_vectors((found[0].T @ found[1]) @ (true[0].T @ true[1]).T))
@@ -227,16 +229,16 @@ def elbow_error(fed: Fed, since: float) -> float:
 
 
 def held(
-    tracker: InertialTracker, fused_late_ns: int | None = None, *, heard: bool = False
+    tracker: InertialTracker, fused_late_ns: int | None = None, *, camera_frames: bool = False
 ) -> list[SegmentOrientation]:
-    """What is told of three seconds of T-pose with sensors whose straps are turned by 8 degrees, and magnetometers."""
+    """Orientations from three seconds of T-pose with magnetometers and straps that are turned by 8 degrees."""
     names = tracker.segments
     posed = pose_rotations(MODEL, "t")[[SEGMENTS.index(name) for name in names]]
     off = so3.quat_to_matrix(so3.exp(np.radians(8.0) * np.eye(3)[0]))
     rotations = so3.matrix_to_quat(posed @ mountings(names).swapaxes(-1, -2) @ off)
     rng = np.random.default_rng(0)
     skeleton = Skeleton(0, "world", tposed(), np.full(25, TrackingState.TRACKED, np.uint8))
-    told, level, field = [], np.diag([1e-4, 1e-4, 1e-3]), np.array([2e-5, 0.0, -4e-5])
+    published, level, field = [], np.diag([1e-4, 1e-4, 1e-3]), np.array([2e-5, 0.0, -4e-5])
     for k in range(150):
         stamp_ns = (100 * NANOSECONDS) + k * NANOSECONDS // 50
         for number, name in enumerate(names):
@@ -245,17 +247,17 @@ def held(
             rate = 0.005 * rng.normal(size=3)
             sample = ImuSample(stamp_ns, name, rotations[number], level, rate, force, to_sensor @ field)
             orientation = tracker.add(name, sample, stamp_ns + 10_000_000).orientation
-            told += [] if orientation is None else [orientation]
+            published += [] if orientation is None else [orientation]
         if fused_late_ns is not None:
             received_ns = stamp_ns + 15_000_000
-            if heard:
-                tracker.hear(stamp_ns + 5 * NANOSECONDS, received_ns)
-            tracker.see(replace(skeleton, stamp_ns=stamp_ns + 5 * NANOSECONDS), received_ns + fused_late_ns)
-    return told
+            if camera_frames:
+                tracker.take_camera_frame(stamp_ns + 5 * NANOSECONDS, received_ns)
+            tracker.take_skeleton(replace(skeleton, stamp_ns=stamp_ns + 5 * NANOSECONDS), received_ns + fused_late_ns)
+    return published
 
 
 def tposed() -> FloatArray:
-    """(25, 3) metres, of somebody who looks along x."""
+    """(25, 3) metres, of a person who faces x."""
     positions = np.full((25, 3), np.nan)
     q = MODEL.neutral()
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -271,15 +273,15 @@ def aligned_by_magnetometers() -> InertialTracker:
     return tracker
 
 
-def told_later(
+def output_later(
     tracker: InertialTracker,
     stamp_ns: int,
     rate: FloatArray | None = STILL,
     turned: FloatArray = STILL,
     *,
     skeleton: bool = True,
-) -> Told:
-    """What a reading of the left forearm, so long after a T-pose, makes the tracker tell."""
+) -> TrackerOutput:
+    """The tracker's output for a reading of the left forearm, at a time after a T-pose."""
     level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
     stamp_ns += 110 * NANOSECONDS
     sample = ImuSample(stamp_ns, "forearm_left", so3.exp(turned), level, rate, None if rate is None else up, None)
@@ -294,20 +296,20 @@ def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_
 
 
 @pytest.mark.parametrize("rate", [None, np.array([0.1, 0.0, 0.0])], ids=["none", "some"])
-def test_no_rate_is_told_that_a_driver_does_not_tell(rate: FloatArray | None) -> None:
+def test_no_rate_is_published_that_the_driver_does_not_report(rate: FloatArray | None) -> None:
     """The difference of two orientations is too rough to be taken for a measurement."""
     tracker = aligned_by_magnetometers()
     for k in range(2):
-        told = told_later(tracker, k * NANOSECONDS // 20, rate, np.array([0.005 * k, 0.0, 0.0])).orientation
-        assert told is not None
-        assert (told.angular_velocity is None) is (rate is None)
+        output = output_later(tracker, k * NANOSECONDS // 20, rate, np.array([0.005 * k, 0.0, 0.0])).orientation
+        assert output is not None
+        assert (output.angular_velocity is None) is (rate is None)
 
 
-def test_no_body_is_fitted_where_nobody_wants_one() -> None:
+def test_no_body_is_fitted_without_a_subscriber() -> None:
     tracker = aligned_by_magnetometers()
     for k, wanted in enumerate((True, False, True)):
-        told = told_later(tracker, k * NANOSECONDS // 5, skeleton=wanted)
-        assert (told.skeleton is not None) is wanted
+        output = output_later(tracker, k * NANOSECONDS // 5, skeleton=wanted)
+        assert (output.skeleton is not None) is wanted
 
 
 def test_stamps_that_jitter_cost_no_orientations() -> None:
@@ -315,22 +317,22 @@ def test_stamps_that_jitter_cost_no_orientations() -> None:
     tracker = aligned_by_magnetometers()
     jitter = np.random.default_rng(0).integers(-1_000_000, 1_000_000, 300).tolist()
     stamps = [k * NANOSECONDS // 100 + off for k, off in enumerate(jitter)]
-    told = [told_later(tracker, stamp_ns, skeleton=False).orientation for stamp_ns in stamps]
-    assert sum(each is not None for each in told) == 100
+    published = [output_later(tracker, stamp_ns, skeleton=False).orientation for stamp_ns in stamps]
+    assert sum(each is not None for each in published) == 100
 
 
 def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_come() -> None:
     parameters = TrackingParameters(clock="own")
-    told = [
-        held(InertialTracker(FOREARMS, parameters), late, heard=heard)
-        for late, heard in ((0, True), (30_000_000, True), (30_000_000, False))
+    published = [
+        held(InertialTracker(FOREARMS, parameters), late, camera_frames=camera_frames)
+        for late, camera_frames in ((0, True), (30_000_000, True), (30_000_000, False))
     ]
-    first, late, unheard = ([(each.stamp_ns, each.segment) for each in one] for one in told)
+    first, late, without_frames = ([(each.stamp_ns, each.segment) for each in one] for one in published)
     assert len(first) > 100
     assert first == late
     # a sensor's reading of the same instant, which came 5 ms sooner
     assert (first[-1][0] - 5 * NANOSECONDS - 100 * NANOSECONDS) % (NANOSECONDS // 50) == 15_000_000
-    assert unheard[-1][0] == first[-1][0] - 30_000_000
+    assert without_frames[-1][0] == first[-1][0] - 30_000_000
 
 
 def test_time_that_runs_backwards_begins_anew_and_is_counted() -> None:
@@ -370,7 +372,7 @@ def test_a_clock_by_receipt_follows_the_least_delay_and_notices_that_it_was_set(
     assert clock.delay_ns == -90 * 10**9
 
 
-def test_sensors_are_meant_to_be_worn_as_they_are_simulated() -> None:
+def test_intended_mountings_are_those_of_the_simulator() -> None:
     for segment in SEGMENTS:
         np.testing.assert_allclose(
             mounting(segment), so3.quat_to_matrix(usual_mounting(segment).quat_xyzw).T, atol=1e-12
@@ -383,7 +385,7 @@ def test_sensors_are_meant_to_be_worn_as_they_are_simulated() -> None:
     "segments, given",
     [([], ()), (["nose"], ()), (["head", "head"], ()), (["head"], ["head:+x+x"]), (["head"], ["x:+x"])],
 )
-def test_what_cannot_be_worn_is_refused(segments: list[str], given: tuple[str, ...]) -> None:
+def test_invalid_segments_and_mountings_are_refused(segments: list[str], given: tuple[str, ...]) -> None:
     with pytest.raises(BodyTrackingError):
         InertialTracker(segments, mountings=given)
     with pytest.raises(InertialTrackingError, match="no inertial sensor"):

@@ -1,4 +1,4 @@
-"""The clocks of worn sensors come together, whoever's they are."""
+"""Stamps of worn sensors come out in one clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OFFSETS = st.integers(-(10**12), 10**12)
 SENSORS = ("forearm_left", "forearm_right")
 
 
-def heard(offset_ns: int, transport_ns: int = 0, seconds: int = 3) -> list[tuple[int, int]]:
+def receipts(offset_ns: int, transport_ns: int = 0, seconds: int = 3) -> list[tuple[int, int]]:
     """Stamps of a clock that is ahead by so much, and when they were received."""
     times = [10**12 + k * NANOSECONDS // 10 for k in range(10 * seconds)]
     return [(now + offset_ns, now + transport_ns + (k % 3) * 10**6) for k, now in enumerate(times)]
@@ -25,21 +25,21 @@ def heard(offset_ns: int, transport_ns: int = 0, seconds: int = 3) -> list[tuple
 def test_stamps_of_all_clocks_come_out_in_that_of_the_camera(left: int, right: int, camera: int) -> None:
     clocks = SensorClocks(OWN, SENSORS)
     assert not clocks.camera_known
-    for stamp, received in heard(camera):
-        clocks.hear(stamp, received)
+    for stamp, received in receipts(camera):
+        clocks.take_camera_frame(stamp, received)
     assert clocks.camera_known
     for name, offset in zip(SENSORS, (left, right), strict=True):
         own = ReceiptClock()
-        for stamp, received in heard(offset):
+        for stamp, received in receipts(offset):
             own.add(stamp, received)
         assert clocks.offset_ns(name, own) == camera - offset
 
 
 @given(OFFSETS)
-def test_of_clocks_that_are_shared_one_tells_of_all(offset: int) -> None:
+def test_sensors_with_a_shared_clock_have_one_offset(offset: int) -> None:
     clocks = SensorClocks(SHARED, SENSORS)
-    for stamp, received in heard(offset):
-        clocks.take(stamp, received)
+    for stamp, received in receipts(offset):
+        clocks.take_reading(stamp, received)
     nothing = ReceiptClock()
     assert clocks.offset_ns(SENSORS[0], nothing) == clocks.offset_ns(SENSORS[1], nothing) == -offset
     clocks.correct(SENSORS[1], 1.0, 0.02, 0.001)
@@ -51,9 +51,9 @@ def test_stamps_that_are_of_the_reference_clock_stay() -> None:
     assert clocks.offset_ns(SENSORS[0], ReceiptClock()) == 0
 
 
-def test_what_motion_tells_of_a_transport_is_followed_and_told() -> None:
+def test_offsets_by_motion_are_followed_and_reported() -> None:
     clocks, own = SensorClocks(OWN, SENSORS), ReceiptClock()
-    for stamp, received in heard(0):
+    for stamp, received in receipts(0):
         own.add(stamp, received)
     assert clocks.found == {}
     late = 0.02
@@ -65,28 +65,28 @@ def test_what_motion_tells_of_a_transport_is_followed_and_told() -> None:
     assert clocks.offset_ns(SENSORS[1], own) == 0
 
 
-def test_a_camera_counts_by_its_own_frames_where_they_are_heard() -> None:
+def test_a_camera_counts_by_its_own_frames_where_they_arrive() -> None:
     clocks, own = SensorClocks(OWN, SENSORS), ReceiptClock()
-    for stamp, received in heard(0):
+    for stamp, received in receipts(0):
         own.add(stamp, received)
-    for stamp, received in heard(0, transport_ns=30 * 10**6):  # skeletons come late
-        assert not clocks.see(stamp, received, jumped=False)
+    for stamp, received in receipts(0, transport_ns=30 * 10**6):  # skeletons come late
+        assert not clocks.take_skeleton(stamp, received, jumped=False)
     assert clocks.offset_ns(SENSORS[0], own) == -30 * 10**6
-    begun = [clocks.hear(stamp, received) for stamp, received in heard(0)]
+    begun = [clocks.take_camera_frame(stamp, received) for stamp, received in receipts(0)]
     assert begun[0] and not any(begun[1:])
     assert clocks.offset_ns(SENSORS[0], own) == 0
-    for stamp, received in heard(0, transport_ns=30 * 10**6):
-        clocks.see(stamp, received, jumped=False)
+    for stamp, received in receipts(0, transport_ns=30 * 10**6):
+        clocks.take_skeleton(stamp, received, jumped=False)
     assert clocks.offset_ns(SENSORS[0], own) == 0
 
 
 def test_a_camera_whose_clock_is_set_is_noticed() -> None:
     clocks = SensorClocks(OWN, SENSORS)
-    (stamp, received), *_ = heard(0)
-    assert not clocks.see(stamp, received, jumped=False)
-    assert clocks.see(stamp + 60 * NANOSECONDS, received + NANOSECONDS, jumped=False)
-    assert clocks.see(stamp, received + 2 * NANOSECONDS, jumped=True)
+    (stamp, received), *_ = receipts(0)
+    assert not clocks.take_skeleton(stamp, received, jumped=False)
+    assert clocks.take_skeleton(stamp + 60 * NANOSECONDS, received + NANOSECONDS, jumped=False)
+    assert clocks.take_skeleton(stamp, received + 2 * NANOSECONDS, jumped=True)
     frames = SensorClocks(OWN, SENSORS)
-    assert frames.hear(stamp, received)
-    assert not frames.hear(stamp + NANOSECONDS, received + NANOSECONDS)
-    assert frames.hear(stamp - 60 * NANOSECONDS, received + 2 * NANOSECONDS)
+    assert frames.take_camera_frame(stamp, received)
+    assert not frames.take_camera_frame(stamp + NANOSECONDS, received + NANOSECONDS)
+    assert frames.take_camera_frame(stamp - 60 * NANOSECONDS, received + 2 * NANOSECONDS)

@@ -37,20 +37,20 @@ def recorded(
     return simulate(Setup(motion, around((0.0,)), imus=imus, seconds=seconds, seed=seed))
 
 
-def samples_of(imu: SimulatedImu, said: ImuSamples) -> list[tuple[int, str, ImuSample]]:
+def samples_of(imu: SimulatedImu, samples: ImuSamples) -> list[tuple[int, str, ImuSample]]:
     """Receipt, segment that is stated, reading."""
     found = []
-    for k, stamp_ns in enumerate(said.stamps_ns.tolist()):
+    for k, stamp_ns in enumerate(samples.stamps_ns.tolist()):
         sample = ImuSample(
             stamp_ns,
             f"{imu.name}_link",
-            None if said.orientation is None else said.orientation[k],
-            None if said.orientation is None else said.orientation_covariance[k],
-            said.angular_velocity[k],
-            said.linear_acceleration[k],
-            None if said.magnetic_field is None else said.magnetic_field[k],
+            None if samples.orientation is None else samples.orientation[k],
+            None if samples.orientation is None else samples.orientation_covariance[k],
+            samples.angular_velocity[k],
+            samples.linear_acceleration[k],
+            None if samples.magnetic_field is None else samples.magnetic_field[k],
         )
-        found.append((int(said.received_ns[k]), imu.name, sample))
+        found.append((int(samples.received_ns[k]), imu.name, sample))
     return found
 
 
@@ -77,14 +77,14 @@ class Fed:
 
     def errors(self, segment: str, since: float) -> tuple[FloatArray, FloatArray]:
         """(n, 3) rotation vectors, radians about world's axes, and (n, 3) stated deviations."""
-        told = [
+        published = [
             each
             for each in self.orientations
             if each.segment == segment and (each.stamp_ns - START_NS) / NANOSECONDS >= since
         ]
-        true = self.true_rotations([each.stamp_ns for each in told])[:, SEGMENTS.index(segment)]
-        found = np.array([each.rotation for each in told])
-        stddev = np.array([np.sqrt(each.covariance.diagonal()) for each in told])
+        true = self.true_rotations([each.stamp_ns for each in published])[:, SEGMENTS.index(segment)]
+        found = np.array([each.rotation for each in published])
+        stddev = np.array([np.sqrt(each.covariance.diagonal()) for each in published])
         return rotation_vectors(found @ true.swapaxes(-1, -2)), stddev
 
 
@@ -98,7 +98,7 @@ def feed(
     """All readings and frames in the order of receipt; the camera's truly placed.
 
     Args:
-        recording: of somebody.
+        recording: of one person.
         parameters: of the tracker; by default with fewer skeletons than usual, which take their time, and with all
             orientations.
         meddle: what becomes of a reading, at seconds from the beginning.
@@ -109,7 +109,7 @@ def feed(
     tracker = InertialTracker(
         stated, TrackingParameters(rate=2.0, orientation_rate=50.0) if parameters is None else parameters
     )
-    events: list[tuple[int, str, object]] = [e for imu, said in recording.imus for e in samples_of(imu, said)]
+    events: list[tuple[int, str, object]] = [e for imu, samples in recording.imus for e in samples_of(imu, samples)]
     (camera,) = recording.sensors
     rng = np.random.default_rng(0)
     truth = recording.truths[0]
@@ -119,8 +119,8 @@ def feed(
             instant = min(int(np.searchsorted(truth.stamps_ns, seen.stamp_ns)), len(truth.stamps_ns) - 1)
             clean = truth.skeleton(instant)
             noisy = clean.positions + camera_stddev * rng.normal(size=(25, 3))
-            told = np.tile(camera_stddev**2 * np.eye(3), (25, 1, 1))
-            events.append((frame.received_ns, "", replace(clean, positions=noisy, covariances=told, velocities=None)))
+            stated = np.tile(camera_stddev**2 * np.eye(3), (25, 1, 1))
+            events.append((frame.received_ns, "", replace(clean, positions=noisy, covariances=stated, velocities=None)))
             continue
         variance = joint_stddev(seen.positions, seen.states) ** 2
         known = np.where(np.isfinite(variance), variance, 1e6)
@@ -139,16 +139,16 @@ def feed(
         if now > seconds:
             break
         if isinstance(what, Skeleton):
-            tracker.see(what, received_ns)
+            tracker.take_skeleton(what, received_ns)
         else:
             assert isinstance(what, ImuSample)
             if meddle is not None:
                 what = meddle(now, tracker, what)
-            told = tracker.add(name, what, received_ns)
-            if told.orientation is not None:
-                fed.orientations.append(told.orientation)
-            if told.skeleton is not None:
-                fed.skeletons.append(told.skeleton)
+            output = tracker.add(name, what, received_ns)
+            if output.orientation is not None:
+                fed.orientations.append(output.orientation)
+            if output.skeleton is not None:
+                fed.skeletons.append(output.skeleton)
         if not fed.named or now - fed.named[-1][0] > 0.2:
             fed.named += [(now, line) for line in tracker.problems(received_ns)] or [(now, "")]
     return fed

@@ -1,4 +1,4 @@
-"""What a pose is off by because sensors take the centres of joints to be elsewhere, as far as no T-pose told where."""
+"""Effect of unknown offsets of a sensor's joint centres on the pose, as far as no T-pose has shown them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simu
 
 
 class Displacement:
-    """Says how unsure a pose is by that.
+    """Covariance of a pose by these offsets.
 
     Args:
         space: of the states.
@@ -39,7 +39,7 @@ class Displacement:
         self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
 
     def displaced(self, state: State) -> FloatArray:
-        """(53, 53) covariance of tangent and lengths by where sensors take the joints' centres to be.
+        """(53, 53) covariance of tangent and lengths by offsets of the joint centres.
 
         By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
         ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` is how the filter weighs the points and ``P`` what is known

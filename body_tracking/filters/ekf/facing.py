@@ -1,4 +1,4 @@
-"""Frames of a body that a camera takes to face it, while arms whose orientation is measured tell that it does not."""
+"""Frames with left and right swapped by a camera, detected by arms with measured orientations."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _IMPROBABLE = 20.0
 freedom) that one of 2000 poses has: rather than that, the filter is wrong about which way the person faces."""
 _TWISTS = ("shoulder_z", "forearm_pronation")
 _SPEAKING_NS = NANOSECONDS // 4
-"""A source that is silent for longer tells nothing."""
+"""A source without a measurement for longer is ignored."""
 _LIMBS = {"upper_arm": ("SHOULDER", "ELBOW"), "forearm": ("ELBOW", "WRIST")}
 _DIRECTION_STDDEV = 0.35
-"""Radians by which a camera errs in where a limb points."""
+"""Radians: standard deviation of a limb's direction by a camera."""
 _MOST, _DOUBTED = 1.0, 10.0
-"""Logarithms of a ratio of likelihoods: what one frame says at most, as the next errs alike, and what decides."""
+"""Log likelihood ratios: greatest of one frame, as errors of the next are correlated, and the one that decides."""
 
 
 class Facing:
-    """Exchanges left and right of frames that contradict the state.
+    """Swaps left and right of frames that contradict the state.
 
-    A Kinect takes every body to face it, and exchanges left and right of one that has turned away. A filter that has
-    followed the turn knows better. One that knows cameras alone may have been wrong from the beginning; where the
-    orientation of an arm is measured it is told so: the arms would have to be twisted as none is, or that arm points
-    where the other one is seen to.
+    A Kinect assumes that every body faces it, and swaps left and right of one that has turned away. A filter that has
+    followed the turn detects the swap. With cameras alone its facing may be wrong from the start; a measured
+    orientation of an arm shows this: the arms would be twisted beyond their ranges, or that arm points where the other
+    one is seen.
 
     Args:
         space: of the states.
@@ -48,7 +48,7 @@ class Facing:
         }
 
     def corrected(self, state: State, skeleton: Skeleton) -> tuple[State, Skeleton]:
-        """A frame with left and right as they are believed.
+        """A frame with left and right swapped if that is likelier.
 
         Args:
             state: of the frame's time.
@@ -84,7 +84,7 @@ class Facing:
         return state, replace(skeleton, positions=points, states=states, covariances=covariances)
 
     def _evidence(self, posture: Posture, segments: IntArray, skeleton: Skeleton) -> float:
-        """Logarithm of how much likelier limbs whose orientation is measured are as seen than exchanged."""
+        """Log likelihood ratio of limbs with measured orientations as seen against swapped."""
         evidence = 0.0
         for number in segments.tolist():
             if number not in self._ends:
@@ -100,7 +100,7 @@ class Facing:
         return float(np.clip(evidence, -_MOST, _MOST))
 
     def _is_improbable(self, state: State) -> bool:
-        """Whether arms are as twisted as they come to be where the body is turned round."""
+        """Whether arms are as twisted as with a body of the wrong facing."""
         ranges = self._space.ranges
         away = (ranges.values(state.q) - ranges.centre)[self._twists] / ranges.stddev[self._twists]
         return float(away @ away) > _IMPROBABLE

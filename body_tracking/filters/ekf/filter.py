@@ -32,12 +32,12 @@ from body_tracking.kinematics.upper_body import UpperBody
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
 _START_FRAMES = 4
-"""Frames of one sensor that tell its noise."""
+"""Frames of one sensor for an estimate of its noise."""
 _WAIT_NS = NANOSECONDS // 2
 """Frames farther apart than this do not make a start together."""
 _MAX_COORDINATE = 100.0
 _LONGEST_WAIT_NS = NANOSECONDS // 10
-"""Orientations that nobody asks for wait no longer than this."""
+"""Greatest time that an orientation is queued without a request for the estimate."""
 _DISORDER_NS = NANOSECONDS // 300
 """Orientations of times so close to each other may come in any order."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
@@ -203,7 +203,7 @@ class ExtendedKalmanFilter:
         """Take the orientation of one segment, at its own time among frames and others.
 
         Where there are no skeletons, the body is started after ``start_after`` by orientations alone, its base at the
-        origin with a deviation that says that nothing tells where it is. The first skeletons then start it anew.
+        origin with the deviation of an unknown position. The first skeletons then restart it.
 
         Returns:
             Whether there is an estimate of about its time now: not where it is a repetition or came late.
@@ -219,7 +219,7 @@ class ExtendedKalmanFilter:
             return self._begun_turned(measurement)
         late = self._is_late(measurement, state)
         self.counters["orientations_late"] += late
-        # It waits until somebody asks: a camera's frame of an earlier time may still be to come before.
+        # queued until the estimate is requested: a camera's frame of an earlier time may still arrive
         self._late.append(measurement)
         if measurement.stamp_ns - state.stamp_ns > _LONGEST_WAIT_NS:
             self._last = self._replay(state)
@@ -486,7 +486,7 @@ class ExtendedKalmanFilter:
             ).but(sensors=learnt)
 
     def _begun(self, measurement: Measurement) -> State | None:
-        """The state after the first few frames, as many as tell a sensor's noise: without it the start is a guess."""
+        """The state after the first frames, enough for an estimate of a sensor's noise."""
         if self._waiting and abs(measurement.stamp_ns - self._waiting[-1].stamp_ns) > _WAIT_NS:
             self._waiting.clear()
         if any((each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for each in self._waiting):

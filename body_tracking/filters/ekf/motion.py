@@ -1,4 +1,4 @@
-"""How a person is expected to move on, and how briskly."""
+"""Motion model of a person, with adaptive noise densities."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from body_tracking.filters.ekf.state import State, StateSpace
 _WHITENESS_TIME = 0.25
 """Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
 _OF_SPEED = 16.0
-"""1/s: beside orientations the density of a joint's acceleration besides, per square of its speed. Who swings a limb
-twice a second accelerates it by 4 pi times its speed for about a tenth of a second; what a pose is too slow to follow
-is taken for errors of the sources."""
+"""1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
+second has 4 pi times its speed as acceleration for about a tenth of a second; with too small a density the lag would be
+attributed to errors of the sources."""
 _DOUBT_TIME = 0.65
 """Seconds for which frames that contradict the state are remembered: one errs as those shortly before."""
 _UNTOUCHED = 0.02
@@ -129,7 +129,7 @@ class Motion:
     def densities_learnt(
         self, state: State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
     ) -> FloatArray:
-        """The spectral densities, from whether the corrections of the velocities lean to one side."""
+        """Adapt the spectral densities to the mean corrections of the velocities."""
         rate = self._parameters.density_rate * dt / _WHITENESS_TIME
         # coordinates that the measurement does not touch say nothing
         share = variance / (variance + _UNTOUCHED * remaining + 1e-30)

@@ -1,4 +1,4 @@
-"""What orientations of segments say, and of their sources."""
+"""Updates by orientations of segments, and of the errors of their sources."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _TOGETHER_NS = NANOSECONDS // 125
 """An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
 the motion model adds in the meantime (1 mrad) comes with the next one."""
 _SLIP_TIME = 0.5
-"""Seconds over which innovations of orientations are summed, to see them lean."""
+"""Seconds over which innovations of orientations are summed, to detect a mean."""
 _SLIPPED = 30.0
-"""Squared normalised sum that a source which fits does not come to (chi-square with 3 degrees of freedom)."""
+"""Squared normalised sum that a consistent source does not reach (chi-square with 3 degrees of freedom)."""
 
 
 class OrientationUpdate:
-    """Takes orientations into a state.
+    """Updates a state by orientations.
 
     Args:
         space: of the states.
@@ -71,11 +71,11 @@ class OrientationUpdate:
         if measurement.stamp_ns - state.stamp_ns > _TOGETHER_NS:
             state = self._motion.predicted(state, measurement.stamp_ns)
         segment = SEGMENT_NUMBER[measurement.segment]
-        heard = measurement.stamp_ns - sources.stamps <= p.forget_after * NANOSECONDS
+        active = measurement.stamp_ns - sources.stamps <= p.forget_after * NANOSECONDS
         if number is not None:
-            heard[number] &= segment == sources.segments[number]
-        if not heard.all():
-            state = self._forgotten(state, heard)
+            active[number] &= segment == sources.segments[number]
+        if not active.all():
+            state = self._forgotten(state, active)
         number = state.sources.find(measurement.source)
         known = number is not None
         if number is None:
@@ -245,7 +245,7 @@ class OrientationUpdate:
         covariance[old:, old:] = added
         none = np.zeros((PER_SOURCE, state.crosses.shape[1]), dtype=state.crosses.dtype)
         crosses = np.concatenate([state.crosses, none])
-        # what thumbs have said so far was said with too much confidence
+        # the updates by thumbs so far had too much weight
         doubtful = self._by_thumbs[sources.segments[-1]]
         covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2
         # so was all, as if a camera took joints to be elsewhere at other times, which from now on it is not taken to
@@ -262,15 +262,14 @@ class OrientationUpdate:
     def without_thumbs(self, state: State, measurement: Measurement) -> Measurement:
         """A frame without the thumbs of forearms or hands whose orientation is measured.
 
-        A thumb is all that tells a camera how a forearm is turned about itself, and it is off for as long as it looks
-        the same: by 50 degrees with a Kinect v2. Any alignment of an inertial sensor is better than what it would be
-        corrected to.
+        For a camera only the thumb shows the axial rotation of a forearm, with a persistent error of 50 degrees for a
+        Kinect v2. Any alignment of an inertial sensor is better.
         """
         unseen = self._space.thumbs[state.sources.segments].any(axis=0)
         return replace(measurement, measured=measurement.measured & ~unseen)
 
     def unlearnt(self, state: State) -> tuple[FloatArray, FloatArray] | None:
-        """What a camera must not teach of sources: how their forearm or hand is turned about itself.
+        """The states of sources that a camera must not correct: axial rotation of forearm or hand.
 
         Thumbs apart (:meth:`without_thumbs`) nothing shows a camera that but which way an arm is bent, of which it is
         sure and wrong for as long as the arm looks the same. That combination of a source's numbers is only considered

@@ -1,4 +1,4 @@
-"""What is handed out of a state."""
+"""Output of a state: skeletons and estimates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNKNOWN[:] = np.diag([np.inf] * 3)
 
 
 class Output:
-    """Makes of a state what users get.
+    """Makes skeletons and estimates of a state.
 
     Args:
         space: of the states.
@@ -38,7 +38,7 @@ class Output:
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Forget the person."""
         self._last_handed_out = None
 
     def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray]:
@@ -81,7 +81,7 @@ class Output:
         return q
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
-        """(35,) a configuration of covariance (32, 32) told the middle of the ranges once, where it is vague."""
+        """(35,) a configuration with covariance (32, 32), updated by the middle of the ranges where vague."""
         soft = self._ranges.soft_coordinates(q)
         gradients = np.zeros((self._space.nv - 6, self._space.nv))
         gradients[:, 6:] = soft.gradients
@@ -120,10 +120,10 @@ class Output:
         space = self._space
         q, covariance = self._handed_out(state)
         lines = self._model.linearise(q, state.lengths)
-        told = covariance[: space.observed, : space.observed]
+        observed = covariance[: space.observed, : space.observed]
         joints = self._model.joints
         observation = space.observation(lines)
-        spread = observation @ told @ observation.T
+        spread = observation @ observed @ observation.T
         positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
         covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)

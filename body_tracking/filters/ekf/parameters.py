@@ -19,7 +19,9 @@ class EkfParameters(OrientationParameters):
         FilterError: a value out of its range.
     """
 
-    velocity_time: float = number_field(0.8, "time in which a velocity fades when nothing renews it", "s", 0.05, 100.0)
+    velocity_time: float = number_field(
+        0.8, "time constant of the decay of velocities without measurements", "s", 0.05, 100.0
+    )
     density_translation: float = number_field(
         1.0, "spectral density of the base's acceleration per axis, before it is learnt", "m2/s3", 1e-5, 1e3
     )
@@ -91,7 +93,7 @@ class EkfParameters(OrientationParameters):
 
     posture: bool = field(
         default=True,
-        metadata={"doc": "how people hold themselves decides what points cannot tell, as how the spine shares a bend"},
+        metadata={"doc": "posture prior for directions that points do not show, such as how the spine shares a bend"},
     )
     t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 

@@ -1,4 +1,4 @@
-"""Poses by inverse kinematics: the first one, and another one where the filter is in a wrong one."""
+"""Poses by inverse kinematics: the initial one, and another one when the filter has a wrong one."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from body_tracking.kinematics.lengths import SegmentLengths
 
 _EYE3 = np.eye(3)
 _REST_NS = NANOSECONDS // 4
-"""At least so long from one search for another pose to the next."""
+"""Least time between searches for another pose."""
 _MOST_ATTEMPTS = 4
-"""Times that the rest doubles where the strain is back soon after another pose was looked for: sensors that contradict
-each other are the cause then, and no pose is right for all of them."""
+"""Greatest number of doublings of this time when the innovations soon persist again: sensors then contradict each
+other, and no pose fits all of them."""
 _SOON = 4
-"""Rests after which it is another matter."""
+"""Multiple of this time after which a search is independent of the last one."""
 _LOOK_NS = NANOSECONDS // 2
-"""The same where only a hand is suspected, which much noise makes it be time and again, and lengths stay as they are:
-these do not give way to a wrong hand, and its strain remains."""
+"""Least time when only a hand is suspected, which noise often causes, and lengths are fixed: fixed lengths do not adapt
+to a wrong hand, so its innovations persist."""
 _WHOLE = 15
-"""Points that a frame must show to tell a person's size from."""
+"""Least number of points of a frame for an estimate of a person's size."""
 _MUCH_BETTER = 0.5
 _LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
-"""Seconds over which innovations are averaged, and how many it takes to see them lean."""
+"""Seconds over which innovations are averaged, and least number in a mean."""
 _STRAINED = 4.0
-"""Squared Mahalanobis distance of a mean innovation that a filter in the right pose does not come to: it stays below 1
-with little noise and below 3 with much; a hand that is bent and turned the wrong way about comes to 2 to 5."""
+"""Squared Mahalanobis distance of a mean innovation that a right pose does not reach: it stays below 1 with little
+noise and below 3 with much; a hand in the wrong elbow or wrist branch reaches 2 to 5."""
 _SUSPICIOUS = 1.0
-"""The same, from which it is worth a look whether a hand is bent and turned the wrong way about. That is seldom with
-little noise, and most of the time in such a pose: lengths that are still learnt give way to it."""
+"""Squared Mahalanobis distance from which the other branch of a hand is tested: rarely with little noise, and mostly in
+a wrong branch, to which lengths that are still estimated adapt."""
 _LIKELIER = 3.0
-"""Half the difference of two costs, the logarithm of how much likelier a pose is: 20 to 1."""
+"""Log likelihood ratio, half the difference of two costs, for another pose: 20 to 1."""
 _MISFIT = 0.02
-"""Metres by which a person's points lie beside any pose of the model for a while."""
+"""Metres: persistent distance of a person's points from any pose of the model."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
-"""Radians by which no other pose that points suggest may turn a segment at once whose orientation is measured."""
+"""Greatest change in radians of a segment with a measured orientation by a new pose."""
 _ANOTHER_SIZE = 1.2
-"""Times that a person is larger or smaller than the one before, who must be another one."""
+"""Ratio of sizes from which a person is another one than before."""
 
 
 class PoseSearch:
@@ -188,7 +188,7 @@ class PoseSearch:
         return self._looked_anew(state, measurement) if state.strain > _SUSPICIOUS else state
 
     def _looked_anew(self, state: State, measurement: Measurement) -> State:
-        """Look for another pose that fits better, the more seldom the more often that was of no use."""
+        """Search for a better pose, more rarely after failed searches."""
         elapsed, rest = state.stamp_ns - state.attempted_ns, _REST_NS << min(state.attempts, _MOST_ATTEMPTS)
         if elapsed < rest or (state.strain < _STRAINED and state.settled and elapsed < _LOOK_NS):
             return state
@@ -196,7 +196,7 @@ class PoseSearch:
         return self._straightened(state, measurement).but(attempted_ns=state.stamp_ns, attempts=attempts)
 
     def _reacquired(self, state: State, measurement: Measurement) -> State:
-        """Start the pose anew where another one fits the rejected points much better."""
+        """Restart the pose if another one fits the rejected points much better."""
         space = self._space
         points, stddev = self._as_fitted(measurement, state)
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
@@ -221,7 +221,7 @@ class PoseSearch:
     def _restarted(self, state: State, points: FloatArray, stddev: FloatArray, share: float) -> State:
         """A pose that fits points with at most a share of the present one's cost; else the present state."""
         try:
-            # to tell whether a pose is worth it takes half the steps that it takes to tell the pose
+            # deciding about a pose takes half the steps of computing it
             fit = self.inverse.solve(points, stddev, state.lengths, tolerance=CLOSE)
             # lengths that were learnt in a wrong pose are wrong, too
             lengths = self._lengths_of(points)
@@ -255,9 +255,11 @@ class PoseSearch:
         white: FloatArray,
         dt: float,
     ) -> tuple[FloatArray, FloatArray, float]:
-        """The faded mean of the innovations (19, 3), its weights (19,) and the strain."""
+        """The faded mean of the innovations (19, 3), its weights (19,), and its greatest squared distance."""
         fade = math.exp(-dt / _LEAN_TIME)
-        bounded = np.minimum(1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9)))  # one outlier is no lean
+        bounded = np.minimum(
+            1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9))
+        )  # bounds the influence of an outlier
         weight = fade * state.leaning + measured
         step = measured / np.maximum(weight, 1.0)
         lean = state.lean + step[:, None] * (bounded[:, None] * innovation - state.lean)
@@ -270,10 +272,10 @@ class PoseSearch:
         return lean, weight, float(strain.max())
 
     def _straightened(self, state: State, measurement: Measurement) -> State:
-        """Start the pose anew where another one fits much better what the points have shown for some time.
+        """Restart the pose if another one fits the averaged points much better.
 
-        A filter can settle in a wrong pose that no single frame contradicts: an elbow that looks straight because
-        the upper arm is turned the wrong way about itself.
+        A wrong pose may persist that no single frame contradicts: a straight elbow with a wrong axial rotation of the
+        upper arm.
         """
         sure = state.leaning > _LEAN_FRAMES
         posture = self._model.forward(state.q, state.lengths)
@@ -287,10 +289,10 @@ class PoseSearch:
         return self._restarted(state, points, stddev, _MUCH_BETTER)
 
     def _hands_turned(self, state: State, points: FloatArray, stddev: FloatArray) -> State:
-        """Start anew with a hand turned about itself where that is much likelier; else the present state.
+        """Restart with the other branch of a hand if that is much likelier; else the current state.
 
-        A hand that is bent and turned the wrong way about soon has lengths to match, a thumb that does not stand out.
-        So the lengths count, too: what is average against what they were learnt to be.
+        Estimated lengths adapt to a hand in the wrong branch, such as a short thumb. So the likelihood includes that of
+        the estimated lengths against average ones.
         """
         lengths, unlikely = state.lengths, 0.0
         if not state.settled:
@@ -318,7 +320,7 @@ class PoseSearch:
         return lengths * float(np.clip(np.median(ratio), 0.5, 1.4)) if len(ratio) else lengths
 
     def _contradicts(self, state: State, q: FloatArray) -> bool:
-        """Whether another pose turns a segment far from where a source that fits has it."""
+        """Whether a pose rotates a segment far from its measured orientation."""
         segments = state.sources.segments[state.sources.unfit_for == 0.0]
         if not len(segments):
             return False

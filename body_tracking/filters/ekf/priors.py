@@ -1,4 +1,4 @@
-"""What is known of a pose without any measurement: ranges of motion, and how people hold themselves."""
+"""Prior knowledge of a pose: ranges of motion, and posture."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from body_tracking.filters.ekf.state import State, StateSpace, single
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
 
 _PRIOR_PERIOD = 0.1
-"""Seconds between two looks at the ranges of motion."""
+"""Seconds between updates by the ranges of motion."""
 
 _POSTURE_TIME, _POSTURE_TIME_MEASURED = 1.0, 10.0
-"""Seconds for which people hold themselves alike: posture is news once in twice that time, however often it is brought
-in. The second where orientations are measured, which say more of it than points do."""
+"""Correlation time of posture in seconds: it counts as one observation per twice that time. The second one applies with
+measured orientations, which show more of the posture than points."""
 VAGUE = 0.5
-"""Share of the range's deviation from which an angle is drawn to the middle of its range."""
+"""Share of the range's deviation from which an angle is moved to the middle of its range."""
 _SPURIOUS = 0.7
-"""Share of what the ranges say below which the variance of an unobserved direction is taken to be false."""
+"""Share of the range's variance below which the variance of an unobserved direction is spurious."""
 _NULL = 1e-6
 """Singular value, as a share of the greatest, below which a direction moves no point."""
 _LIMIT_STDDEV = 3.0
-"""Degrees: how softly limits push back, each time."""
+"""Degrees: standard deviation of the pseudo-measurement at a limit."""
 _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
 _HELD_STDDEV = 0.02
-"""Radians by which what moves a pose without any measurement may turn a segment whose orientation is measured."""
+"""Radians: standard deviation by which priors may rotate a segment with a measured orientation."""
 _HELD_FOR_NS = NANOSECONDS // 4
-"""A source that is silent for longer does not hold its segment any more."""
+"""A source without a measurement for longer does not constrain its segment."""
 
 
 class Priors:
-    """Keeps a state where a body can be.
+    """Applies the priors to a state.
 
     Args:
         space: of the states.
@@ -48,7 +48,7 @@ class Priors:
         self._space, self._model, self._ranges = space, space.model, space.ranges
         self._parameters, self._counters = parameters, counters
         self._prior = space.prior
-        # the quantities that are brought in: coordinates, how a twist is shared, and the lean of the pelvis
+        # the pseudo-measurements: coordinates, sharing of a twist, and inclination of the pelvis
         self._stddev = np.concatenate([self._prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], self._prior.tilt_stddev])
         self._range_stddev = np.append(self._ranges.stddev, self._stddev[-3:])
         self._postural = np.append(self._prior.postural, [True] * 3)
@@ -57,14 +57,14 @@ class Priors:
         self._trunk = np.append(trunk, [True, False, False])
 
     def bounded(self, state: State) -> State:
-        """Bring in the ranges of motion: softly push back what left them, and bound what nothing observes."""
+        """Update by the ranges of motion: soft limits, and bounds of unobserved directions."""
         space = self._space
         if state.since_prior < _PRIOR_PERIOD:
             return state
         prior = self._prior.rows(state.q, self._model.linearise(state.q, state.lengths))
         values, gradients, stddev = prior.residuals, prior.gradients, self._stddev
         excess = self._ranges.excess_of(prior.coordinates)
-        if state.sources.names:  # the posture prior is not validated beside sensors whose mounting is being estimated
+        if state.sources.names:  # the posture prior is not validated with sensors whose mounting is being estimated
             values[:-3], stddev = prior.coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
@@ -98,7 +98,7 @@ class Priors:
         return state
 
     def _turned(self, state: State, q: FloatArray, signs: FloatArray) -> State:
-        """The same state told by another configuration, whose tangent has other signs (32,)."""
+        """The same state in an equivalent configuration, whose tangent has other signs (32,)."""
         self._counters["branches"] += 1
         both = np.concatenate(
             [signs, np.ones(self._space.nl), signs, np.ones(len(state.covariance) - self._space.size)]
@@ -112,7 +112,7 @@ class Priors:
         )
 
     def _unsure(self, state: State) -> State:
-        """Take back what the update believes to know of directions that no point shows.
+        """Remove spurious information about unobserved directions.
 
         The unobserved directions are those of the estimate, which trembles; the update takes their turning from
         frame to frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is
@@ -139,7 +139,7 @@ class Priors:
         return state.but(covariance=covariance)
 
     def _drawn(self, state: State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> State:
-        """The estimate drawn to the middle of the ranges, where nothing else holds it; the covariance stays.
+        """The estimate moved to the middle of the ranges in unobserved directions; the covariance stays.
 
         Without this, an angle that nothing observes would wander with the noise of those that are. Beside orientations
         it is done to what is handed out only (``output``): what cameras pull back again and again, as the
@@ -218,7 +218,7 @@ class Priors:
     ) -> State:
         """The nearest state, by the covariance, within the limits; softly (Simon 2010, projection of the estimate).
 
-        The covariance stays: that an angle is within its limits does not tell where.
+        The covariance stays: limits do not determine an angle within them.
         """
         space = self._space
         cross_covariance = self._free(state)[0][:, space.tangent] @ observation.T
@@ -231,8 +231,8 @@ class Priors:
     def _free(self, state: State) -> tuple[FloatArray, SingleArray]:
         """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free.
 
-        A pose that is moved without any measurement must not turn what a source says the turn of: the source would be
-        corrected instead, each time a little.
+        Priors must not rotate a segment with a measured orientation: the errors of its source would be corrected
+        instead, a little each time.
         """
         space = self._space
         speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS

@@ -1,4 +1,4 @@
-"""What cameras err by: white noise, and what lasts for seconds."""
+"""Errors of cameras: white noise, and systematic errors that persist for seconds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MAX_SLOW = np.array([9.0, 1.0])
 _THIRD_DIFFERENCE_SPAN = 0.25
 """Seconds beyond which four frames in a row show motion, not noise."""
 _CORRELATED = 2.31
-"""So many third differences in a row, which overlap, tell of a variance as much as one and those after it, apart."""
+"""Number of overlapping third differences per independent one."""
 _NOISE_FRAMES = 600.0
 """Frames over which the white noise of a point is averaged."""
 _POOL = 8.0
@@ -38,7 +38,7 @@ _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
 _SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_STEP = 0.02
-"""Share by which a scale changes at least: what it did to the state before has to be put right each time."""
+"""Share by which a scale changes at least: each change requires a correction of the state."""
 _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 
@@ -161,7 +161,7 @@ class SensorErrors:
         return _kept(sensor.slow, scales), estimate, total
 
     def least_slow(self, white: FloatArray, measurement: Measurement) -> FloatArray:
-        """(2,) the scales that there are at least: what a sensor's points do not tremble by, they are wrong by."""
+        """(2,) lower bounds of the systematic error's scale: total expected error minus the measured white noise."""
         missing = self._space.points * _LEAST_ERROR**2 - float(white.sum())
         return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), 0.0])
 

@@ -23,7 +23,7 @@ _EYE3 = np.eye(3)
 _MEAN_VARIANCE = _EYE3.reshape(-1) / 3.0
 """(9,) factors of a covariance, row by row."""
 _FORESEEABLE = 0.1
-"""Metres: standard deviation of a predicted point up to which its innovation tells of slow errors."""
+"""Metres: standard deviation of a predicted point up to which its innovation is used for slow errors."""
 _SETTLE_AFTER = 0.3
 """Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
 _AWAY_NS = NANOSECONDS // 4
@@ -322,7 +322,7 @@ class SkeletonUpdate:
         return sensor.stamps[-1] if sensor is not None and sensor.stamps else measurement.stamp_ns
 
     def _measured(self, state: State, measurement: Measurement) -> State:
-        """The lengths that many poses tell, which take the place of those that the filter had."""
+        """Replace the lengths by those estimated from many poses."""
         space = self._space
         if state.seen is None:
             return state

@@ -1,20 +1,19 @@
-"""Orientations of segments as measurements of the model's state: what is expected, and what their sources err by.
+"""Orientations of segments as measurements of the model's state, with the errors of their sources.
 
-A source says of its segment's rotation R to world
+A source measures its segment's rotation R to world as
 
     R_m = Exp(n) Exp(h z) Exp(g) R M,    M = Exp(m) M_0                                                   (1)
 
 with white noise n, an error h of its heading, an error g that persists for some seconds (of the filter in the source,
-of tissue), and a misalignment m with the segment. What a source states to err by is mostly what it does not know of how
-it is put on and of its heading, and so is the deviation of h and m at first; they walk at random, and are known as much
-better or worse as the source states to know its orientation later. g is a Gauss-Markov process of the few degrees that
-tissue and a source's own filter make. All seven numbers are estimated with the body; what they
-share with the pose (a forearm's misalignment about itself with its pronation) keeps its deviation, as nothing tells
-them apart. That holds as long as the linearisation has one direction for both whatever is found: the error m of the
-misalignment is told in the segment's frame, not in the sensor's, which turns with what is found (Huang, Mourikis and
-Roumeliotis 2010 on such false information). An angular velocity that comes with an orientation corrects the velocities
-alone: what it errs by lasts, and is no state here. Errors of rotations are rotation vectors (Sola, Deray and Atchuthan
-2018).
+of tissue), and a misalignment m with the segment. The covariance that a source states is mostly that of its
+mounting and heading, so it is the initial covariance of h and m. Both are random walks, and their variances follow
+later changes of the stated covariance. g is a Gauss-Markov process of a few degrees, by tissue and the source's own
+filter. All seven numbers are estimated with the body; their parts that cannot be distinguished from the pose (a
+forearm's axial misalignment and its pronation) keep their deviation. This requires a linearisation with the same
+direction for both at every estimate, so m is expressed in the segment's frame and not in the sensor's, which rotates
+with the estimate (Huang, Mourikis and Roumeliotis 2010 on such spurious information). An angular velocity that comes
+with an orientation corrects the velocities only: its error persists, and is not in the state. Errors of rotations are
+rotation vectors (Sola, Deray and Atchuthan 2018).
 """
 
 from __future__ import annotations
@@ -183,7 +182,7 @@ class Sources:
 
     @classmethod
     def none(cls) -> Self:
-        """Nobody."""
+        """No sources."""
         zero, whole = np.zeros(0), np.zeros(0, dtype=np.intp)
         cube = np.zeros((0, 3, 3))
         pairs, triples = np.zeros((0, 2)), np.zeros((0, 3))
@@ -193,7 +192,7 @@ class Sources:
         return len(self.names)
 
     def find(self, name: str) -> int | None:
-        """Which one is of this name; None where nobody is."""
+        """Index of the source of this name; None without one."""
         return self.names.index(name) if name in self.names else None
 
     def _but(self, **changes: Any) -> Self:
@@ -410,8 +409,8 @@ def _exp(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
 def pose_of(model: UpperBody, ranges: Ranges, measurements: Sequence[SegmentOrientation]) -> FloatArray:
     """(35,) the likeliest pose, with the base at the origin, of a body whose segments are turned so.
 
-    Maximum a posteriori by Gauss-Newton steps from several headings of the base: what no orientation tells is in the
-    middle of its range, and the pelvis upright.
+    Maximum a posteriori by Gauss-Newton steps from several headings of the base: coordinates without a measurement are
+    in the middle of their range, and the pelvis upright.
     """
     segments = np.array([SEGMENT_NUMBER[each.segment] for each in measurements], dtype=np.intp)
     measured = np.stack([each.rotation for each in measurements])

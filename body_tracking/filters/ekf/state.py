@@ -1,4 +1,4 @@
-"""What the extended filter estimates, and the space in which it does."""
+"""The state of the extended filter, and the layout of its vectors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Changeable:
     """A frozen dataclass without slots that is copied often."""
 
     def but(self, **changes: Any) -> Self:
-        """What ``dataclasses.replace`` makes, which takes thirty times as long for that many fields."""
+        """``dataclasses.replace``, thirty times as fast for that many fields."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         other.__dict__.update(changes)
@@ -59,7 +59,7 @@ class Measurement:
     """One frame of one sensor, on the model's points.
 
     Attributes:
-        sensor: who measured.
+        sensor: its name.
         stamp_ns: capture time.
         positions: (19, 3) metres in world; 0 where not measured.
         measured: (19,) which are.
@@ -77,7 +77,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class SensorState(Changeable):
-    """What the filter has learnt of a sensor.
+    """Estimated errors of a sensor.
 
     Attributes:
         stamps: nanoseconds of its last (at most 3) frames.
@@ -104,7 +104,7 @@ class SensorState(Changeable):
 
 @dataclass(frozen=True, eq=False)
 class State(Changeable):
-    """Everything that changes; never written into, so that an earlier one can be gone on from.
+    """The complete state, immutable, so that the filter can continue from an earlier one.
 
     Attributes:
         stamp_ns: of the state.
@@ -112,31 +112,30 @@ class State(Changeable):
         covariance: (85, 85) of the tangent, the lengths and the velocities; m more of m / 7 sources of orientations.
         log_density: (groups,) log of the spectral density of each group of coordinates.
         moved: (32,) faded sum of the corrections of the velocities.
-        moved_variance: (32,) its variance, if all is right.
-        sensors: what is known of each.
-        slow_names: (n,) those with whose slow errors the state is correlated.
+        moved_variance: (32,) its variance in a consistent filter.
+        sensors: estimated errors of each.
+        slow_names: (n,) sensors whose slow errors are correlated with the state.
         crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation. In
-            single precision: no other matrix is as large, with four cameras an eighth of a frame's time goes by half of
-            it, and what is only considered need not be known to more than seven digits.
+            single precision: seven digits are enough for considered states, and with four cameras half the size of this
+            largest matrix saves an eighth of a frame's time.
         rejected_for: (19,) seconds.
-        lean: (19, 3) metres, faded mean of the innovations: where a wrong pose shows that no frame alone gives away.
-        leaning: (19,) how many innovations it is worth.
-        strain: the greatest squared Mahalanobis distance of such a mean (chi-square with 3 degrees of freedom).
+        lean: (19, 3) metres, faded mean of the innovations, which shows wrong poses that no single frame shows.
+        leaning: (19,) effective number of innovations in it.
+        strain: greatest squared Mahalanobis distance of such a mean (chi-square with 3 degrees of freedom).
         used_ns: (19,) stamp of the last accepted measurement of each point.
-        since_prior: seconds since ranges of motion were last brought in.
+        since_prior: seconds since ranges of motion were last applied.
         tracked: seconds since the start.
         settled: the lengths are only considered.
-        seen: what tells the lengths; None from when they stay as they are.
-        measured_at: seconds since the start at which these were last brought in.
+        seen: estimator of the segment lengths; None once they are fixed.
+        measured_at: seconds since the start at which its lengths were last applied.
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
-        attempted_ns: when another pose was looked for last.
-        attempts: how often that was, each time soon after the last.
+        attempted_ns: stamp of the last search for another pose.
+        attempts: number of such searches in close succession.
         sources: of orientations.
         oriented_ns: stamp of the last accepted orientation.
-        unplaced: started by orientations: nothing tells where the base is.
-        doubt: faded logarithm of how much likelier frames are as seen than with left and right exchanged, of those
-            that contradict the state.
+        unplaced: started by orientations, with an unknown position of the base.
+        doubt: faded log likelihood ratio of contradicting frames as seen against left and right swapped.
     """
 
     stamp_ns: int
@@ -178,7 +177,7 @@ class State(Changeable):
 
 
 class StateSpace:
-    """The body, and where in the state what of it is.
+    """The body model, and the indices of its parts in the state.
 
     Args:
         model: the body.
@@ -224,7 +223,7 @@ class StateSpace:
                 self.thumbs[number] = model.joints == Joint[f"THUMB_{name.rsplit('_', 1)[1].upper()}"]
 
     def moved(self, state: State, correction: FloatArray) -> State:
-        """The state moved by a correction (85,)."""
+        """The state after a correction (85,)."""
         lengths = state.lengths if state.settled else state.lengths + correction[self.lengths]
         return state.but(
             q=self.model.integrate(state.q, correction[self.tangent]),
