@@ -39,7 +39,10 @@ def sensor_colours(sensors: Sequence[str]) -> dict[str, Colour]:
 
 
 def joint_colours(states: NDArray[np.uint8], own: Colour) -> ColourArray:
-    """(n, 3) RGB of joints with (n,) ``TrackingState``; ``own`` is the colour of tracked joints."""
+    """(n, 3) RGB of joints with (n,) ``TrackingState``; ``own`` is the colour of tracked joints.
+
+    Schlagenhauf 2017, section 5.9, figures 5.18-5.19.
+    """
     table = np.empty((len(TrackingState), 3), np.uint8)
     table[[TrackingState.NOT_TRACKED, TrackingState.INFERRED, TrackingState.TRACKED]] = NOT_TRACKED, INFERRED, own
     colours: ColourArray = table[states]

@@ -34,7 +34,7 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
         ({"ROS_DOMAIN_ID": "233"}, PROBLEM, "0 to 232"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, PROBLEM, "do not find each other"),
         ({"ROS_LOCALHOST_ONLY": "1"}, WARNING, "ROS_LOCALHOST_ONLY=1"),
-        ({"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, WARNING, "who hears whom"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, WARNING, "limits which nodes find each other"),
         ({"ROS_DISCOVERY_SERVER": "10.0.0.1:11811"}, WARNING, "10.0.0.1"),
     ],
 )

