@@ -2,6 +2,8 @@
 
 Messages are CDR bytes; :func:`serialize` and :func:`deserialize` convert them. Layout: https://github.com/ros2/rosbag2
 (metadata version 9) and the ``ros2`` profile of https://mcap.dev/spec/registry. All times are integer nanoseconds.
+
+Over 500 lines: reader, writer and metadata of one format, which must agree.
 """
 
 from __future__ import annotations
