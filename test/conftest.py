@@ -25,7 +25,10 @@ dds.prepare()  # what tests send is sent again as soon as what nodes send
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # so a shell without job control starts what it runs in the background, and every process would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
-PROCESSES = ("nodes", "ros2", "test_cli.py", "test_docs.py", "test_package.py", "test_up.py")
+PROCESSES = (
+    *("nodes", "ros2", "test_cli.py", "test_docs.py", "test_fifth_system.py", "test_live_equals_offline.py"),
+    *("test_package.py", "test_up.py"),
+)
 
 
 def _starts_processes(path: Path) -> bool:
