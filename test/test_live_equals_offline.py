@@ -184,6 +184,7 @@ def frames(bag: Path) -> dict[str, int]:
         return {name: reader.topics[name].count for name in map(graph.skeleton_topic, graph.DEFAULT_SENSORS)}
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_files_in_place_of_sensors_give_what_a_replay_of_their_recording_gives(tmp_path: Path, wave: Path) -> None:
     """In real time, without a bag's clock."""
