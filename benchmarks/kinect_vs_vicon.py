@@ -38,7 +38,6 @@ from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint
 from body_tracking.evaluation.metrics import sample
 from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.filters.ekf import ExtendedKalmanFilter
-from body_tracking.filters.smoother import smooth
 from body_tracking.kinect.axes import camera_space_to_optical
 
 CLIPS = ("m07_s01_e01", "m07_s01_e02", "m08_s01_e01", "m09_s01_e01", "m10_s01_e01", "m10_s01_e02")
@@ -185,10 +184,9 @@ METHODS: dict[str, Method] = {
     RAW: lambda skeletons: skeletons,
     "lkf_constant_velocity": lambda skeletons: filtered(skeletons, make_filter("lkf_constant_velocity")),
     "ekf": lambda skeletons: filtered(skeletons, ExtendedKalmanFilter()),
-    "ekf, smoothed": lambda skeletons: [out for out in smooth([("", each) for each in skeletons]).skeletons if out],
 }
 """All at their default settings, from each clip's first frame on."""
-HELD = ("ekf", "ekf, smoothed")
+HELD = ("ekf",)
 """Those that are held to the bars."""
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -32,7 +33,12 @@ def _found() -> tuple[System, ...]:
         path.parent.name for path in Path(__file__).parent.glob("*/system.py") if path.parent.name != "pipeline"
     )
     ours = [load(f"body_tracking.{folder}.system:SYSTEM") for folder in folders]
-    others = [entry.load() for entry in entry_points(group=ENTRY_POINTS)]
+    others = []
+    for entry in entry_points(group=ENTRY_POINTS):
+        try:
+            others.append(entry.load())
+        except Exception as error:  # of another package, which must not stop ours
+            print(f"body_tracking: system {entry.name} ({entry.value}) is left out: {error}", file=sys.stderr)
     return tuple(sorted([*ours, *others], key=lambda system: (system.order, system.name)))
 
 
@@ -217,12 +223,12 @@ def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, 
     hosts = sorted(
         (spec for spec in specs if spec.executable in STAGES), key=lambda spec: STAGES.index(spec.executable)
     )
+    from body_tracking.pipeline.offline import connect  # numpy takes its time
+
     stages = {}
     for spec in hosts:
         own = {name: value for name, value in parameters[spec.name].items() if not is_ros_own(name)}
         stages[spec.name] = stage_class(spec.executable)(check_all(parameters_of(spec.executable), own))
-    from body_tracking.pipeline.offline import connect  # numpy takes its time
-
     connect(tuple(stages.values()))
     return stages
 

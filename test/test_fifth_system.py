@@ -77,6 +77,19 @@ def test_its_topic_parameter_option_and_layer_are_among_the_graphs() -> None:
     assert HEIGHT in done.stdout and done.stdout.rstrip().endswith("['heights']")
 
 
+def test_a_broken_system_is_named_and_left_out(tmp_path: Path) -> None:
+    folder = tmp_path / "broken-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[body_tracking.systems]\nbroken = nowhere.system:SYSTEM\n")
+    path = os.pathsep.join([str(ROOT), str(tmp_path)])
+    line = [sys.executable, "-m", "body_tracking.cli", "--help"]
+    done = subprocess.run(line, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    assert "replay" in done.stdout
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("body_tracking: system broken (nowhere.system:SYSTEM) is left out: ")
+
+
 def test_its_layer_is_drawn_and_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser")
     monkeypatch.syspath_prepend(str(ROOT / "test" / "fifth_system"))

@@ -37,8 +37,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -332,26 +332,6 @@ class _Evidence:
     counts: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
     variance: FloatArray = field(default_factory=lambda: np.zeros(len(LEARNT)))
 
-    def copied(self) -> _Evidence:
-        return replace(self, recent=self.recent.copy())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Snapshot:
-    """State of :class:`JointCentres` at some time."""
-
-    sensors: Mapping[str, _Evidence]
-    offsets: Offsets | None
-    before: FloatArray
-    since_ns: int
-    first_ns: int
-    held_ns: int
-    refused_ns: int
-
-    def as_long_known(self) -> Snapshot:
-        """The same, with the offsets fully in force."""
-        return replace(self, since_ns=_LONG_AGO_NS, first_ns=_LONG_AGO_NS)
-
 
 class JointCentres:
     """Estimates the offsets of one person's joints, and subtracts them.
@@ -373,20 +353,11 @@ class JointCentres:
 
     def reset(self) -> None:
         """Forget the person."""
-        self.restore(Snapshot({}, None, np.zeros((len(LEARNT), 3)), 0, 0, _LONG_AGO_NS, _LONG_AGO_NS))
-
-    def snapshot(self) -> Snapshot:
-        """The present state, for :meth:`restore`."""
-        sensors = {name: seen.copied() for name, seen in self._sensors.items()}
-        times = self._since_ns, self._first_ns, self._held_ns, self._refused_ns
-        return Snapshot(sensors, self.offsets, self._before, *times)
-
-    def restore(self, snapshot: Snapshot) -> None:
-        """Return to an earlier state."""
-        self._sensors = {name: seen.copied() for name, seen in snapshot.sensors.items()}
-        self.offsets, self._before = snapshot.offsets, snapshot.before
-        self._since_ns, self._first_ns = snapshot.since_ns, snapshot.first_ns
-        self._held_ns, self._refused_ns = snapshot.held_ns, snapshot.refused_ns
+        self._sensors: dict[str, _Evidence] = {}
+        self.offsets: Offsets | None = None
+        self._before: FloatArray = np.zeros((len(LEARNT), 3))
+        self._since_ns = self._first_ns = 0
+        self._held_ns = self._refused_ns = _LONG_AGO_NS
 
     def update(self, skeleton: Skeleton, sensor: str = "") -> bool:
         """Check a frame for a T-pose, and update the offsets with it.

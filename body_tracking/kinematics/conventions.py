@@ -20,7 +20,7 @@ dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematic
 
 Uncertainty is propagated by the analytic Jacobian. Near a singular pose it grows as 1 / sin, up to that of a uniform
 angle, and the angles are held continuous (``kinematics.euler``). An unobserved angle has the standard deviation of its
-prior. :func:`segment_quaternions` has no singular pose.
+prior.
 """
 
 from __future__ import annotations
@@ -400,52 +400,3 @@ def angles_of(estimate: ModelEstimate, model: UpperBody, name: str, previous: Jo
         ConventionError: no such convention, or previous angles of another one.
     """
     return convention(name, model)(estimate, previous)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SegmentQuaternions:
-    """Orientations of the segments, without singular poses.
-
-    Attributes:
-        stamp_ns: capture time, nanoseconds.
-        frame_id: the frame of the orientations in world.
-        names: s segments.
-        parents: index of each segment's parent; -1 for the base, whose orientation against its parent is that in world.
-        relative: (s, 4) unit quaternions xyzw, a segment's vectors to its parent.
-        world: (s, 4) unit quaternions xyzw, a segment's vectors to world.
-        relative_stddev: (s, 3) radians: of a small rotation vector in the segment's own frame, against its parent.
-        world_stddev: (s, 3) radians: the same against world.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    relative: FloatArray
-    world: FloatArray
-    relative_stddev: FloatArray
-    world_stddev: FloatArray
-
-
-def segment_quaternions(estimate: ModelEstimate, model: UpperBody) -> SegmentQuaternions:
-    """Orientation of every segment, with standard deviations."""
-    linear = model.linearise(estimate.q, estimate.lengths)
-    rotations, turning = linear.posture.rotations, linear.rotation_jacobian
-    parents = np.array(model.parents)
-    based = (parents >= 0)[:, None, None]
-    relative = np.where(based, rotations[parents].swapaxes(-1, -2), np.eye(3)) @ rotations
-    own = rotations.swapaxes(-1, -2)
-    in_parent = own @ (turning - np.where(based, turning[parents], 0.0))
-    covariance, unknown = _finite(estimate.covariance[: model.nv, : model.nv])
-    gradients = np.concatenate([in_parent, own @ turning]).reshape(-1, model.nv)
-    stddev = _stddev(gradients, covariance, unknown).reshape(2, -1, 3)
-    return SegmentQuaternions(
-        estimate.stamp_ns,
-        estimate.frame_id,
-        model.segment_names,
-        model.parents,
-        so3.matrix_to_quat(relative),
-        so3.matrix_to_quat(rotations),
-        stddev[0],
-        stddev[1],
-    )

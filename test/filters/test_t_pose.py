@@ -10,9 +10,7 @@ import pytest
 from body_tracking.calibration.joint_centres import LEARNT, posed
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import FloatArray, Joint, Skeleton
-from body_tracking.filters import SkeletonFilter, make_filter, smoother
-from body_tracking.filters.ekf import EkfParameters
-from body_tracking.filters.smoother import Smoothed, smooth
+from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from draws import draws
 from walkers import TRACKED, frame, performed
@@ -135,44 +133,3 @@ def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
             known = lengths[ekf.model.length_names.index(f"{name}_{side}")]  # type: ignore[attr-defined]
             real = np.linalg.norm(true[Joint[f"{end}_{side.upper()}"]] - true[Joint[f"{start}_{side.upper()}"]])
             assert known == pytest.approx(real, abs=0.015)
-
-
-def elbows_off(smoothed: Smoothed) -> FloatArray:
-    """(n, 2) degrees by which elbows are off in each frame that shows the person."""
-    pairs = zip(smoothed.skeletons, reaching(), strict=False)
-    return np.degrees([off(found, true)[ELBOWS] for found, true in pairs if found is not None])
-
-
-@pytest.mark.slow
-def test_in_a_recording_what_a_t_pose_tells_holds_before_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pose is known after 21 frames. Live, all before is as it was seen; the smoother corrects the first 15, too.
-
-    The bound is a share of the error without the pose, which was above 12 degrees until a posture prior replaced the
-    centre of the ranges of motion, and is 10 degrees since.
-    """
-    monkeypatch.setattr(smoother, "_SECTION", 60)
-    frames = [("kinect1", each) for each in skeletons()[:240]]
-    off = elbows_off(smooth(frames))
-    without = elbows_off(smooth(frames, EkfParameters(t_pose=False)))
-    assert rms(off[:15]) < min(5.0, 0.45 * rms(without[:15]))
-    assert rms(off[150:]) < min(5.0, 0.4 * rms(without[150:]))
-
-
-@pytest.mark.parametrize(("posture", "tolerance"), [(False, 1e-9), pytest.param(True, 1e-5, marks=pytest.mark.slow)])
-def test_a_recording_is_smoothed_in_sections_as_in_one(
-    monkeypatch: pytest.MonkeyPatch, posture: bool, tolerance: float
-) -> None:
-    """The recursion is the same to rounding errors.
-
-    What is handed out of a state takes the uncertainty of the joints' centres as it is known at the end of the section,
-    and posture weighs by it: that moves the output by up to 9 micrometres.
-    """
-    frames = [("kinect1", each) for each in skeletons()[:90]]
-    parameters = EkfParameters(posture=posture)
-    whole = smooth(frames, parameters, learn=False)
-    monkeypatch.setattr(smoother, "_SECTION", 25)
-    parts = smooth(frames, parameters, learn=False)
-    for one, other in zip(whole.skeletons, parts.skeletons, strict=True):
-        assert (one is None) == (other is None)
-        if one is not None and other is not None:
-            np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=tolerance)

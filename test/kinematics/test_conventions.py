@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,7 +16,6 @@ from body_tracking.kinematics.conventions import (
     UNIFORM_STDDEV,
     ConventionError,
     angles_of,
-    segment_quaternions,
 )
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
@@ -425,44 +422,3 @@ def test_names_and_stamp() -> None:
         assert angles.stamp_ns == 7
         assert len(set(angles.names)) == count
         assert all(getattr(angles, field).shape == (count,) for field in ("position", "velocity", "position_stddev"))
-
-
-def test_segment_quaternions_are_the_models_rotations() -> None:
-    for q in poses(10):
-        result = segment_quaternions(estimate(q), MODEL)
-        r = MODEL.forward(q, LENGTHS).rotations
-        np.testing.assert_allclose(so3.quat_to_matrix(result.world), r, rtol=0, atol=1e-12)
-        for segment, parent in enumerate(result.parents):
-            expected = r[segment] if parent < 0 else r[parent].T @ r[segment]
-            np.testing.assert_allclose(so3.quat_to_matrix(result.relative[segment]), expected, rtol=0, atol=1e-12)
-
-
-def test_segment_quaternion_deviations_match_their_scatter_in_the_t_pose() -> None:
-    rng = np.random.default_rng(4)
-    root = rng.normal(size=(NV, NV))
-    covariance = np.zeros((2 * NV, 2 * NV))
-    covariance[:NV, :NV] = (0.5 * DEGREE) ** 2 * (np.eye(NV) + root @ root.T / NV)
-    q = arms(0, 90)
-    now = segment_quaternions(estimate(q, covariance=covariance), MODEL)
-    errors = rng.multivariate_normal(np.zeros(NV), covariance[:NV, :NV], size=3000)
-    moved = MODEL.forward(MODEL.integrate(q, errors), LENGTHS).rotations
-    parents = np.array(now.parents)
-    world = so3.quat_multiply(so3.quat_inverse(now.world), so3.matrix_to_quat(moved))
-    np.testing.assert_allclose(so3.log(world).std(axis=0) / now.world_stddev, 1.0, atol=0.08)
-    relative = so3.matrix_to_quat(moved[:, parents[1:]].swapaxes(-1, -2) @ moved[:, 1:])
-    scatter = so3.log(so3.quat_multiply(so3.quat_inverse(now.relative[1:]), relative)).std(axis=0)
-    stated = now.relative_stddev[1:]
-    moves = stated > 1e-9  # joints of two axes do not turn about the third
-    np.testing.assert_allclose(scatter[moves] / stated[moves], 1.0, atol=0.08)
-    assert scatter[~moves].max() < 1e-3
-    np.testing.assert_allclose(now.relative_stddev[0], now.world_stddev[0])
-
-
-def test_an_unknown_orientation_is_infinitely_uncertain() -> None:
-    covariance = 1e-6 * np.eye(2 * NV)
-    number = MODEL.coordinate_names.index("forearm_pronation_left")
-    covariance[number, number] = np.inf
-    result = segment_quaternions(replace(estimate(arms(0, 45)), covariance=covariance), MODEL)
-    infinite = {result.names[s] for s in range(len(result.names)) if np.isinf(result.world_stddev[s]).any()}
-    assert infinite == {"forearm_left", "hand_left"}
-    assert np.isfinite(result.relative_stddev[result.names.index("hand_left")]).all()

@@ -119,13 +119,6 @@ class Motion:
         """Turn the rows (85, n) of the base's and the shoulders' rotation in place, by (3, 3, 3) for each of these."""
         errors[self._ball_rows] = (turns @ errors.take(self._model.ball_v, axis=0)).reshape(len(self._ball_rows), -1)
 
-    def turning_back(self, step: FloatArray) -> FloatArray:
-        """(32, 32) how an error of the tangent is seen from the moved configuration (adjoint, Sola eq. 82)."""
-        turn = np.eye(self._space.nv)
-        rows = self._model.ball_v
-        turn[rows[:, :, None], rows[:, None, :]] = so3.quat_to_matrix(so3.exp(-step[rows]))
-        return turn
-
     def densities_learnt(
         self, state: State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
     ) -> FloatArray:
