@@ -96,6 +96,10 @@ def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> A
         return yaml.load(text, loader)
     except BodyTrackingError:
         raise
+    except yaml.MarkedYAMLError as error:
+        if "nesting depth" in str(error):  # libyaml's own limit (1000), before it tells of the first level
+            raise FileLimitError(f"is not read (nested deeper than {MAX_DEPTH})") from error
+        raise FileError(f"is not YAML ({' '.join(str(error).split())})") from error
     except Exception as error:  # constructors of numbers and times raise errors of their own
         raise FileError(f"is not YAML ({' '.join(str(error).split()) or type(error).__name__})") from error
 
