@@ -269,7 +269,8 @@ class Supervisor:
         self.subscribers = subscribers(specs, parameters)
         self.console = Console()
         self.children = [Child(spec, dict(parameters[spec.name])) for spec in specs]
-        self.stopping = threading.Event()
+        # Not an Event: its lock may be held by the very wait that a signal interrupts.
+        self.stopping = False
         self.failure = ""
         self._bag_start_ns = 0
         if options["bag"]:
@@ -283,7 +284,8 @@ class Supervisor:
         begin = time.monotonic()
         self.console.line(f"starting {', '.join(child.spec.name for child in self.children)}")
         try:
-            while not self.stopping.wait(0.05):
+            while not self.stopping:
+                time.sleep(0.05)
                 if monitor.has_predecessor():
                     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
                     self.failure = (
@@ -309,7 +311,7 @@ class Supervisor:
         return 0
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.stopping.set()
+        self.stopping = True
 
     def _restarts(self) -> dict[str, int]:
         return {child.spec.name: child.restarts for child in self.children if child.restarts}
@@ -376,7 +378,7 @@ class Supervisor:
             return
         if code == CANNOT_START and child.restarts == 0:
             self.failure = child.last_lines[-1] if child.last_lines else f"{child.spec.name} could not start"
-            self.stopping.set()
+            self.stopping = True
             return
         child.deaths = 1 if now - child.started > SETTLED else child.deaths + 1
         child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
@@ -398,7 +400,7 @@ class Supervisor:
                 if not text or (level is not None and level[1] in ("DEBUG", "INFO")) or _FAST_DDS.search(text):
                     continue
                 child.last_lines.append(text)
-                if not self.stopping.is_set() and not text.startswith(f"{child.spec.executable}: "):
+                if not self.stopping and not text.startswith(f"{child.spec.executable}: "):
                     self.console.line(f"{child.spec.name}: {text}", error=True)
 
     # --- ending
@@ -412,14 +414,15 @@ class Supervisor:
                 child.process.send_signal(signal.SIGINT)
             end = time.monotonic() + FINISH_TIMEOUT
             while any(child.process is not None and child.process.poll() is None for child in running):
-                if self.stopping.wait(0.02):
+                time.sleep(0.02)
+                if self.stopping:
                     return
                 if time.monotonic() > end:
                     self.console.line(f"{executable} did not finish in {FINISH_TIMEOUT:g} s", error=True)
                     break
 
     def _stop_all(self) -> None:
-        self.stopping.set()
+        self.stopping = True
         recorders = [child for child in self.children if child.spec.executable == "bag_recorder"]
         others = [child for child in self.children if child not in recorders]
         for group in (others, recorders):  # the recorder last, so that it records everything
