@@ -30,6 +30,12 @@ PROCESSES = (
     *("test_package.py", "test_up.py"),
 )
 
+LONGEST = (
+    *("works[README]", "test_live_equals_offline.py", "ros2/test_launch.py", "test_fifth_system.py"),
+    "test_namespaces.py",
+)
+"""Of these, so that none of them is left over at the end."""
+
 
 def _starts_processes(path: Path) -> bool:
     return path.relative_to(ROOT / "test").parts[0] in PROCESSES
@@ -44,7 +50,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that start processes, which run in a phase of their own."""
+    """Mark the tests that start processes, which run in a phase of their own, those that take longest first."""
+    items.sort(key=lambda item: not any(each in item.nodeid for each in LONGEST))
     for item in items:
         if _starts_processes(item.path):
             item.add_marker(pytest.mark.processes)

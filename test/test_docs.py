@@ -42,14 +42,16 @@ def commands(page: Path) -> list[str]:
     return [text for language, text in blocks(page) if language == "sh" and not MARK.match(text)]
 
 
-# doctor finds fault with a machine on which others work
-ALONE = {"troubleshooting"}
+ALONE = {"troubleshooting": pytest.mark.alone}
+"""doctor finds fault with a machine on which others work."""
+SLOW = dict.fromkeys(("first_ten_minutes", "reading_uncertainty", "choosing_a_filter"), pytest.mark.slow)
+"""Most of their commands are also those of the README."""
 
 
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=page.stem, marks=[pytest.mark.alone] if page.stem in ALONE else [])
+        pytest.param(page, id=page.stem, marks=[marks[page.stem] for marks in (ALONE, SLOW) if page.stem in marks])
         for page in PAGES
         if commands(page)
     ],

@@ -71,6 +71,7 @@ def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -
     # A message is left out where it was sent so long before; to which the nodes add what they need on a busy machine.
     undisturbed = [*before, *(each for each in live.stamps if each[0] > continued_ns)]
     delay = max(arrival - stamp for stamp, arrival in undisturbed)
-    oldest = continued_ns - min(stamp for stamp, _ in live.stamps)
+    # One may have been between the last look at the clock and the system call that sends it, which nothing can see.
+    oldest = continued_ns - sorted(stamp for stamp, _ in live.stamps)[1]
     assert oldest / NANOSECONDS < MAX_AGE + max(0.2, delay / NANOSECONDS)
     assert delay / NANOSECONDS < STOPPED / 2  # or the test would say nothing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from sensor_msgs.msg import JointState
 from tools import NO_DAEMON, Tools
 
@@ -42,9 +44,9 @@ def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhi
         assert bag.whole and bag.topics[ANGLES].count > 0
 
 
-def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools: Tools) -> None:
+def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools: Tools, wave: Path) -> None:
     angles = tools.bench.collect(JointState, f"/lab{ANGLES}")
-    launch = tools.launch(f"bag:={tools.bag()}", "namespace:=lab", "record:=live", "rate:=1.5")
+    launch = tools.launch(f"bag:={wave}", "namespace:=lab", "record:=live", "rate:=0.7")
     assert tools.bench.until(lambda: angles, SOON), launch.text()
     names = {name for name, _ in tools.bench.node.get_topic_names_and_types()}
     assert {f"/lab{graph.FUSED}", f"/lab{graph.FILTERED}", f"/lab{graph.CALIBRATION}"} <= names
