@@ -7,10 +7,12 @@ colcon installs starts it with blocked signals.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +26,12 @@ def start(name: str) -> None:
     imported = threading.Event()
     threading.Thread(target=_leave_unless, args=(imported,), daemon=True).start()
     if importlib.util.find_spec(f"body_tracking.nodes.{name}") is not None:
-        main = importlib.import_module(f"body_tracking.nodes.{name}").main
+        node = importlib.import_module(f"body_tracking.nodes.{name}")
+        main = node.main
+        if not {"-h", "--help"} & set(sys.argv):
+            for module in getattr(node, "IMPORTED_AT_START", ()):
+                with contextlib.suppress(ImportError):  # the node says what it lacks
+                    importlib.import_module(module)
     else:  # of a system of another package
         main = importlib.import_module("body_tracking.ros.host").host_of(name)
     imported.set()

@@ -14,7 +14,7 @@ import traceback
 from collections import deque
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -79,6 +79,10 @@ _SHARE = 0.25
 _FAILURES = 10
 """Consecutive failed drawings after which the node ends."""
 _NICE = 10
+
+
+IMPORTED_AT_START: Final = ("body_tracking.viewing.page",)
+"""Takes a second, in which a signal ends the process at once."""
 
 
 class ViewerNode(GraphNode):

@@ -80,6 +80,9 @@ STOP_TIMEOUT = 8.0
 FINISH_TIMEOUT = 60.0
 """Seconds for a node to handle its remaining messages after the end of a bag."""
 
+LOOK_PERIOD = 0.25
+"""Seconds between two looks at the graph, for the status line and for another ``up``."""
+
 LINE_PERIOD = 5.0
 """Seconds between status lines where stdout is no terminal."""
 
@@ -284,8 +287,16 @@ class Supervisor:
         begin = time.monotonic()
         self.console.line(f"starting {', '.join(child.spec.name for child in self.children)}")
         try:
+            looked = begin
             while not self.stopping:
                 time.sleep(0.05)
+                self._supervise(monitor)
+                if any(child.done for child in self.children):
+                    self._finish()
+                    break
+                if time.monotonic() - looked < LOOK_PERIOD:
+                    continue
+                looked = time.monotonic()
                 if monitor.has_predecessor():
                     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
                     self.failure = (
@@ -293,11 +304,7 @@ class Supervisor:
                         "end it, or give this one another ROS_DOMAIN_ID"
                     )
                     break
-                self._supervise(monitor)
-                self.console.status(monitor.line(self.options, time.monotonic() - begin, self._restarts()))
-                if any(child.done for child in self.children):
-                    self._finish()
-                    break
+                self.console.status(monitor.line(self.options, looked - begin, self._restarts()))
         finally:
             self._stop_all()
             for number, handler in handlers.items():
