@@ -89,6 +89,7 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
         yield running
 
 
+@pytest.mark.slow
 def test_two_rigs_run_in_one_domain(rigs: Rigs) -> None:
     there = {topic for topic, _ in rigs.node.get_topic_names_and_types()}
     assert not [topic for topic in there - names.WHOLE_DOMAIN if not topic.startswith(("/left/", "/right/"))]

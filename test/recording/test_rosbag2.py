@@ -507,9 +507,10 @@ def test_kill_9_leaves_a_bag_that_opens(tmp_path):
     try:
         until = time.monotonic() + 30
         while time.monotonic() < until:
-            if (tmp_path / "bag" / "bag_0.mcap").exists() and len(read(tmp_path / "bag")) > 100:
-                break
             time.sleep(0.1)
+            file = tmp_path / "bag" / "bag_0.mcap"
+            if file.exists() and file.stat().st_size and len(read(tmp_path / "bag")) > 100:
+                break
         process.send_signal(signal.SIGKILL)
     finally:
         process.kill()
