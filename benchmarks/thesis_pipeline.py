@@ -1,9 +1,10 @@
 """The whole of Schlagenhauf (2017), chapter 5, as a baseline: calibrate, pair, fuse, filter. For others to import.
 
-As published, with the errors of DESIGN 4 (1-3) corrected and nothing else: one registration from the first 50 frames,
-in the T-pose (section 5.3.1); whatever each sensor said last, taken together when the first one speaks (section 5.2:
-two computers, no common clock); weights by the tracking states as her text has them (section 5.3.2); LKF1, LKF2 or her
-extended filter, as ``filters.thesis`` and ``filters.schlagenhauf`` have them.
+As published, with its three errors (transposed rotation, weights, innovation) corrected and nothing else: one
+registration from the first 50 frames, in the T-pose (section 5.3.1); whatever each sensor said last, taken together
+when the first one speaks (section 5.2: two computers, no common clock); weights by the tracking states as her text
+has them (section 5.3.2); LKF1, LKF2 or her extended filter, as ``filters.thesis`` and ``filters.schlagenhauf`` have
+them.
 """
 
 from __future__ import annotations

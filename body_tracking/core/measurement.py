@@ -1,4 +1,4 @@
-"""Measurement noise of a skeleton camera's joints (DESIGN 6), and the heading of a body.
+"""Measurement noise of a skeleton camera's joints, and the heading of a body.
 
 The noise of a joint depends on its tracking state, its distance and the body's yaw to the sensor. Calibration, fusion
 and filters all use this model.

@@ -1,4 +1,4 @@
-"""The default model: an upper body on a free base, in anatomical joint order (DESIGN 5).
+"""The default model: an upper body on a free base, in anatomical joint order.
 
 Pelvis, lower and upper trunk, head, and per side clavicle, upper arm, forearm and hand. All segment frames are aligned
 with the world (x forward, y left, z up) in the neutral-zero pose of clinical goniometry: upright, arms hanging, elbows

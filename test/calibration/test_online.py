@@ -126,7 +126,7 @@ def test_the_thesis_method_keeps_its_still_pose(shared_data: Path) -> None:
     _, updates = run(recording(shared_data / "kinect_pairs" / "p12_90deg.csv.gz"), method="thesis")
     yaws = {round(np.degrees(relative_yaw(update.result, "kinect2")), 6) for update in updates}
     assert len(yaws) == 1
-    # DESIGN 4.8: one still pose calibrates wide layouts wrongly.
+    # One still pose calibrates wide layouts wrongly.
     assert yaws.pop() > NOMINAL["90deg"] + 5.0
 
 

@@ -28,7 +28,7 @@ def test_recovers_any_rigid_motion(seed: int) -> None:
 
 
 def test_a_noisy_t_pose_is_never_reflected() -> None:
-    """DESIGN 4.1: without the determinant check 0.6-18 % of T-poses with 20-40 mm noise come out mirrored."""
+    """Without the determinant check 0.6-18 % of T-poses with 20-40 mm noise come out mirrored."""
     rng = np.random.default_rng(1)
     pose = performed("two_handed_wave", np.array([1.0]))[0]
     pose = (pose - pose.mean(axis=0)) * [0.3, 1.0, 1.0]

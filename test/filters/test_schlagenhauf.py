@@ -212,7 +212,7 @@ def test_velocities_and_covariances_are_those_of_the_state() -> None:
 
 
 def test_unobserved_angles_grow_uncertain_without_bound() -> None:
-    """What DESIGN 4 (5) says of her filter: 18 observed directions in the T-pose, the others wander."""
+    """Of her filter: 18 observed directions in the T-pose, the others wander."""
     tracker = started()
     largest = []
     for k in range(FRAMES + 1, FRAMES + 601):
@@ -224,7 +224,7 @@ def test_unobserved_angles_grow_uncertain_without_bound() -> None:
 
 
 def test_its_time_step_is_fixed() -> None:
-    """DESIGN 5.7, as published: the stamps change nothing but their order, and a gap is one step."""
+    """As published: the stamps change nothing but their order, and a gap is one step."""
     rng = np.random.default_rng(5)
     regular, irregular = started(), started()
     stamp_ns = FRAMES * FRAME_NS

@@ -1,4 +1,4 @@
-"""The thesis's weights: by its text and by its formula (DESIGN 4.2)."""
+"""The thesis's weights: by its text and by its formula."""
 
 from __future__ import annotations
 
