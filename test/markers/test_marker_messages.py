@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.markers.observations import ImageBalls, Points, TargetPose
-from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
-from body_tracking.messages.images import array_to_image, image_to_array
-from body_tracking.messages.marker_observations import (
+from body_tracking.markers.messages import (
     balls_to_cloud,
     cloud_to_balls,
     cloud_to_points,
@@ -19,6 +16,9 @@ from body_tracking.messages.marker_observations import (
     points_to_cloud,
     target_pose_to_message,
 )
+from body_tracking.markers.observations import ImageBalls, Points, TargetPose
+from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
+from body_tracking.messages.images import array_to_image, image_to_array
 from body_tracking.recording.rosbag2 import BAG_MESSAGES
 
 STAMP_NS = 1_750_000_000_123_456_789
