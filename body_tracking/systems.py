@@ -10,7 +10,7 @@ import argparse
 import importlib
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
@@ -126,7 +126,9 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
         value = getattr(args, name, None)
         if value is None:
             continue
-        if name == "sensors":
+        if name == "sensors" and value == graph.NO_SENSORS:
+            value = ()
+        elif name == "sensors":
             value = tuple(each for each in value.split(",") if each)
             if not value:
                 raise graph.GraphError("sensors: no name")
@@ -158,11 +160,13 @@ def with_file(options: Options, file: Path | None) -> Options:
     return found
 
 
-def bodies_of(options: Options) -> tuple[str, ...]:
-    """The ids of all people who may be tracked; empty with one subject."""
-    from body_tracking.pipeline.people import ALL, MAX_PEOPLE
+def played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
+    """The topics of a bag that take the place of the sensors.
 
-    return graph.bodies(int(str(options["people"])) or MAX_PEOPLE) if options["subject"] == ALL else ()
+    Raises:
+        GraphError: a topic is missing.
+    """
+    return tuple(topic for system in SYSTEMS for topic in system.played(options, topics))
 
 
 # --- the graph
@@ -178,17 +182,24 @@ def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
         SensorNameError: an invalid name of a sensor.
     """
     specs = [spec for system in SYSTEMS for spec in system.specs(options)]
+    if not any(NODES[spec.executable].place < Place.CONSUMER and not is_player(spec) for spec in specs):
+        raise graph.GraphError("no sensors")
     specs.sort(key=lambda spec: -NODES[spec.executable].place)
     return tuple(
         replace(
             spec,
             namespace=str(options["namespace"]),
             parameters=spec.parameters
-            if spec.executable == "bag_player"
+            if is_player(spec)
             else {**spec.parameters, "use_sim_time": bool(options["bag"])},
         )
         for spec in specs
     )
+
+
+def is_player(spec: NodeSpec) -> bool:
+    """Whether the node plays a bag in place of sensors."""
+    return spec.executable == "bag_player"
 
 
 def is_source(spec: NodeSpec) -> bool:
@@ -198,14 +209,8 @@ def is_source(spec: NodeSpec) -> bool:
 
 def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     """The nodes of a graph, and all that it could have: live, with a bag, and with all optional nodes."""
-    more = {
-        **options,
-        "record": "recording",
-        "imus": options["imus"] or graph.EXAMPLE_IMUS,
-        "robot": options["robot"] or "robot.yaml",
-        "viewer": True,
-        "markers": True,
-    }
+    examples = {each.name: options[each.name] or each.example for each in OPTIONS.values() if each.example is not None}
+    more: Options = {**options, **examples}
     variants = [options] + [{**more, "bag": bag} for bag in ("", options["bag"] or "bag")]
     return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
 
@@ -240,7 +245,7 @@ def subscribers(specs: Sequence[NodeSpec], parameters: Mapping[str, Mapping[str,
     published = {port.topic for stage in stages.values() for port in stage.outputs if not port.optional}
     for spec in specs:
         given = parameters[spec.name]
-        if spec.executable == "bag_player" and isinstance(played := given["topics"], tuple):
+        if is_player(spec) and isinstance(played := given["topics"], tuple):
             published.update(played)
         elif is_source(spec):
             published.add(graph.skeleton_topic(str(given["sensor"])))
@@ -248,6 +253,12 @@ def subscribers(specs: Sequence[NodeSpec], parameters: Mapping[str, Mapping[str,
         if (takes := NODES[spec.executable].takes) is not None:
             count.update(takes(parameters[spec.name], published))
     return dict(count)
+
+
+def angles_topics(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> tuple[str, ...]:
+    """The topics of joint angles that a graph publishes; arguments and errors as of :func:`stages_for`."""
+    stages = stages_for(specs, parameters).values()
+    return tuple(port.topic for stage in stages for port in stage.outputs if graph.is_joint_states(port.topic))
 
 
 CONFIG_HEADER = """\

@@ -22,7 +22,7 @@ from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rosbag2 import is_known
 from body_tracking.robot.system import convention_of
-from body_tracking.systems import EXECUTABLES, TOPICS, all_nodes_for, bodies_of, nodes_for, options_of, subscribers
+from body_tracking.systems import EXECUTABLES, TOPICS, all_nodes_for, angles_topics, nodes_for, options_of, subscribers
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH = ROOT / "launch" / "two_kinects.launch.py"
@@ -57,11 +57,12 @@ def test_every_parameter_in_the_table_is_one_of_its_node(options: Options) -> No
 
 
 def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
-    live, played = named(nodes_for(options_of())), named(nodes_for(options_of(bag="bag", record="r")))
+    topics = ("/kinect1/skeleton", "/kinect2/skeleton")
+    live, played = named(nodes_for(options_of())), named(nodes_for(options_of(bag="bag", record="r", played=topics)))
     assert {"kinect1_skeleton", "kinect2_skeleton"} <= set(live)
     assert "bag_player" not in live
     assert not any(name.endswith("t1_skeleton") for name in played)
-    assert played["bag_player"].parameters["topics"] == ("/kinect1/skeleton", "/kinect2/skeleton")
+    assert played["bag_player"].parameters["topics"] == topics
     assert not any(spec.parameters.get("use_sim_time") for spec in live.values())
     assert all(spec.parameters["use_sim_time"] for name, spec in played.items() if name != "bag_player")
 
@@ -74,8 +75,15 @@ def test_external_sensors_need_no_nodes() -> None:
 
 def counted(**given: Any) -> dict[str, int]:
     """How many nodes take each topic of a graph."""
-    specs = nodes_for(options_of(**given))
+    played = tuple(map(graph.skeleton_topic, graph.DEFAULT_SENSORS)) if given.get("bag") else ()
+    specs = nodes_for(options_of(**given, played=played))
     return subscribers(specs, parameters_for(specs, None))
+
+
+def published_angles(options: Options) -> tuple[str, ...]:
+    """The ids of the people of whom a graph publishes angles."""
+    specs = nodes_for(options)
+    return tuple(topic.split("/")[3] for topic in angles_topics(specs, parameters_for(specs, None)))
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -106,7 +114,10 @@ def test_all_tracking_nodes_have_the_same_subject() -> None:
     for name in ("fusion", "skeleton_filter", "joint_angles"):
         assert (specs[name].parameters["subject"], specs[name].parameters["people"]) == ("all", 2)
     assert specs["imu_skeleton"].parameters["subject"] == "all"
-    assert bodies_of(options_of(**given)) == ("body1", "body2") and bodies_of(options_of()) == ()
+    topics = [
+        angles_topics(each, parameters_for(each, None)) for each in (tuple(specs.values()), nodes_for(options_of()))
+    ]
+    assert topics == [tuple(map(graph.joint_states_topic, ("body1", "body2"))), (graph.joint_states_topic("body1"),)]
     found = counted(**given)
     for body in ("body1", "body2"):
         topics = graph.model_topics(body, several=True)
@@ -121,9 +132,9 @@ def test_all_tracking_nodes_have_the_same_subject() -> None:
 def test_subject_is_set_by_file_or_command_line(tmp_path: Path) -> None:
     file = tmp_path / "people.yaml"
     file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
-    assert bodies_of(systems.with_file(options_of(), file)) == graph.bodies(4)
+    assert published_angles(systems.with_file(options_of(), file)) == graph.bodies(4)
     assert systems.with_file(options_of(subject="first", people=3), file)["people"] == 3
-    assert bodies_of(systems.with_file(options_of(subject="first"), file)) == ()
+    assert published_angles(systems.with_file(options_of(subject="first"), file)) == ("body1",)
 
 
 def test_one_parameters_file_serves_in_every_namespace(tmp_path: Path) -> None:

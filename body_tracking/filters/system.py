@@ -28,6 +28,8 @@ def _filters() -> Sequence[str]:
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
+    if not (options["sensors"] or options["imus"]):
+        return
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
     orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}

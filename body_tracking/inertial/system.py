@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from body_tracking.core.message_types import IMU, POINT_CLOUD
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,
@@ -26,11 +27,16 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         yield NodeSpec("imu_skeleton", "imu_skeleton", parameters=given)
 
 
+def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
+    return graph.played_imu_topics(names_in(options["imus"]), topics)
+
+
 SYSTEM = System(
     "inertial",
     order=1,
     nodes=(NodeType("imu_skeleton", Place.SENSING, "body_tracking.inertial.stage:ImuStage"),),
     specs=_specs,
+    played=_played,
     options=(
         Option(
             "imus",
@@ -38,6 +44,7 @@ SYSTEM = System(
             "a segment with an inertial sensor, as the parameter segments of imu_skeleton lists them",
             "SEGMENT[:NAME]",
             parameter=("imu_skeleton", "segments"),
+            example=graph.EXAMPLE_IMUS,
         ),
     ),
     topics=(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from body_tracking.core.message_types import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import Value
@@ -33,6 +33,8 @@ def _subjects() -> tuple[str, ...]:
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
     sensors = sensors_of(options)
+    if not sensors:
+        return
     several = sensors_and_transport(options)
     yield NodeSpec("fusion", "fusion", parameters={**several, **asked(options, subject="subject", people="people")})
     yield NodeSpec(
@@ -49,17 +51,24 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         )
 
 
+def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
+    wanted = tuple(map(graph.skeleton_topic, sensors_of(options)))
+    missing = [topic for topic in wanted if topic not in topics]
+    if missing:
+        there = ", ".join(graph.sensors_among(topics)) or "none"
+        raise graph.GraphError(f"no topic {missing[0]}; its sensors are {there}")
+    return wanted
+
+
 def sensors_of(options: Options) -> tuple[str, ...]:
-    """The sensors of a graph.
+    """The cameras of a graph that see skeletons.
 
     Raises:
-        GraphError: no sensor, or a duplicate.
+        GraphError: a duplicate.
         SensorNameError: an invalid name.
     """
     given = options["sensors"]
     sensors = tuple(check_sensor_name(sensor) for sensor in given) if isinstance(given, tuple) else ()
-    if not sensors:
-        raise graph.GraphError("no sensors")
     if len(set(sensors)) < len(sensors):
         raise graph.GraphError(f"a sensor is named twice among {', '.join(sensors)}")
     return sensors
@@ -91,11 +100,12 @@ SYSTEM = System(
         NodeType("fusion", Place.FUSION, "body_tracking.fusion.stage:FusionStage"),
     ),
     specs=_specs,
+    played=_played,
     options=(
         Option(
             "sensors",
             graph.DEFAULT_SENSORS,
-            "names, the reference first (default: those in the bag, else kinect1,kinect2)",
+            "names, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
             "A,B",
         ),
         Option("external", False, "start no sensor nodes: other processes publish /<sensor>/skeleton"),

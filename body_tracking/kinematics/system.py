@@ -28,6 +28,8 @@ def _conventions() -> Sequence[str]:
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
+    if not (options["sensors"] or options["imus"]):
+        return
     from body_tracking.pipeline.roles import role_of
 
     role = role_of(options)

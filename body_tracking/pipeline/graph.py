@@ -52,6 +52,8 @@ START_SERVICE = "calibration/start"
 RESET_SERVICE = "calibration/reset"
 ALIGN_SERVICE = "imu_skeleton/align"
 DEFAULT_SENSORS = ("kinect1", "kinect2")
+NO_SENSORS = "none"
+"""The value of the option ``sensors`` of a graph without cameras that see skeletons."""
 DEFAULT_BODY = "body1"
 EXAMPLE_IMUS = ("forearm_left", "forearm_right")
 """Segments with wrist-worn inertial sensors."""
@@ -69,6 +71,11 @@ def skeleton_topic(sensor: str) -> str:
 def orientation_topic(segment: str) -> str:
     """The topic of a segment's orientation by its inertial sensor."""
     return f"/imu/{segment}/orientation"
+
+
+def is_joint_states(topic: str) -> bool:
+    """Whether a topic has joint angles, not their standard deviations (:func:`joint_states_topic`)."""
+    return re.fullmatch(r"/humans/bodies/\w+/joint_states", topic) is not None
 
 
 def is_model_covariance(topic: str) -> bool:

@@ -8,7 +8,7 @@ its modules and classes instead of importing them; the caller loads them.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, TypeAlias
@@ -46,6 +46,7 @@ class Option:
         path: it names a file or a folder.
         parameter: the equivalent (node, parameter) of a parameters file, which the option overrides.
         hidden: no command has it, only the parameters file.
+        example: a value with which a graph has the nodes that depend on it, for lists of all nodes.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Option:
     path: bool = False
     parameter: tuple[str, str] | None = None
     hidden: bool = False
+    example: Value | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +180,8 @@ class System:
         order: among the systems, in tables.
         nodes: its executables.
         specs: returns the nodes that it runs for given options, without their namespace.
+        played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
+            none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
         options, topics, services, commands, layers: that it adds.
     """
 
@@ -185,6 +189,7 @@ class System:
     order: int = 100
     nodes: tuple[NodeType, ...] = ()
     specs: Callable[[Options], Iterable[NodeSpec]] = lambda options: ()
+    played: Callable[[Options, Collection[str]], tuple[str, ...]] = lambda options, topics: ()
     options: tuple[Option, ...] = ()
     topics: tuple[TopicSpec, ...] = ()
     services: tuple[Service, ...] = ()

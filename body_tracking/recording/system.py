@@ -36,9 +36,6 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         yield NodeSpec("bag_recorder", "bag_recorder", parameters={"start_recording": False, **covariance})
     if not options["bag"]:
         return
-    sensors, inertial = options["sensors"], options["imu_topics"]
-    assert isinstance(sensors, tuple)
-    assert isinstance(inertial, tuple)
     yield NodeSpec(
         "bag_player",
         "bag_player",
@@ -47,7 +44,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         parameters={
             "bag": options["bag"],
             "rate": options["rate"],
-            "topics": (*map(graph.skeleton_topic, sensors), *inertial),
+            "topics": options["played"],
             "reliable": options["reliable"],
         },
     )
@@ -61,8 +58,8 @@ SYSTEM = System(
     options=(
         Option("bag", "", "play this bag in place of the sensors", "BAG", path=True),
         Option("rate", 1.0, "play the bag X times as fast (default 1)", "X"),
-        Option("imu_topics", (), hidden=True),
-        Option("record", "", "record everything into this new folder", "BAG", path=True),
+        Option("played", (), hidden=True),
+        Option("record", "", "record everything into this new folder", "BAG", path=True, example="recording"),
         Option(
             "model_covariance",
             False,

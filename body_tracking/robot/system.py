@@ -59,7 +59,16 @@ SYSTEM = System(
     order=4,
     nodes=(NodeType("robot_commands", Place.CONSUMER, takes=_takes),),
     specs=_specs,
-    options=(Option("robot", "", "mapping file of a robot that is to follow; see docs/robots.md", "FILE", path=True),),
+    options=(
+        Option(
+            "robot",
+            "",
+            "mapping file of a robot that is to follow; see docs/robots.md",
+            "FILE",
+            path=True,
+            example="robot.yaml",
+        ),
+    ),
     topics=(
         TopicSpec(
             "<topic of the mapping>",

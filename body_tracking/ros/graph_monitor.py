@@ -40,18 +40,18 @@ class GraphMonitor:
     """Subscribes in a thread of its own.
 
     Args:
-        bodies: the ids of the people who may be tracked.
+        angles_topics: of the joint angles that the graph publishes.
         namespace: of the graph.
     """
 
-    def __init__(self, bodies: Sequence[str], namespace: str = "/") -> None:
+    def __init__(self, angles_topics: Sequence[str], namespace: str = "/") -> None:
         self.clock_ns = 0
         """The latest time on ``/clock``; 0 before the first."""
         self.last_angles = 0.0
         """Steady time of receipt of the latest angles, seconds."""
         self.angles = 0
         """Number of received angle messages."""
-        self._angles_topics = [graph.joint_states_topic(body) for body in bodies]
+        self._angles_topics = tuple(angles_topics)
         self._statuses: dict[str, NodeStatus] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -156,11 +156,17 @@ class GraphMonitor:
             return f"{float(value):.0f}" if value is not None else "-"
 
         sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in sensors_of(options))
-        fused = rate("fusion", "out", graph.FUSED)
-        rates = [rate("joint_angles", "out", topic) for topic in self._angles_topics]
+        skeletons = f"{sensors}, fused {rate('fusion', 'out', graph.FUSED)}, " if sensors else ""
+        rates = [self._angles_rate(topic, fresh) for topic in self._angles_topics]
         # the people with angles; the first one if there are none
         angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
-        return f"{sensors}, fused {fused}, angles {angles} Hz"
+        return f"{skeletons}angles {angles} Hz"
+
+    def _angles_rate(self, topic: str, fresh: Mapping[str, NodeStatus]) -> str:
+        """Of the one node that publishes it."""
+        key = f"rate out {names.resolved(topic, self._namespace)}"
+        found = [status.values[key] for status in fresh.values() if key in status.values]
+        return f"{float(found[0]):.0f}" if found else "-"
 
     @staticmethod
     def _delay(options: Options, fresh: Mapping[str, NodeStatus]) -> str:

@@ -44,11 +44,12 @@ from body_tracking.systems import (
     FLOW,
     add_options,
     all_nodes_for,
-    bodies_of,
+    angles_topics,
     is_source,
     nodes_for,
     options_from,
     options_of,
+    played,
     subscribers,
     with_file,
 )
@@ -119,22 +120,18 @@ def options_for(args: argparse.Namespace) -> Options:
         with RigReader(args.bag) as reader:
             topics = frozenset(reader.topics)
             there = graph.sensors_among(reader.topics)
-        if not there:
-            raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(reader.topics) or 'none'}")
-        sensors = given.get("sensors", there)
-        missing = [sensor for sensor in sensors if sensor not in there] if isinstance(sensors, tuple) else []
-        if missing:
-            raise UpError(
-                f"{args.bag}: no topic {graph.skeleton_topic(missing[0])}; its sensors are {', '.join(there)}"
-            )
-        given["sensors"] = sensors
+        given.setdefault("sensors", there)
     if args.robot is not None:
         given["convention"] = convention_of(args.robot, args.convention or "")
     given["namespace"] = names.check_namespace(args.namespace or "/")
     options = with_file(options_of(**given), args.params_file)
-    imus = options["imus"]
-    if args.bag is not None and isinstance(imus, tuple):
-        options = {**options, "imu_topics": graph.played_imu_topics(imus, topics)}
+    if args.bag is not None:
+        try:
+            options = {**options, "played": played(options, topics)}
+        except graph.GraphError as error:
+            raise UpError(f"{args.bag}: {error}") from error
+        if not options["played"]:
+            raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(sorted(topics)) or 'none'}")
     return options
 
 
@@ -514,8 +511,7 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
-    bodies = bodies_of(options) or (str(parameters["joint_angles"].get("body", graph.DEFAULT_BODY)),)
-    monitor = GraphMonitor(bodies, str(options["namespace"]))
+    monitor = GraphMonitor(angles_topics(specs, parameters), str(options["namespace"]))
     try:
         return Supervisor(options, specs, parameters, folder).run(monitor)
     finally:

@@ -32,8 +32,8 @@ SYSTEM = System(
     ),
     specs=_specs,
     options=(
-        Option("viewer", False, "show it on a live page in a browser, and take its buttons"),
-        Option("markers", False, "publish markers for RViz and Foxglove"),
+        Option("viewer", False, "show it on a live page in a browser, and take its buttons", example=True),
+        Option("markers", False, "publish markers for RViz and Foxglove", example=True),
     ),
     topics=(
         TopicSpec(

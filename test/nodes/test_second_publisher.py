@@ -146,7 +146,7 @@ def test_second_up_in_a_domain_ends_with_an_error(tmp_path: Path, monkeypatch: p
     found = environment()
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.setenv(name, found[name])
-    first = GraphMonitor(["body1"])  # the node of a ``body_tracking up``
+    first = GraphMonitor([graph.joint_states_topic("body1")])  # the node of a ``body_tracking up``
     command = [sys.executable, "-m", "body_tracking.cli", "up", "--external", "--log-dir", str(tmp_path)]
     second = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=found)
     try:
@@ -165,7 +165,7 @@ def test_second_up_in_a_domain_ends_with_an_error(tmp_path: Path, monkeypatch: p
 def test_one_of_two_simultaneous_ups_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in environment().items():
         monkeypatch.setenv(name, value)
-    monitors = [GraphMonitor(["body1"]) for _ in range(2)]
+    monitors = [GraphMonitor([graph.joint_states_topic("body1")]) for _ in range(2)]
     end = time.monotonic() + 30.0
     while not monitors[1].has_predecessor() and time.monotonic() < end:
         time.sleep(0.05)

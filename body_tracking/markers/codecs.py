@@ -1,0 +1,99 @@
+"""Codecs of the marker system's messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.message_types import IMAGE, POINT_CLOUD
+from body_tracking.markers.messages import (
+    POSE,
+    balls_to_cloud,
+    cloud_to_balls,
+    cloud_to_points,
+    message_to_target_pose,
+    points_to_cloud,
+    target_pose_to_message,
+)
+from body_tracking.markers.observations import ImageBalls, Points, TargetPose
+from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
+from body_tracking.messages.codecs import Codec, Wire
+from body_tracking.messages.images import array_to_image, image_to_array
+
+
+class CameraImage(Codec):
+    """An image of one brightness per pixel: stamp in nanoseconds, frame, (height, width) pixels."""
+
+    type_name = IMAGE
+
+    def encode(self, payload: tuple[int, str, NDArray[Any]], wire: Wire) -> bytes:
+        stamp_ns, frame_id, pixels = payload
+        return wire.serialize(IMAGE, array_to_image(pixels, stamp_ns, frame_id, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, NDArray[Any]]:
+        return image_to_array(wire.deserialize(IMAGE, cdr))
+
+    def stamp_ns(self, payload: tuple[int, str, NDArray[Any]]) -> int:
+        return payload[0]
+
+
+class Info(Codec):
+    """The calibration of a camera: stamp in nanoseconds, and camera."""
+
+    type_name = CAMERA_INFO
+
+    def encode(self, payload: tuple[int, Camera], wire: Wire) -> bytes:
+        return wire.serialize(CAMERA_INFO, camera_to_info(payload[1], payload[0], wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> Camera:
+        return info_to_camera(wire.deserialize(CAMERA_INFO, cdr))
+
+
+class Balls(Codec):
+    """The balls in one image."""
+
+    type_name = POINT_CLOUD
+
+    def encode(self, payload: ImageBalls, wire: Wire) -> bytes:
+        return wire.serialize(POINT_CLOUD, balls_to_cloud(payload, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> ImageBalls:
+        return cloud_to_balls(wire.deserialize(POINT_CLOUD, cdr))
+
+    def stamp_ns(self, payload: ImageBalls) -> int:
+        return payload.stamp_ns
+
+
+class SpacePoints(Codec):
+    """Points in space at one time."""
+
+    type_name = POINT_CLOUD
+
+    def encode(self, payload: Points, wire: Wire) -> bytes:
+        return wire.serialize(POINT_CLOUD, points_to_cloud(payload, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> Points:
+        return cloud_to_points(wire.deserialize(POINT_CLOUD, cdr))
+
+    def stamp_ns(self, payload: Points) -> int:
+        return payload.stamp_ns
+
+
+class PoseOfTarget(Codec):
+    """The pose of one target."""
+
+    type_name = POSE
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def encode(self, payload: TargetPose, wire: Wire) -> bytes:
+        return wire.serialize(POSE, target_pose_to_message(payload, wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> TargetPose:
+        return message_to_target_pose(wire.deserialize(POSE, cdr), self.name)
+
+    def stamp_ns(self, payload: TargetPose) -> int:
+        return payload.stamp_ns

@@ -1,0 +1,71 @@
+"""Frames of several cameras that were taken at one time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Generic, TypeVar
+
+Frame = TypeVar("Frame")
+_KEPT: Final = 64
+"""Incomplete sets; older ones are given up."""
+
+
+class FrameSets(Generic[Frame]):
+    """Collects the frames of cameras that are triggered together, in sets of equal stamps.
+
+    Args:
+        cameras: names.
+        tolerance_ns: by which the stamps of a set may differ.
+        max_wait_ns: how long a set waits for its missing frames, by the clock of :meth:`push`.
+
+    Attributes:
+        incomplete: number of sets that were given out or left out with a frame missing.
+        late: number of frames that came after their set.
+    """
+
+    def __init__(self, cameras: Sequence[str], tolerance_ns: int, max_wait_ns: int) -> None:
+        self._cameras = tuple(cameras)
+        self._tolerance_ns, self._max_wait_ns = tolerance_ns, max_wait_ns
+        self._open: list[tuple[int, int, dict[str, Frame]]] = []  # stamp, arrival of the first, frames
+        self._last_ns: int | None = None
+        self.incomplete = self.late = 0
+
+    def push(self, camera: str, stamp_ns: int, frame: Frame, now_ns: int) -> list[dict[str, Frame]]:
+        """Take a frame; the sets that are complete with it, in the order of their stamps."""
+        if self._last_ns is not None and stamp_ns <= self._last_ns + self._tolerance_ns:
+            self.late += 1
+            return []
+        for stamp, _, frames in self._open:
+            if abs(stamp - stamp_ns) <= self._tolerance_ns and camera not in frames:
+                frames[camera] = frame
+                break
+        else:
+            self._open.append((stamp_ns, now_ns, {camera: frame}))
+            self._open.sort(key=lambda each: each[0])
+        complete = [k for k, (_, _, frames) in enumerate(self._open) if len(frames) == len(self._cameras)]
+        # what is older than a complete set will not become complete: cameras send in order
+        return self._give(complete[-1] + 1 if complete else max(0, len(self._open) - _KEPT))
+
+    def poll(self, now_ns: int) -> list[dict[str, Frame]]:
+        """The sets that have waited for long enough."""
+        waited = [k for k, (_, arrival, _) in enumerate(self._open) if now_ns - arrival >= self._max_wait_ns]
+        return self._give(waited[-1] + 1 if waited else 0)
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When the next set has waited for long enough; None where none waits."""
+        if not self._open:
+            return None
+        return min(arrival for _, arrival, _ in self._open) + self._max_wait_ns
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._open.clear()
+        self._last_ns = None
+
+    def _give(self, count: int) -> list[dict[str, Frame]]:
+        given, self._open = self._open[:count], self._open[count:]
+        if given:
+            self._last_ns = given[-1][0]
+        self.incomplete += sum(len(frames) < len(self._cameras) for _, _, frames in given)
+        return [frames for _, _, frames in given if len(frames) > 1]

@@ -1,0 +1,86 @@
+"""A rig: calibrated cameras that stand still to each other, and how sure their calibration is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.camera import Camera
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
+
+POSE: Final = 6
+"""Parameters of a camera's pose: a rotation vector and a translation."""
+LENS: Final = 4
+"""Parameters of a camera's matrix: fx, fy, cx, cy."""
+
+
+class RigError(BodyTrackingError):
+    """Cameras and poses do not go together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """Cameras and their poses.
+
+    The rig's frame is that of its first camera, unless a caller chooses another.
+
+    Attributes:
+        cameras: two or more, each with a frame of its own.
+        rotations: (n, 3, 3) and
+        translations: (n, 3) metres: a point x of the rig's frame is at ``rotations[i] @ x + translations[i]`` in
+            camera i.
+        covariance: (p, p) of :attr:`size` parameters; camera by camera fx, fy, cx, cy, the coefficients of its
+            distortion, and its pose: a rotation vector w, so that the true rotation is ``exp(w) @ rotations[i]``, and
+            what is to be added to the translation. Zeros for what is known.
+
+    Raises:
+        RigError: other shapes, the same frame twice.
+    """
+
+    cameras: tuple[Camera, ...]
+    rotations: FloatArray
+    translations: FloatArray
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        count, frames = len(self.cameras), [camera.frame_id for camera in self.cameras]
+        if count < 1 or len(set(frames)) < count:
+            raise RigError(f"cameras {', '.join(frames) or 'none'}: each needs a frame of its own")
+        expected = (count, 3, 3), (count, 3), (self.size, self.size)
+        given = self.rotations.shape, self.translations.shape, self.covariance.shape
+        if given != expected:
+            raise RigError(f"rotations, translations, covariance {given} of {count} cameras, expected {expected}")
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(LENS + len(camera.distortion) + POSE for camera in self.cameras)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, ..., 2) in each camera of points (..., 3) in the rig's frame; NaN for points behind a camera."""
+        return np.stack(
+            [
+                camera.project(points @ rotation.T + translation)
+                for camera, rotation, translation in zip(self.cameras, self.rotations, self.translations, strict=True)
+            ]
+        )
+
+    def changed(self, parameters: Sequence[float] | FloatArray) -> Rig:
+        """The rig whose parameters are larger by these (p,)."""
+        rest = np.asarray(parameters, dtype=np.float64)
+        if rest.shape != (self.size,):
+            raise RigError(f"{rest.shape} parameters, expected ({self.size},)")
+        cameras, rotations, translations = [], np.array(self.rotations), np.array(self.translations)
+        for index, camera in enumerate(self.cameras):
+            count = len(camera.distortion)
+            lens, distortion, pose, rest = np.split(rest, [LENS, LENS + count, LENS + count + POSE])
+            matrix = camera.matrix + np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 0.0]])
+            cameras.append(replace(camera, matrix=matrix, distortion=camera.distortion + distortion))
+            rotations[index] = so3.quat_to_matrix(so3.exp(pose[:3])) @ rotations[index]
+            translations[index] += pose[3:]
+        return Rig(tuple(cameras), rotations, translations, self.covariance)

@@ -1,0 +1,62 @@
+"""A folder with what the marker nodes need: ``rig.yaml``, ``targets.yaml``, ``chain.yaml``; and names of topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from body_tracking.core.errors import BodyTrackingError
+
+RIG, TARGETS, CHAIN = "rig.yaml", "targets.yaml", "chain.yaml"
+POINTS: Final = "/markers/points"
+BODY: Final = "markers"
+"""The id under which angles of a chain of targets are published."""
+_FRAME_SUFFIX: Final = "_optical_frame"
+
+
+class SetupError(BodyTrackingError):
+    """The folder lacks a file, or none is given."""
+
+
+def file_of(folder: object, name: str, made_by: str) -> Path:
+    """A file of the folder.
+
+    Args:
+        folder: the parameter ``setup``.
+        name: one of the three.
+        made_by: the command that makes it, for the error.
+
+    Raises:
+        SetupError: no folder, or no such file in it.
+    """
+    if not folder:
+        raise SetupError("setup: no folder given; it has to hold rig.yaml, targets.yaml and chain.yaml")
+    path = Path(str(folder)).expanduser() / name
+    if not path.is_file():
+        raise SetupError(f"{path}: no such file; body_tracking markers {made_by} makes it")
+    return path
+
+
+def camera_name(frame_id: str) -> str:
+    """The name of a camera in topics, from its optical frame."""
+    return frame_id.removesuffix(_FRAME_SUFFIX)
+
+
+def image_topic(camera: str) -> str:
+    """The topic of a camera's images, by its frame or name."""
+    return f"/{camera_name(camera)}/image_raw"
+
+
+def info_topic(camera: str) -> str:
+    """The topic of a camera's calibration."""
+    return f"/{camera_name(camera)}/camera_info"
+
+
+def balls_topic(camera: str) -> str:
+    """The topic of the balls in a camera's images."""
+    return f"/{camera_name(camera)}/balls"
+
+
+def pose_topic(target: str) -> str:
+    """The topic of a target's poses."""
+    return f"/markers/{target}/pose"
