@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterable
 
 from body_tracking.core.message_types import IMU, POINT_CLOUD
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import (
     NodeSpec,
     NodeType,
@@ -28,7 +27,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
-    return graph.played_imu_topics(names_in(options["imus"]), topics)
+    imus = options["imus"]
+    return graph.played_imu_topics(imus if isinstance(imus, tuple) else (), topics)
 
 
 SYSTEM = System(

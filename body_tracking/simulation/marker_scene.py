@@ -1,0 +1,142 @@
+"""A simulated person with targets on shoulder, upper arm and forearm before a stereo rig of infrared cameras.
+
+The geometry is that of Gaschler (2011), chapter 6: focal length 834 pixels, 0.48 m apart, turned towards each other
+by 13 degrees, targets of 98 mm. The shoulder is a ball joint between its target, which moves with the clavicle, and the
+upper arm; the elbow a universal joint: flexion, then pronation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.camera import Camera
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.rig import Rig
+from body_tracking.markers.targets import Target
+from body_tracking.simulation.people import MODEL, Person
+from body_tracking.simulation.repertoire import make_movement
+
+FOCAL, WIDTH, HEIGHT = 834.0, 640, 480
+APART, TOED_IN = 0.48, np.radians(13.0)
+DIAMETER: Final = 0.014
+EXTENT: Final = 0.098
+SEGMENTS: Final = {"shoulder": "clavicle_left", "upper_arm": "upper_arm_left", "forearm": "forearm_left"}
+"""The segment that carries each target."""
+_MOUNTS: Final = {"shoulder": (0.03, 0.10, 0.05), "upper_arm": (0.03, 0.06, -0.14), "forearm": (0.03, 0.05, -0.13)}
+"""Where on its segment, metres: x forward, y to the left, z up, while the arm hangs."""
+_TRIALS: Final = 2000
+_AWAY: Final = 1.7
+"""Metres from the rig to the middle of the arm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerScene:
+    """What happens before the rig.
+
+    Attributes:
+        rig: of two cameras; its frame is that of the left one.
+        targets: with their true geometry.
+        times: (n,) seconds.
+        rotations: (n, t, 3, 3) and
+        translations: (n, t, 3) metres: true poses of the targets in the rig's frame.
+        shoulder: (n, 3, 3) true rotations of the upper arm's target by the shoulder's.
+        elbow: (n, 2) radians, flexion and pronation.
+    """
+
+    rig: Rig
+    targets: tuple[Target, ...]
+    times: FloatArray
+    rotations: FloatArray
+    translations: FloatArray
+    shoulder: FloatArray
+    elbow: FloatArray
+
+    def balls(self, index: int) -> FloatArray:
+        """(b, 3) all balls at one time in the rig's frame, target by target."""
+        return np.concatenate(
+            [
+                target.points @ rotation.T + translation
+                for target, rotation, translation in zip(
+                    self.targets, self.rotations[index], self.translations[index], strict=True
+                )
+            ]
+        )
+
+
+def stereo_rig(distortion: float = -0.1) -> Rig:
+    """The rig, with a radial distortion k1."""
+    matrix = np.array([[FOCAL, 0.0, WIDTH / 2.0 - 0.5], [0.0, FOCAL, HEIGHT / 2.0 - 0.5], [0.0, 0.0, 1.0]])
+    cameras = tuple(
+        Camera(f"{name}_optical_frame", WIDTH, HEIGHT, matrix, np.array([distortion, 0.0, 0.0, 0.0, 0.0]))
+        for name in ("left", "right")
+    )
+    # the right camera stands on the left one's +x, turned about y towards it
+    turn = so3.quat_to_matrix(so3.exp(np.array([0.0, TOED_IN, 0.0])))
+    middle = np.array([APART * np.cos(TOED_IN / 2.0), 0.0, -APART * np.sin(TOED_IN / 2.0)])
+    rig = Rig(cameras, np.stack([np.eye(3), turn]), np.stack([np.zeros(3), -turn @ middle]), np.zeros((30, 30)))
+    return rig
+
+
+def make_targets(seed: int = 0) -> tuple[Target, ...]:
+    """Targets of five balls each, no two alike: the best of some random ones."""
+    rng = np.random.default_rng(seed)
+    found: list[Target] = []
+    for name in SEGMENTS:
+        best, points = 0.0, np.zeros((5, 3))
+        for _ in range(_TRIALS):
+            drawn = rng.uniform(-0.5, 0.5, (5, 3)) * np.array([1.0, 1.0, 0.45])
+            drawn *= EXTENT / _distances(drawn).max()
+            own = _distances(drawn)
+            others = np.concatenate([own, *(_distances(each.points) for each in found)])
+            # balls well apart, distances within a target far from each other, those of different targets less so
+            worth = min(
+                own.min() / 2.5 / DIAMETER, np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4
+            )
+            if worth > best:
+                best, points = worth, drawn - drawn.mean(axis=0)
+        found.append(Target(name, points, np.zeros((15, 15)), DIAMETER))
+    return tuple(found)
+
+
+def _distances(points: FloatArray) -> FloatArray:
+    """(10,) between five points, metres."""
+    apart: FloatArray = np.linalg.norm(points[:, None] - points[None], axis=2)[np.triu_indices(5, 1)]
+    return apart
+
+
+def marker_scene(motion: str = "reaching", seed: int = 0, rate: float = 60.0, seconds: float = 20.0) -> MarkerScene:
+    """A person, drawn by the seed, who moves before the rig.
+
+    Args:
+        motion: of the repertoire.
+        seed: of the person and the manner.
+        rate: images a second.
+        seconds: from the middle of the motion.
+    """
+    rng = np.random.default_rng([seed, 20110215])
+    person = Person.draw(rng)
+    movement = make_movement(motion, person, rng, None)
+    count = round(rate * min(seconds, movement.duration))
+    times = max(0.0, 0.5 * (movement.duration - count / rate)) + np.arange(count) / rate
+    course = movement.course(times)
+    posture = MODEL.forward(course.q, person.lengths)
+    indices = [MODEL.segment_names.index(segment) for segment in SEGMENTS.values()]
+    # x right, y down, z forward in the rig; the person's arm in the middle of its view, facing the rig
+    away = posture.origins[:, indices].mean(axis=(0, 1))
+    to_rig = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    rig = stereo_rig()
+    middle = 0.5 * (APART - _AWAY * np.tan(TOED_IN))  # between the axes of the cameras
+    mounts = np.array([_MOUNTS[name] for name in SEGMENTS])
+    worn = so3.quat_to_matrix(so3.exp(rng.normal(0.0, 0.3, (len(SEGMENTS), 3))))
+    on_segments = posture.rotations[:, indices]
+    origins = posture.origins[:, indices] + np.einsum("ntij,tj->nti", on_segments, mounts)
+    translations = (origins - away) @ to_rig.T + np.array([middle, 0.0, _AWAY])
+    rotations = to_rig @ on_segments @ worn
+    upper, lower = (MODEL.coordinate_names.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left"))
+    angles = MODEL.difference(MODEL.neutral(), course.q)[:, [upper, lower]]
+    shoulder = rotations[:, 0].transpose(0, 2, 1) @ rotations[:, 1]
+    return MarkerScene(rig, make_targets(), times, rotations, translations, shoulder, angles)
