@@ -127,7 +127,8 @@ def _reduced(equations: Equations, damping: float) -> tuple[FloatArray, FloatArr
     shared, right, mixed, blocks, block_right = equations
     diagonal = np.einsum("vii->vi", blocks)
     eye = np.eye(blocks.shape[1])
-    damped = blocks + (damping * diagonal)[:, :, None] * eye
+    # a local parameter that no residual depends on keeps its value
+    damped = blocks + np.where(diagonal > 0.0, damping * diagonal, 1.0)[:, :, None] * eye
     try:
         by_shared = np.linalg.solve(damped, mixed.transpose(0, 2, 1))  # (v, k, p)
         by_right = np.linalg.solve(damped, block_right[:, :, None])[:, :, 0]

@@ -18,7 +18,7 @@ import numpy as np
 from body_tracking.core.camera import Camera
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
-from body_tracking.markers import bundle
+from body_tracking.markers import bundle, projection
 from body_tracking.markers.boards import CharucoBoard, Chessboard, Image
 from body_tracking.markers.bundle import Adjusted, Corners
 from body_tracking.markers.rig import Rig
@@ -41,6 +41,7 @@ _ACROSS: Final = (5.0, 3.0)
 """How far a board is from where another camera's board says, median over corners, likewise."""
 _ADJUSTED: Final = (2.0, 0.1)
 """A board's RMS in the bundle adjustment, likewise."""
+_NO_FIT: Final = "its corners do not fit the camera"
 _CV: Any = cv2
 
 
@@ -152,10 +153,9 @@ def calibrate_cameras(
     Raises:
         CalibrationError: a camera sees too few good boards, or shares none with the others; a pixel is not finite.
     """
-    if not (np.isfinite(corners.pixels).all() and np.isfinite(corners.board).all()) or corners.board[:, 2].any():
-        raise CalibrationError("a corner is not finite, or the board not flat (z = 0 in its own frame)")
-    if len(frames) != len(sizes) or (len(corners) and corners.cameras.max() >= len(frames)):
-        raise CalibrationError(f"{len(frames)} frames, {len(sizes)} sizes, corners of other cameras")
+    if len(frames) != len(sizes):
+        raise CalibrationError(f"{len(frames)} frames, {len(sizes)} sizes of images")
+    _check(corners, len(frames))
     rejected: list[Rejected] = []
     seen: list[dict[int, _Seen]] = []
     cameras: list[Camera] = []
@@ -163,8 +163,52 @@ def calibrate_cameras(
         camera, boards = _single_camera(frame, size, index, corners, rejected)
         cameras.append(camera)
         seen.append(boards)
+    return _set_of_cameras(cameras, seen, corners, coefficients, rejected)
+
+
+def calibrate_poses(
+    cameras: Sequence[Camera], corners: Corners, coefficients: tuple[int, ...] | None = None
+) -> CameraCalibration:
+    """Calibrate the poses to each other of cameras whose lenses are known.
+
+    Args:
+        cameras: two or more; the first one's frame is the rig's.
+        corners: of a flat board (z = 0), seen at instants common to the cameras.
+        coefficients: of the distortion, which are fitted again with the cameras' matrices, from the known values on;
+            None keeps the lenses.
+
+    Raises:
+        CalibrationError: a camera sees too few good boards, or shares none with the others; a pixel is not finite.
+    """
+    _check(corners, len(cameras))
+    rejected: list[Rejected] = []
+    seen: list[dict[int, _Seen]] = []
+    for index, camera in enumerate(cameras):
+        boards = _planar_boards(camera.frame_id, index, corners, rejected)
+        seen.append({view: _board_pose(camera, rows, corners) for view, rows in boards.items()})
+        errors = np.array([_rms(_missed(camera, each, each, corners)) for each in seen[-1].values()])
+        kept = _without(boards, _too_large(errors, _SINGLE), camera.frame_id, errors, _NO_FIT, rejected)
+        seen[-1] = {view: board for view, board in seen[-1].items() if view in kept}
+    return _set_of_cameras(list(cameras), seen, corners, coefficients, rejected)
+
+
+def _check(corners: Corners, cameras: int) -> None:
+    if not (np.isfinite(corners.pixels).all() and np.isfinite(corners.board).all()) or corners.board[:, 2].any():
+        raise CalibrationError("a corner is not finite, or the board not flat (z = 0 in its own frame)")
+    if len(corners) and not 0 <= corners.cameras.min() <= corners.cameras.max() < cameras:
+        raise CalibrationError(f"corners in camera {corners.cameras.max()} of {cameras} cameras")
+
+
+def _set_of_cameras(
+    cameras: list[Camera],
+    seen: list[dict[int, _Seen]],
+    corners: Corners,
+    coefficients: tuple[int, ...] | None,
+    rejected: list[Rejected],
+) -> CameraCalibration:
     rotations, translations = _camera_poses(cameras, seen, corners)
-    placed = Rig(tuple(cameras), rotations, translations, np.zeros((15 * len(cameras),) * 2))
+    size = sum(projection.size(camera) for camera in cameras)
+    placed = Rig(tuple(cameras), rotations, translations, np.zeros((size, size)))
     _reject_contradictions(placed, seen, corners, rejected)
     return _adjusted(placed, seen, corners, coefficients, rejected)
 
@@ -183,10 +227,8 @@ def _planar(rows: IntArray, corners: Corners) -> float:
     return float(np.sqrt((missed**2).sum(axis=-1).mean()))
 
 
-def _single_camera(
-    frame: str, size: tuple[int, int], index: int, corners: Corners, rejected: list[Rejected]
-) -> tuple[Camera, dict[int, _Seen]]:
-    """A camera's own calibration (eq. 4.8) and its boards, without those that are no plane or do not fit."""
+def _planar_boards(frame: str, index: int, corners: Corners, rejected: list[Rejected]) -> dict[int, IntArray]:
+    """Rows of the corners of each board in a camera's images, without boards whose corners are of no plane."""
     of_camera = corners.cameras == index
     boards = {int(view): np.flatnonzero(of_camera & (corners.views == view)) for view in np.unique(corners.views)}
     # five corners or fewer, or corners in a row, which have no homography
@@ -198,7 +240,28 @@ def _single_camera(
     }
     _check_count(frame, boards)
     errors = np.array([_planar(rows, corners) for rows in boards.values()])
-    boards = _without(boards, _too_large(errors, _PLANE), frame, errors, "its corners are not of a plane", rejected)
+    return _without(boards, _too_large(errors, _PLANE), frame, errors, "its corners are not of a plane", rejected)
+
+
+def _board_pose(camera: Camera, rows: IntArray, corners: Corners) -> _Seen:
+    """Pose of a board in a camera whose lens is known."""
+    flat = camera.undistort(corners.pixels[rows])
+    if not np.isfinite(flat).all():
+        raise CalibrationError(f"camera {camera.frame_id}: a corner where its distortion gives no direction")
+    try:
+        found, turn, shift = _CV.solvePnP(corners.board[rows], flat, np.eye(3), None)
+    except cv2.error as error:
+        raise CalibrationError(f"camera {camera.frame_id}: OpenCV finds no pose of a board ({error.err})") from error
+    if not found:
+        raise CalibrationError(f"camera {camera.frame_id}: OpenCV finds no pose of a board")
+    return _Seen(rows, np.asarray(_CV.Rodrigues(turn)[0]), np.asarray(shift).ravel())
+
+
+def _single_camera(
+    frame: str, size: tuple[int, int], index: int, corners: Corners, rejected: list[Rejected]
+) -> tuple[Camera, dict[int, _Seen]]:
+    """A camera's own calibration (eq. 4.8) and its boards, without those that are no plane or do not fit."""
+    boards = _planar_boards(frame, index, corners, rejected)
     while True:
         _check_count(frame, boards)
         flags = _CV.CALIB_ZERO_TANGENT_DIST | _CV.CALIB_FIX_K3
@@ -222,7 +285,7 @@ def _single_camera(
         wrong = _too_large(errors, _SINGLE) & (errors == errors.max())
         if not wrong.any():
             return camera, found
-        boards = _without(boards, wrong, frame, errors, "its corners do not fit the camera", rejected)
+        boards = _without(boards, wrong, frame, errors, _NO_FIT, rejected)
 
 
 def _check_count(frame: str, boards: dict[int, IntArray]) -> None:
@@ -336,7 +399,7 @@ def _adjusted(
     rig: Rig,
     seen: list[dict[int, _Seen]],
     corners: Corners,
-    coefficients: tuple[int, ...],
+    coefficients: tuple[int, ...] | None,
     rejected: list[Rejected],
 ) -> CameraCalibration:
     """Bundle adjustment; the board with the largest residuals is left out until none has too large ones."""
