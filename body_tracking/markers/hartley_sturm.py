@@ -15,6 +15,9 @@ from body_tracking.core.skeleton import FloatArray
 _POLISH: Final = 2
 """Newton steps on the roots: a leading coefficient near zero (an epipole far away) costs the eigenvalues digits."""
 _LEADING: Final = 1e-10
+_NEWTON: Final = 4
+_PARABOLA: Final = 0.03
+"""Relative size below which terms that bend the parabola are small enough for its minimum to be the only one."""
 
 
 def fundamental(
@@ -68,23 +71,62 @@ def correct(
     moved = b_frame.transpose(0, 2, 1) @ matrix @ a_frame
     moved /= np.abs(moved).max(axis=(1, 2), keepdims=True)
     a, b, c, d = moved[:, 1, 1], moved[:, 1, 2], moved[:, 2, 1], moved[:, 2, 2]
-    roots = _roots(a, b, c, d, f, g)
-    # the cost C(t), and its limit for an infinite t
+    t, one = _minimum(a, b, c, d, f, g)
+    # eq. 3.11; for an infinite t its direction
+    p, q = a * t + b * one, c * t + d * one
+    a_line, b_line = np.stack([t * f, one, -t], axis=-1), np.stack([-g * q, p, q], axis=-1)
+    return unit * _nearest(a_line, a_frame), unit * _nearest(b_line, b_frame)
+
+
+def _minimum(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t; (n,) each.
+
+    The cost is at most that of t = 0, the line through the first pixel, so that \|t\| has a bound. Where the pixels are
+    near their epipolar lines against the distance to the epipoles, the cost is a parabola within it, and Newton's
+    method finds its one minimum; all roots are computed for the others.
+    """
+    coefficients = _polynomial(a, b, c, d, f, g)
+    t, one = np.zeros_like(a), np.ones_like(a)
+    with np.errstate(all="ignore"):
+        start = d * d / (b * b + g * g * d * d)
+        bound = np.sqrt(start / (1.0 - f * f * start))
+        near = (bound * np.abs(f) < _PARABOLA) & (bound * np.abs(a) < _PARABOLA * np.abs(b))
+        near &= np.abs(g) * (np.abs(c) * bound + np.abs(d)) < _PARABOLA * np.abs(b)
+        for _ in range(_NEWTON):
+            value, slope = _value(coefficients, t)
+            step = value / slope
+            t = t - step
+        near &= (np.abs(step) <= 1e-9 * bound + 1e-15) & (np.abs(t) <= 1.001 * bound + 1e-15)
+    others = np.flatnonzero(~near)
+    if len(others):
+        rest = [each[others] for each in (a, b, c, d, f, g)]
+        t[others], one[others] = _global_minimum(coefficients[:, others], *rest)
+    return t, one
+
+
+def _global_minimum(
+    coefficients: FloatArray,
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    d: FloatArray,
+    f: FloatArray,
+    g: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """As :func:`_minimum`, from all roots of the polynomial and the limit of the cost for an infinite t."""
+    roots = _roots(coefficients)
     f2, g2 = (f * f)[:, None], (g * g)[:, None]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         p, q = a[:, None] * roots + b[:, None], c[:, None] * roots + d[:, None]
         cost = roots**2 / (1.0 + f2 * roots**2) + q * q / (p * p + g2 * q * q)
         limit = 1.0 / (f * f) + c * c / (a * a + g * g * c * c)
     cost = np.where(np.isfinite(cost), cost, np.inf)
-    rows = np.arange(len(first))
+    rows = np.arange(len(a))
     best = cost.argmin(axis=1)
-    t = roots[rows, best]
-    # eq. 3.11; for an infinite t its direction
     far = limit < cost[rows, best]
-    t, one = np.where(far, 1.0, t), np.where(far, 0.0, 1.0)
-    p, q = a * t + b * one, c * t + d * one
-    a_line, b_line = np.stack([t * f, one, -t], axis=-1), np.stack([-g * q, p, q], axis=-1)
-    return unit * _nearest(a_line, a_frame), unit * _nearest(b_line, b_frame)
+    return np.where(far, 1.0, roots[rows, best]), np.where(far, 0.0, 1.0)
 
 
 def _frame(pixels: FloatArray, epipole: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -99,14 +141,16 @@ def _frame(pixels: FloatArray, epipole: FloatArray) -> tuple[FloatArray, FloatAr
     return frame, epipole[2] / length
 
 
-def _roots(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
-    """(n, 6) real parts of the roots of eq. 3.12."""
+def _polynomial(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray
+) -> FloatArray:
+    """(7, n) coefficients of eq. 3.12, the highest first."""
     f2, g2 = f * f, g * g
     # (at+b)^2 + g^2 (ct+d)^2 = s2 t^2 + s1 t + s0, and (at+b)(ct+d) = m2 t^2 + m1 t + m0
     s2, s1, s0 = a * a + g2 * c * c, 2.0 * (a * b + g2 * c * d), b * b + g2 * d * d
     m2, m1, m0 = a * c, a * d + b * c, b * d
     k = a * d - b * c
-    coefficients = np.stack(
+    return np.stack(
         [
             -k * f2 * f2 * m2,
             s2 * s2 - k * f2 * f2 * m1,
@@ -117,19 +161,28 @@ def _roots(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatA
             -k * m0,
         ]
     )
+
+
+def _value(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A polynomial's value and derivative, by Horner's rule."""
+    value, slope = coefficients[0] + 0.0 * t, np.zeros_like(t)
+    for coefficient in coefficients[1:]:
+        slope = slope * t + value
+        value = value * t + coefficient
+    return value, slope
+
+
+def _roots(coefficients: FloatArray) -> FloatArray:
+    """(n, 6) real parts of the roots of polynomials (7, n)."""
     least = _LEADING * np.abs(coefficients).max(axis=0)
     leading = np.where(np.abs(coefficients[0]) > least, coefficients[0], least + 1e-300)
-    companion = np.zeros((len(a), 6, 6))
+    companion = np.zeros((coefficients.shape[1], 6, 6))
     companion[:, 0] = np.nan_to_num((-coefficients[1:] / leading).T, posinf=0.0, neginf=0.0)
     companion[:, np.arange(1, 6), np.arange(5)] = 1.0
     roots = np.linalg.eigvals(companion).real
     with np.errstate(all="ignore"):
         for _ in range(_POLISH):
-            value = np.zeros_like(roots)
-            slope = np.zeros_like(roots)
-            for coefficient in coefficients:
-                slope = slope * roots + value
-                value = value * roots + coefficient[:, None]
+            value, slope = _value(coefficients[:, :, None], roots)
             step = value / slope
             roots = roots - np.where(np.isfinite(step) & (np.abs(step) < 1e-2 * (1.0 + np.abs(roots))), step, 0.0)
     return roots

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core import so3
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import hartley_sturm, projection
 from body_tracking.markers.observations import ImageBalls, Points
@@ -108,12 +109,11 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
 def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: TriangulationSettings) -> Pairs:
     """Balls of cameras a and b within the gate of each other's epipolar lines, few enough for each ball of both."""
     of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
-    height, width = of_a.stop - of_a.start, of_b.stop - of_b.start
     baseline = geometry.positions[b] - geometry.positions[a]
-    # the volume that two rays span with the baseline, and its derivative by either direction
-    a_normal = np.cross(rays.directions[of_a], baseline)  # g = d_b . (b x d_a) up to sign
-    by_b = -a_normal
-    by_a = -np.cross(baseline, rays.directions[of_b])
+    # the volume that two rays span with the baseline b, d_b . (b x d_a), and its derivative by either direction
+    cross = so3.skew(baseline)
+    by_b = -rays.directions[of_a] @ cross
+    by_a = rays.directions[of_b] @ cross
     volume = by_b @ rays.directions[of_b].T
     a_plane, b_plane = geometry.rotations[a, :2].T, geometry.rotations[b, :2].T  # (3, 2) of image coordinates
     by_a_flat, by_b_flat = by_a @ a_plane, by_b @ b_plane  # (width, 2), (height, 2)
@@ -126,14 +126,14 @@ def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: Tria
         b_moves = (by_b_flat @ rays.flat_factor[of_b]).transpose(1, 0, 2)
         shift = geometry.rotations[a].T @ geometry.translation_factor[a]
         shift = shift - geometry.rotations[b].T @ geometry.translation_factor[b]  # (3, r) of the baseline
-        across = np.cross(rays.directions[of_a][:, None], rays.directions[of_b][None])
-        moves = across @ shift - a_moves - b_moves
+        across = (rays.directions[of_a] @ (so3.skew(rays.directions[of_b]) @ shift)).transpose(1, 0, 2)
+        moves = across - a_moves - b_moves
         variance += (moves**2).sum(axis=-1)
     with np.errstate(invalid="ignore"):
         distance = volume / np.sqrt(variance)
     size = np.where(np.isfinite(distance), np.abs(distance), np.inf)
     good = size < settings.gate
-    if height > settings.alternatives < width and good.any():
+    if max(good.sum(axis=0).max(initial=0), good.sum(axis=1).max(initial=0)) > settings.alternatives:
         # the nearest few of each ball of both
         by_row = np.argsort(np.argsort(size, axis=1), axis=1) < settings.alternatives
         by_column = np.argsort(np.argsort(size, axis=0), axis=0) < settings.alternatives
