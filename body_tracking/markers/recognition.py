@@ -7,9 +7,8 @@ in real time. His heuristic search is in :mod:`body_tracking.markers.depth_first
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -17,16 +16,18 @@ import numpy as np
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.markers.interpretation import Candidate, decide, fitted
 from body_tracking.markers.observations import Points, TargetPose
-from body_tracking.markers.search import Deadline, DeadlineError, Pairs, Relation, Shape, near_pairs
+from body_tracking.markers.search import Deadline, DeadlineError, Pairs, Shape, near_pairs
 from body_tracking.markers.targets import Target
 
 SURE: Final = 4
 """Balls that tell a target; three agree too often by chance."""
-MAX_CHANCE: Final = 0.01
+MAX_CHANCE: Final = 1e-3
 """Assignments expected by chance alone, above which one is not believed (number of false alarms, Desolneux, Moisan
 and Morel 2000)."""
 _MISSED_THREE: Final = 0.05
 """Share of right assignments of three balls of a larger target that are refused: their fit is tested more strictly."""
+_MAX_THREES: Final = 20
+"""Points at an edge of a target, on average, above which three balls are not searched: too many would agree."""
 _USELESS: Final = 0.25
 """A point is ignored whose standard deviation is more than this part of the largest target's size."""
 
@@ -86,18 +87,17 @@ class Recogniser:
         wanted = [name for name in self.targets if names is None or name in names]
         until = Deadline(deadline)
         candidates: dict[str, list[Candidate]] = {}
-        chances: dict[str, _Chance] = {}
         complete = True
         try:
             pairs = self.pairs(points, wanted)
             for name in wanted:
                 until.check()
-                candidates[name], chances[name] = self._candidates(name, points, pairs, until)
+                candidates[name] = self._candidates(name, points, pairs, until)
         except DeadlineError:
             complete = False
         chosen, unsure = decide(candidates)
         for name, candidate in list(chosen.items()):
-            if chances[name].of(seen_balls(candidate)) > MAX_CHANCE:
+            if expected_by_chance(self.targets[name], points, candidate) > MAX_CHANCE:
                 del chosen[name]
                 unsure.add(name)
         return Recognition(
@@ -114,51 +114,45 @@ class Recogniser:
         pairs = near_pairs(points.positions[useful], points.covariance[useful], reach)
         return Pairs(useful[pairs.first], useful[pairs.second], pairs.low, pairs.high)
 
-    def _candidates(
-        self, name: str, points: Points, pairs: Pairs, deadline: Deadline
-    ) -> tuple[list[Candidate], _Chance]:
+    def _candidates(self, name: str, points: Points, pairs: Pairs, deadline: Deadline) -> list[Candidate]:
         target, shape = self.targets[name], self.shapes[name]
         relations = shape.relations(pairs)
-        chance = _Chance(shape, relations, pairs)
         found = shape.assignments(relations, min(SURE, shape.balls), deadline)
         candidates = fitted(target, points, list(found), deadline)
-        if not candidates and shape.balls > 3:
-            threes = combinations(range(shape.balls), 3)
-            if sum(chance.of(three) for three in threes) < MAX_CHANCE:
-                found = shape.assignments(relations, 3, deadline)
-                candidates = fitted(target, points, list(found), deadline, _MISSED_THREE)
-        return candidates, chance
+        if not candidates and shape.balls > 3 and sum(map(len, relations)) <= _MAX_THREES * len(relations):
+            found = shape.assignments(relations, 3, deadline)
+            candidates = fitted(target, points, list(found), deadline, _MISSED_THREE)
+        return candidates
 
 
-class _Chance:
-    """How many assignments to expect of points whose distances are not those of a target."""
+def expected_by_chance(target: Target, points: Points, candidate: Candidate) -> float:
+    """How many ways to see a target that fit at least as well to expect of points that have nothing to do with it.
 
-    def __init__(self, shape: Shape, relations: Sequence[Relation], pairs: Pairs) -> None:
-        self._edge = shape.edge
-        self._pairs = max(len(pairs.first), 1)
-        self._points = max(len(set(pairs.first.tolist()) | set(pairs.second.tolist())), 1)
-        # less the one pair of an assignment itself
-        self._others = [
-            max(sum(points.bit_count() for points in relation.values()) / 2 - 1.0, 0.0) for relation in relations
-        ]
-
-    def of(self, balls: Iterable[int]) -> float:
-        """For these balls.
-
-        The first edge may be at each pair of its length, either way round; a further ball at as many points as a point
-        has pairs of the length of an edge; every other edge agrees by the share of the pairs of its length. The
-        edges that agree are those of the fewest pairs: an upper bound.
-        """
-        seen = list(balls)
-        others = sorted((self._others[self._edge[i][j]] for i, j in combinations(seen, 2)), reverse=True)
-        placed = others[1 : len(seen) - 1]
-        agreeing = others[len(seen) - 1 :]
-        return (
-            2.0
-            * others[0]
-            * math.prod(2.0 * number / self._points for number in placed)
-            * math.prod(number / self._pairs for number in agreeing)
-        )
+    Of n points with a density of q per cubic metre, independent of each other, the sets of m points within a squared
+    Mahalanobis distance c of some pose are ``n q^(m-1) 8 pi^2 V sqrt(det S / det P)``: 8 pi^2 the volume of the
+    rotations, V that of the ball of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that
+    of the pose. The density is that of the other points within the size of the target.
+    """
+    balls = seen_balls(candidate)
+    chosen = np.array(candidate.assignment)[balls]
+    noise = points.covariance[chosen]
+    shape = target.covariance.reshape(len(target.points), 3, len(target.points), 3)[balls, :, balls]
+    size = np.linalg.norm(target.points[:, None] - target.points, axis=2).max()
+    centre = points.positions[chosen].mean(axis=0)
+    near = int((((points.positions - centre) ** 2).sum(axis=1) < size**2).sum())
+    density = (near - len(balls) + 1.0) / (4.0 / 3.0 * math.pi * size**3)
+    degrees = 3 * len(balls) - 6
+    logarithm = (
+        math.log(len(points.positions) * 8.0 * math.pi**2)
+        + (len(balls) - 1) * math.log(density)
+        + 0.5 * degrees * math.log(math.pi * max(candidate.chi_square, 1e-9))
+        - math.lgamma(0.5 * degrees + 1.0)
+        + 0.5
+        * float(np.linalg.slogdet(noise + np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3))[1].sum())
+        - 0.5 * float(np.linalg.slogdet(candidate.covariance)[1])
+        + math.log(math.comb(len(target.points), len(balls)))
+    )
+    return math.exp(min(logarithm, 100.0))
 
 
 def check_targets(targets: Sequence[Target]) -> None:
