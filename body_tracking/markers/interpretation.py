@@ -7,6 +7,7 @@ at most, so the targets that compete for points are judged together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -25,6 +26,9 @@ MARGIN: Final = 9.0
 """By how much the cost of a second interpretation must be larger: a ratio of the likelihoods of 90."""
 MISSED: Final = 1e-4
 """Share of right assignments that the test of their fit refuses."""
+MAX_CHANCE: Final = 1e-3
+"""Ways to see a target expected by chance alone, above which one is not believed (the number of false alarms of
+Desolneux, Moisan and Morel 2000)."""
 _SAME: Final = 0.1
 """Two poses are one interpretation when no ball differs by more than this part of the target's size."""
 _MOST: Final = 6
@@ -117,6 +121,43 @@ def _fit(
         )
         for row in np.flatnonzero(fits.chi_square <= gate)
     ]
+
+
+def expected_by_chance(target: Target, points: Points, candidate: Candidate, poses: float | None = None) -> float:
+    """How many ways to see a target that fit at least as well to expect of points that have nothing to do with it.
+
+    Of points with a density of q per cubic metre, independent of each other, the sets of m points within a squared
+    Mahalanobis distance c of a pose among a volume U of poses are ``q^m U V sqrt(det S / det P)``: V the volume of the
+    ball of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that of the pose. The density
+    is that of the other points within the size of the target, and of one more.
+
+    Args:
+        target: of the candidate.
+        points: of the frame.
+        candidate: with three balls or more.
+        poses: m^3 rad^3, the volume of the poses at which the target may be; when None, all rotations (8 pi^2) at as
+            many cubic metres as the points would fill at that density.
+    """
+    balls = [ball for ball, point in enumerate(candidate.assignment) if point >= 0]
+    chosen = np.array(candidate.assignment)[balls]
+    shape = target.covariance.reshape(len(target.points), 3, len(target.points), 3)[balls, :, balls]
+    noise = points.covariance[chosen] + np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+    size = np.linalg.norm(target.points[:, None] - target.points, axis=2).max()
+    centre = points.positions[chosen].mean(axis=0)
+    near = int((((points.positions - centre) ** 2).sum(axis=1) < size**2).sum())
+    density = (near - len(balls) + 1.0) / (4.0 / 3.0 * math.pi * size**3)
+    volume = 8.0 * math.pi**2 * len(points.positions) / density
+    degrees = 3 * len(balls) - 6
+    logarithm = (
+        math.log(math.comb(len(target.points), len(balls)))
+        + len(balls) * math.log(density)
+        + math.log(volume if poses is None else min(poses, volume))
+        + 0.5 * degrees * math.log(math.pi * max(candidate.chi_square, 1e-9))
+        - math.lgamma(0.5 * degrees + 1.0)
+        + 0.5 * float(np.linalg.slogdet(noise)[1].sum())
+        - 0.5 * float(np.linalg.slogdet(candidate.covariance)[1])
+    )
+    return math.exp(min(logarithm, 100.0))
 
 
 def spread(points: FloatArray, least: float = 0.1) -> bool:

@@ -6,7 +6,6 @@ in real time. His heuristic search is in :mod:`body_tracking.markers.depth_first
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -14,16 +13,13 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.markers.interpretation import Candidate, decide, fitted
+from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.search import Deadline, DeadlineError, Pairs, Shape, near_pairs
 from body_tracking.markers.targets import Target
 
 SURE: Final = 4
 """Balls that tell a target; three agree too often by chance."""
-MAX_CHANCE: Final = 1e-3
-"""Assignments expected by chance alone, above which one is not believed (number of false alarms, Desolneux, Moisan
-and Morel 2000)."""
 _MISSED_THREE: Final = 0.05
 """Share of right assignments of three balls of a larger target that are refused: their fit is tested more strictly."""
 _MAX_THREES: Final = 20
@@ -125,36 +121,6 @@ class Recogniser:
         return candidates
 
 
-def expected_by_chance(target: Target, points: Points, candidate: Candidate) -> float:
-    """How many ways to see a target that fit at least as well to expect of points that have nothing to do with it.
-
-    Of n points with a density of q per cubic metre, independent of each other, the sets of m points within a squared
-    Mahalanobis distance c of some pose are ``n q^(m-1) 8 pi^2 V sqrt(det S / det P)``: 8 pi^2 the volume of the
-    rotations, V that of the ball of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that
-    of the pose. The density is that of the other points within the size of the target.
-    """
-    balls = seen_balls(candidate)
-    chosen = np.array(candidate.assignment)[balls]
-    noise = points.covariance[chosen]
-    shape = target.covariance.reshape(len(target.points), 3, len(target.points), 3)[balls, :, balls]
-    size = np.linalg.norm(target.points[:, None] - target.points, axis=2).max()
-    centre = points.positions[chosen].mean(axis=0)
-    near = int((((points.positions - centre) ** 2).sum(axis=1) < size**2).sum())
-    density = (near - len(balls) + 1.0) / (4.0 / 3.0 * math.pi * size**3)
-    degrees = 3 * len(balls) - 6
-    logarithm = (
-        math.log(len(points.positions) * 8.0 * math.pi**2)
-        + (len(balls) - 1) * math.log(density)
-        + 0.5 * degrees * math.log(math.pi * max(candidate.chi_square, 1e-9))
-        - math.lgamma(0.5 * degrees + 1.0)
-        + 0.5
-        * float(np.linalg.slogdet(noise + np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3))[1].sum())
-        - 0.5 * float(np.linalg.slogdet(candidate.covariance)[1])
-        + math.log(math.comb(len(target.points), len(balls)))
-    )
-    return math.exp(min(logarithm, 100.0))
-
-
 def check_targets(targets: Sequence[Target]) -> None:
     """Refuse what no pose can be had of.
 
@@ -205,8 +171,3 @@ def target_pose(name: str, points: Points, candidate: Candidate) -> TargetPose:
         np.array(candidate.assignment, dtype=np.int64),
         candidate.residual,
     )
-
-
-def seen_balls(candidate: Candidate) -> list[int]:
-    """The balls that have a point."""
-    return [ball for ball, point in enumerate(candidate.assignment) if point >= 0]

@@ -46,6 +46,10 @@ class Deadline:
         if self._end is not None and self._clock() > self._end:
             raise DeadlineError
 
+    def remaining(self) -> float | None:
+        """Seconds, not negative; None when it never comes."""
+        return None if self._end is None else max(self._end - self._clock(), 0.0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:

@@ -6,11 +6,12 @@ import sys
 import time
 
 import numpy as np
-from scenes import TARGET_POINTS, measure, random_rotation, random_targets, rotation_error, scene
+from scenes import TARGET_POINTS, measure, moving, random_rotation, random_targets, rotation_error, scene
 
 from body_tracking.markers.pose import fit_pose
 from body_tracking.markers.recognition import Recogniser
 from body_tracking.markers.targets import Target
+from body_tracking.markers.tracking import TargetTracker
 
 
 def pose(count: int = 3000) -> None:
@@ -70,6 +71,36 @@ def recognition(count: int = 400) -> None:
         )
 
 
+def tracking(count: int = 20, frames: int = 120) -> None:
+    """Five moving targets at 60 Hz, a ball of each hidden in turn (another each 20 frames), 80 spurious points."""
+    for distance, spurious in ((1.0, 80), (2.0, 80), (3.0, 80), (1.0, 300)):
+        found = wrong = extra = full = 0
+        spent = []
+        for seed in range(count):
+            rng = np.random.default_rng([seed, 11])
+            targets = random_targets(rng, 5)
+            tracker = TargetTracker(targets, deadline=0.05 if spurious > 80 else None)
+            for stamp, true, poses, assignments in moving(targets, distance, rng, frames, spurious):
+                points = measure(true, rng, stamp)
+                begin = time.thread_time()
+                result = tracker.update(points)
+                spent.append(time.thread_time() - begin)
+                found += len(result)
+                full += len(result) == 5
+                for fit in result:
+                    index = [target.name for target in targets].index(fit.name)
+                    seen = fit.points >= 0
+                    wrong += np.linalg.norm(rotation_error(poses[index][0], fit.rotation)) > 0.2
+                    extra += (fit.points[seen] != assignments[index][seen]).any()
+        ms = 1e3 * np.array(spent)
+        total = count * frames
+        print(
+            f"tracking at {distance:g} m, {spurious} spurious: all five in {100 * full / total:.2f} % of {total} frames, "
+            f"targets {100 * found / total / 5:.3f} %, {wrong} wrong poses, {extra} with a spurious ball; CPU of five: "
+            f"median {np.median(ms):.2f} ms, 99 % {np.quantile(ms, 0.99):.2f}; {tracker.counters}"
+        )
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:] or ["pose", "recognition"]:
+    for name in sys.argv[1:] or ["pose", "recognition", "tracking"]:
         globals()[name]()

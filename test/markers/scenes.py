@@ -6,6 +6,8 @@ in the middle between the cameras, z forward.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -113,6 +115,43 @@ def scene(
             assignment[owner[row, 1]] = row
         assignments.append(assignment)
     return points, owner, poses, assignments
+
+
+def moving(
+    targets: list[Target], distance: float, rng: np.random.Generator, frames: int, spurious: int, rate: float = 60.0
+) -> Iterator[tuple[int, FloatArray, list[tuple[FloatArray, FloatArray]], list[FloatArray]]]:
+    """Frames of targets that swing about a place each and turn: stamps, and the rest as :func:`scene` gives it.
+
+    Amplitudes of 4 cm at up to 1 Hz and 0.6 rad at up to 1 Hz. One ball of each target is hidden, another one after
+    every 20 frames. Half of the spurious points are near the targets, and all of them stay where they are.
+    """
+    count = len(targets)
+    _, owner, poses, _ = (first := scene(targets, distance, rng, spurious, 0))
+    clutter = first[0][owner[:, 0] < 0]
+    axes, frequencies = rng.normal(size=(count, 2, 3)), rng.uniform(0.3, 1.0, (count, 2))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    hidden = np.zeros(count, dtype=int)
+    for frame in range(frames):
+        if frame % 20 == 0:
+            hidden = np.array([rng.integers(len(target.points)) for target in targets])
+        phase = 2.0 * np.pi * frequencies * frame / rate
+        now, rows, owners = [], [], []
+        for index, target in enumerate(targets):
+            turned = Rotation.from_rotvec(0.6 * np.sin(phase[index, 0]) * axes[index, 0]).as_matrix() @ poses[index][0]
+            centre = poses[index][1] + 0.04 * np.sin(phase[index, 1]) * axes[index, 1]
+            now.append((turned, centre))
+            for ball, point in enumerate(target.points):
+                if ball != hidden[index]:
+                    rows.append(turned @ point + centre)
+                    owners.append((index, ball))
+        rows.extend(clutter)
+        owners.extend([(-1, -1)] * len(clutter))
+        order = rng.permutation(len(rows))
+        assignments = [np.full(len(target.points), -1) for target in targets]
+        for row, source in enumerate(order):
+            if owners[source][0] >= 0:
+                assignments[owners[source][0]][owners[source][1]] = row
+        yield round(frame / rate * 1e9), np.array(rows)[order], now, assignments
 
 
 def rotation_error(first: FloatArray, second: FloatArray) -> FloatArray:
