@@ -37,7 +37,7 @@ _CONVERGED: Final = 1e-8
 _SETTLING: Final = 12
 _LOST: Final = 10.0
 """Times the usual squared error of a frame."""
-_BLOCKS: Final = 25
+_BLOCKS: Final = 12
 """Parts of a recording over which errors that exceed the poses' noise are taken as independent."""
 
 
@@ -207,23 +207,23 @@ def _covariance(
         for sign in (1.0, -1.0):
             other = moved(tree, posture, sign * spread[:, :, column])
             surplus += 0.5 * (_normal(tree, other, poses, directions, None).information - normal.information)
-    surplus *= 1.0 + 3.0 * np.sqrt(2.0 / len(poses))
-    if scale > 1.0:
-        surplus *= scale**2
+    surplus *= scale**2 * (1.0 + 3.0 * np.sqrt(2.0 / len(poses)))
     # in units in which the information is the identity
     root = np.linalg.inv(np.linalg.cholesky(normal.information + prior))
     values, vectors = np.linalg.eigh(root @ (normal.information - surplus) @ root.T)
     basis = root.T @ vectors
-    known = np.maximum(values, 0.0) + np.einsum("ia,ij,ja->a", basis, prior, basis)
-    inverse = (basis / known) @ basis.T
-    if scale <= 1.0:
-        return inverse
-    # errors that last: of the parts of the recording as they are (Huber's sandwich with blocks), at least scaled noise
-    blocks = np.stack([part.sum(axis=0) for part in np.array_split(normal.gradients, min(_BLOCKS, len(poses)))])
-    values, vectors = np.linalg.eigh(blocks.T @ blocks)
-    pulls = vectors * np.sqrt(np.maximum(values, 0.0))
-    lasting = inverse @ pulls
-    return scale**2 * inverse + lasting @ lasting.T
+    before = np.einsum("ia,ij,ja->a", basis, prior, basis)
+    variances = 1.0 / (np.maximum(values, 0.0) / scale**2 + before)
+    whitened = np.diag(variances)
+    if scale > 1.0:
+        # errors that last: each part of the recording as it pulls (Huber's sandwich with blocks), beside scaled noise
+        parts = np.array_split(normal.gradients, min(_BLOCKS, len(poses)))
+        pulls = (np.stack([part.sum(axis=0) for part in parts]) @ basis) * np.minimum(variances / scale**2, 1.0)
+        whitened = whitened + pulls.T @ pulls
+        shrink = np.sqrt(np.minimum(1.0 / (before * whitened.diagonal()), 1.0))
+        whitened = whitened * shrink * shrink[:, None]
+    result: FloatArray = basis @ whitened @ basis.T
+    return result
 
 
 def _directions(tree: Tree) -> FloatArray:
