@@ -55,6 +55,7 @@ setup(
         "lz4>=4",
         "zstandard>=0.22",
         "rosbags>=0.10,<0.12",
+        "opencv-python-headless>=4.6",
     ],
     extras_require={
         "ros": [
@@ -78,7 +79,6 @@ setup(
             "setuptools>=77",
             "ezc3d>=1.7",
             "import-linter>=2",
-            "opencv-python-headless>=4.6",
             "mujoco-core>=4",
             "playwright>=1.50",
         ],
