@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
-from body_tracking.markers.discs import explain
+from body_tracking.markers.discs import MOST_DISCS, explain
 from body_tracking.markers.observations import ImageBalls
 from body_tracking.markers.spheres import sphere_centre_correction as sphere_centre_correction
 
@@ -28,10 +29,20 @@ _MARGIN: Final = 3
 """Pixels around the thresholded region whose light is the ball's."""
 _RING: Final = 2
 """Pixels around the margin, of the background."""
-_REACH: Final = 2.0
-"""Pixels by which the window of a centroid is larger than the ball."""
+_REACH: Final = 0.8
+"""By which the window of a centroid is larger than the ball, widths of the edge."""
+_LEAST_REACH: Final = 1.2
+"""Pixels."""
+_SATURATED_REACH: Final = 2.5
+"""Pixels; what is left of the edge of a saturated ball is its long tail."""
 _APART: Final = 4.0
 """Pixels between the edges of balls that are near enough to disturb each other's centroids."""
+_TOGETHER: Final = 0.06
+"""Misfit up to which regions that are near to each other are one ball each."""
+_FIT_FLOOR: Final = 0.004
+"""Standard deviation of a fitted centre without noise, pixels."""
+_DISTURBED: Final = 0.05
+"""Standard deviation of a centroid by the light of a ball nearby, pixels."""
 _LEAST_RING: Final = 12
 """Pixels from which the background around a ball is known."""
 _LOWER: Final = 0.2
@@ -40,10 +51,17 @@ _LOST: Final = 1.45
 """Pixels of area that the blur of an edge takes from :attr:`_Measured.fill`."""
 _ELONGATION_NOISE: Final = 4.0
 """Elongation by noise, standard deviations of the centroid in radii of the ball."""
+_EDGE: Final = 1.3
+_LEAST_EDGE: Final = 0.5
+"""Pixels between 10 and 90 % of a ball's brightness."""
 _PASSES: Final = 2
 _QUANTISATION: Final = 1.0 / 12.0
 """Variance of rounding to whole numbers."""
 _MOST: Final = 2**16 - 1
+
+
+_Ball = tuple[FloatArray, float, FloatArray]
+"""Centroid (2,), area, covariance (2, 2)."""
 
 
 class ImageError(BodyTrackingError):
@@ -52,39 +70,59 @@ class ImageError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True)
 class DetectionSettings:
-    """How balls are found.
+    """How balls are found; each field's ``doc`` says what it is.
 
-    Attributes:
-        dark: quantile of the brightness that is background for sure; Gaschler has 0.98, but 15 near balls are 2 %.
-        bright: quantile that is ball for sure.
-        lower: where between the two the threshold is. Gaschler has 0.2; less finds a ball at 3 m beside saturated ones.
-        noise: of the background, standard deviations by which the threshold is above it at least.
-        least_area: pixels above the threshold; fewer are a glint or a broken pixel.
-        most_area: pixels above the threshold; more are a lamp, a window, a coat.
-        most_balls: of an image, the largest.
-        elongation: ratio of its axes from which a region is taken for more or less than one whole ball.
-        fill: ratio of its area to that of an ellipse with its moments, under which it is.
-        misfit: root of the mean squared difference from discs, share of the brightness, over which a region is dropped.
-        saturation: brightness at which the sensor saturates; None for the largest number of the image's type.
-        full_well: electrons of a saturated pixel, for the shot noise.
-        floor: standard deviation of a centroid that blur and whole numbers leave, pixels.
-        saturated_floor: the same of a ball that saturates: its edge is cut off pixel by pixel.
+    Raises:
+        ImageError: a value out of its range.
     """
 
-    dark: float = 0.95
-    bright: float = 0.9999
-    lower: float = 0.1
-    noise: float = 6.0
-    least_area: int = 5
-    most_area: int = 2500
-    most_balls: int = 64
-    elongation: float = 1.12
-    fill: float = 0.85
-    misfit: float = 0.12
-    saturation: float | None = None
-    full_well: float = 10_000.0
-    floor: float = 0.004
-    saturated_floor: float = 0.009
+    dark: float = number_field(
+        0.95,
+        "quantile of the brightness that is background; Gaschler has 0.98, but 15 near balls are 2 %",
+        "",
+        0.1,
+        0.99,
+    )
+    bright: float = number_field(0.9999, "quantile of the brightness that is a ball's", "", 0.99, 1.0)
+    lower: float = number_field(
+        0.1,
+        "where the threshold is between the two; Gaschler has 0.2, less finds far balls beside near ones",
+        "",
+        0.0,
+        1.0,
+    )
+    noise: float = number_field(
+        6.0, "by which the threshold is above the background at least, standard deviations of its noise", "", 3.0, 100.0
+    )
+    least_area: float = number_field(
+        5.0, "area above the threshold under which a region is a glint or a broken pixel", "px^2", 1.0, 1e4
+    )
+    most_area: float = number_field(2500.0, "area above which it is a lamp, a window, a coat", "px^2", 10.0, 1e6)
+    most_balls: float = number_field(64.0, "regions of an image that are measured, the largest", "", 1.0, 1000.0)
+    elongation: float = number_field(
+        1.12, "ratio of its axes from which a region is taken for more or less than one whole ball", "", 1.0, 10.0
+    )
+    fill: float = number_field(
+        0.85, "ratio of its area to an ellipse's of its moments, under which it is", "", 0.0, 1.0
+    )
+    misfit: float = number_field(
+        0.12, "RMS difference from discs, share of the brightness, over which a region is dropped", "", 0.01, 1.0
+    )
+    saturation: float = number_field(
+        0.0, "brightness at which the sensor saturates; 0 for the largest number of the image's type", "", 0.0, 65535.0
+    )
+    full_well: float = number_field(10_000.0, "electrons of a saturated pixel, for the shot noise", "", 100.0, 1e7)
+    floor: float = number_field(
+        0.005,
+        "standard deviation of a centroid without noise where the edge of a ball is 1.3 pixels wide from 10 to 90 % "
+        "of its brightness; it goes with the inverse square of the width",
+        "px",
+        0.0,
+        1.0,
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self, "detection of balls", ImageError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,18 +149,19 @@ class _Regions:
 
     def sums(self, weights: FloatArray) -> FloatArray:
         """(count,) sums of weights (p,) of each region."""
-        return np.bincount(self.label, weights, self.count)
+        sums: FloatArray = np.bincount(self.label, weights, self.count).astype(np.float64)
+        return sums
 
 
 def detect(
-    image: NDArray[Any], camera: str = "", stamp_ns: int = 0, settings: DetectionSettings | None = None
+    image: NDArray[Any], stamp_ns: int = 0, camera: str = "", settings: DetectionSettings | None = None
 ) -> ImageBalls:
     """The balls in an image.
 
     Args:
         image: (h, w) uint8 or uint16.
-        camera: its frame.
         stamp_ns: capture time, nanoseconds.
+        camera: its frame.
         settings: how balls are found.
 
     Raises:
@@ -134,8 +173,9 @@ def detect(
         raise ImageError(f"image of camera {camera or '(no name)'}: {shape} of {kind}, expected (h, w) uint8 or uint16")
     if not image.size:
         raise ImageError(f"image of camera {camera or '(no name)'}: {image.shape}, no pixels")
+    image = np.ascontiguousarray(image)
     histogram = _Histogram.of(image, settings)
-    mask = cv2.compare(image, histogram.threshold, cv2.CMP_GT)
+    mask = cv2.threshold(image, histogram.threshold, 255, cv2.THRESH_BINARY)[1].astype(np.uint8)
     count, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     none = ImageBalls(stamp_ns, camera, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)), count - 1)
     if count == 1 or count > _MOST:
@@ -144,19 +184,23 @@ def detect(
     keep = inside & (core >= settings.least_area) & (core <= settings.most_area)
     keep[0] = False
     kept = np.flatnonzero(keep)
-    kept = np.sort(kept[np.argsort(-core[kept], kind="stable")[: settings.most_balls]])
+    kept = np.sort(kept[np.argsort(-core[kept], kind="stable")[: int(settings.most_balls)]])
     if not len(kept):
         return none
     measured = _centroids(regions, settings)
-    found, dropped = [], count - 1 - len(kept)
-    for members in _groups(kept, measured):
-        odd = measured.odd(members, settings)
-        if len(members) == 1 and not odd[0]:
-            label = members[0]
-            found.append((measured.pixels[label], measured.areas[label], measured.covariance[label]))
-            continue
-        balls = _explained(regions, measured, members, settings)
-        dropped += not balls
+    odd = measured.odd(settings)
+    found: list[_Ball] = []
+    dropped = count - 1 - len(kept)
+    for group in _groups(kept, measured):
+        balls = _explained(regions, measured, group, _TOGETHER) if 1 < len(group) <= MOST_DISCS else []
+        for label in group if not balls else []:
+            if odd[label]:
+                alone = _explained(regions, measured, np.array([label]), settings.misfit)
+            else:
+                disturbed = _DISTURBED**2 * np.eye(2) * (len(group) > 1)
+                alone = [(measured.pixels[label], measured.areas[label], measured.covariance[label] + disturbed)]
+            dropped += not alone
+            balls += alone
         found += balls
     if not found:
         return replace(none, dropped=dropped)
@@ -213,7 +257,7 @@ def _regions(
     noise = np.maximum(noise, histogram.variance)
     # from here on what is a ball's
     at, value, label = at[in_near], value[in_near], near[at[in_near]].astype(np.intp)
-    saturation = float(np.iinfo(image.dtype).max) if settings.saturation is None else settings.saturation
+    saturation = settings.saturation or float(np.iinfo(image.dtype).max)
     above = value - background[label]
     variance = noise[label] + saturation / settings.full_well * np.maximum(above, 0.0)
     variance[value >= saturation] = 0.0
@@ -244,12 +288,12 @@ class _Measured:
     elongation: FloatArray
     fill: FloatArray
 
-    def odd(self, members: IntArray, settings: DetectionSettings) -> BoolArray:
-        """Which regions (k,) are not the image of one whole ball."""
-        areas = np.maximum(self.areas[members], 2.0 * _LOST)
-        noise = np.sqrt(np.pi * np.trace(self.covariance[members], axis1=1, axis2=2) / areas)
-        elongated = self.elongation[members] > settings.elongation + _ELONGATION_NOISE * noise
-        return np.asarray(elongated | (self.fill[members] < settings.fill * (1.0 - _LOST / areas)))
+    def odd(self, settings: DetectionSettings) -> BoolArray:
+        """Which regions (count,) are not the image of one whole ball."""
+        areas = np.maximum(self.areas, 2.0 * _LOST)
+        noise = np.sqrt(np.pi * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1]) / areas)
+        elongated = self.elongation > settings.elongation + _ELONGATION_NOISE * noise
+        return np.asarray(elongated | (self.fill < settings.fill * (1.0 - _LOST / areas)))
 
 
 def _centroids(regions: _Regions, settings: DetectionSettings) -> _Measured:
@@ -265,8 +309,11 @@ def _centroids(regions: _Regions, settings: DetectionSettings) -> _Measured:
     xy = regions.sums(linear * offset_x * offset_y) / area
     middle, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     long, short = np.maximum(middle + spread, 1e-3), np.maximum(middle - spread, 1e-3)
-    # a window that is symmetrical about the centroid does not move it
-    radius = 2.0 * np.sqrt(long) + _REACH + 0.5
+    slope = (value > 0.1 * peak[label]) & (value < 0.9 * peak[label])
+    edge = np.maximum(regions.sums(slope.astype(np.float64)) / (2.0 * np.sqrt(np.pi * area)), _LEAST_EDGE)
+    # a window that is symmetrical about the centroid does not move it; half a pixel is its own edge
+    reach = np.where(peak >= regions.ceiling, _SATURATED_REACH, np.clip(_REACH * edge, _LEAST_REACH, _MARGIN))
+    radius = 2.0 * np.sqrt(long) + reach + 0.5
     for _ in range(_PASSES):
         offset_x, offset_y = x - centre_x[label], y - centre_y[label]
         weight = np.clip(radius[label] - np.hypot(offset_x, offset_y), 0.0, 1.0)
@@ -275,7 +322,8 @@ def _centroids(regions: _Regions, settings: DetectionSettings) -> _Measured:
         centre_x = centre_x + regions.sums(light * offset_x) / total
         centre_y = centre_y + regions.sums(light * offset_y) / total
     noise = weight**2 * regions.variance
-    floor = np.where(peak >= regions.ceiling, settings.saturated_floor, settings.floor)
+    # the sharper an edge, the less can pixels tell where it is; saturation sharpens it
+    floor = settings.floor * (_EDGE / edge) ** 2
     covariance = np.empty((regions.count, 2, 2))
     covariance[:, 0, 0] = regions.sums(noise * offset_x**2) / total**2
     covariance[:, 1, 1] = regions.sums(noise * offset_y**2) / total**2
@@ -296,16 +344,13 @@ def _groups(kept: IntArray, measured: _Measured) -> list[IntArray]:
     return [kept[group == index] for index in range(count)]
 
 
-def _explained(
-    regions: _Regions, measured: _Measured, members: IntArray, settings: DetectionSettings
-) -> list[tuple[FloatArray, float, FloatArray]]:
+def _explained(regions: _Regions, measured: _Measured, members: IntArray, misfit: float) -> list[_Ball]:
     """Centres, areas and covariances of the balls in regions; none where they are no balls."""
     own = np.isin(regions.label, members)
     value, variance = regions.value[own], regions.variance[own]
     ceiling = float(regions.ceiling[members].min())
     discs = explain(regions.x[own], regions.y[own], value, variance, ceiling, measured.pixels[members])
-    if discs.misfit > settings.misfit:
+    if discs.misfit > misfit:
         return []
     areas = np.pi * discs.radii**2
-    covariance = discs.covariance + settings.floor**2 * np.eye(2)
-    return list(zip(discs.centres, areas.tolist(), covariance, strict=True))
+    return list(zip(discs.centres, areas.tolist(), discs.covariance + _FIT_FLOOR**2 * np.eye(2), strict=True))

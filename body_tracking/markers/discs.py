@@ -16,7 +16,8 @@ from scipy.special import ndtr
 
 from body_tracking.core.skeleton import FloatArray
 
-_MOST_DISCS: Final = 4
+MOST_DISCS: Final = 4
+"""That are fitted together."""
 _ITERATIONS: Final = 30
 _STEP: Final = 1e-5
 """Of the derivatives' differences, pixels or shares of the brightness."""
@@ -28,6 +29,8 @@ _LEAST_RADIUS: Final = 0.7
 _MISFIT: Final = 0.01
 """Of the models, share of the brightness: a ball is not equally bright all over."""
 _GAUSS: Final = np.polynomial.legendre.leggauss(5)
+_BLURRED: Final = 4.0
+"""Standard deviations of the blur by which discs must be apart not to hide each other."""
 _CONVINCING: Final = 1.0
 """Weighted sum of squares over the number of pixels of a model that needs no rival."""
 _EXPLAINED: Final = 0.06
@@ -87,17 +90,20 @@ def overlapping(x: FloatArray, y: FloatArray, p: FloatArray) -> FloatArray:
     edge, count = np.exp(p[:, -1:]), (p.shape[1] - 1) // 4
     result = np.zeros((len(p), len(x)))
     discs = p[:, :-1].reshape(len(p), count, 4)
-    before: list[tuple[FloatArray, FloatArray]] = []
+    before: list[tuple[int, FloatArray, FloatArray]] = []
     # the order of the first set of parameters, so that its derivatives see no jump
-    for index in np.argsort(-discs[0, :, 2]):
+    for index in np.argsort(-discs[0, :, 2]).tolist():
         inside, normal = _inside(x, y, discs[:, index], edge)
         share = ndtr(inside)
         shown = share
-        for other, other_normal in before:
+        for nearer, other, other_normal in before:
+            gap = np.hypot(*(discs[0, index, :2] - discs[0, nearer, :2])) - discs[0, index, 2] - discs[0, nearer, 2]
+            if gap > _BLURRED * edge[0, 0]:
+                continue
             hidden = _both(inside, other, (normal * other_normal).sum(axis=0))
             shown = shown * (1.0 - np.minimum(hidden / np.maximum(share, 1e-12), 1.0))
         result += discs[:, index, 3:] * shown
-        before.append((inside, normal))
+        before.append((index, inside, normal))
     return result
 
 
@@ -155,7 +161,7 @@ def explain(
         single.append(_single(cut, [*centre, whole, 1.0, np.arctan2(hidden[1], hidden[0]), 0.0], *data))
         if single[-1].squares < _CONVINCING:
             break
-    for count in range(3, _MOST_DISCS + 1):
+    for count in range(3, MOST_DISCS + 1):
         if min(discs.misfit for discs in overlap + single) < _EXPLAINED:
             break
         # discs that share a part of their area
@@ -248,7 +254,8 @@ def _fit(
         jacobian[-1, -1] = tightness
         return residual, jacobian, float(residual @ residual)
 
-    found, damping = np.array([*start, expected]), 1e-3
+    found: FloatArray = np.array([*start, expected], dtype=np.float64)
+    damping = 1e-3
     residual, jacobian, squares = linear(found)
     for _ in range(_ITERATIONS):
         normal = jacobian.T @ jacobian
@@ -270,6 +277,7 @@ def _fit(
             if damping > 1e6:
                 break
     freedom = max(len(values) - size, 1)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian + 1e-9 * np.eye(size)) * max(1.0, squares / freedom)
+    inverse: FloatArray = np.asarray(np.linalg.pinv(jacobian.T @ jacobian + 1e-9 * np.eye(size)), dtype=np.float64)
+    covariance = max(1.0, squares / freedom) * inverse
     misfit = float(np.sqrt(np.mean((residual[:-1] / weight) ** 2)))
-    return found, covariance, misfit, squares / len(values), squares + size * np.log(len(values))
+    return found, covariance, misfit, squares / len(values), squares + size * float(np.log(len(values)))

@@ -244,7 +244,9 @@ def render(
         visible[index] = whole[inside].sum() / areas[index]
         if sensor.blur > 0.0:
             spread = sensor.blur * sensor.supersampling
-            shown = cv2.GaussianBlur(shown, (0, 0), spread, borderType=cv2.BORDER_CONSTANT)
+            shown = np.asarray(
+                cv2.GaussianBlur(shown, (0, 0), spread, borderType=cv2.BORDER_CONSTANT), dtype=np.float64
+            )
             whole = _binned(shown, sensor.supersampling)
         light[rows, columns] += sensor.brightness / float(centres[index] @ centres[index]) * whole
     light = light[_PAD:-_PAD, _PAD:-_PAD]
@@ -349,7 +351,9 @@ def render_chessboard(
             paper = (x >= -2) & (x <= columns) & (y >= -2) & (y <= rows) & (w > 0.0)
             dark = board & ((x + y) % 2 == 0)
             light += np.where(dark, black, np.where(paper, white, sensor.background))
-    light = light.reshape(shape) / len(offsets) ** 2
+    made: SingleArray = (light.reshape(shape) / len(offsets) ** 2).astype(np.float32)
     if sensor.blur > 0.0:
-        light = cv2.GaussianBlur(light, (0, 0), sensor.blur, borderType=cv2.BORDER_REPLICATE)
-    return sensor.expose(light[_PAD - 1 : 1 - _PAD, _PAD - 1 : 1 - _PAD], np.random.default_rng(seed))
+        made = np.asarray(
+            cv2.GaussianBlur(made, (0, 0), sensor.blur, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
+        )
+    return sensor.expose(made[_PAD - 1 : 1 - _PAD, _PAD - 1 : 1 - _PAD], np.random.default_rng(seed))
