@@ -26,6 +26,10 @@ from body_tracking.markers.rig import Rig
 
 _SCALES: Final = (4.0, 2.0, 1.0, 0.5)
 """Pixels beyond which a distance is an outlier, from the first fit to the last."""
+_PLACE: Final = 5.0
+"""Pixels after which a ball's distance is another, independent one."""
+_RATE: Final = 60.0
+"""Images per second, about."""
 _CUT: Final = 9.0
 """Squared standard deviations at which the cost of an outlier ends."""
 
@@ -43,27 +47,33 @@ class MonitorSettings:
 
     Attributes:
         window: seconds of images that are looked at.
-        reach: pixels from an epipolar line within which a lone ball is taken for the partner.
-        noise: standard deviation of an epipolar distance that does not average out over balls, pixels.
+        reach: pixels from an epipolar line within which a ball may be the partner when nothing moves.
+        max_delay: longest delay that is looked for, seconds; balls that move are in reach farther away.
+        partners: most balls within reach; a ball with more is left out.
+        noise: standard deviation of an epipolar distance, pixels.
         jitter: standard deviation of the cameras' capture times, seconds.
+        min_seconds: that the window must hold before anything is told.
         min_distances: fewest distances in the window.
         min_turn: least turn that is told, radians.
         min_delay: least delay that is told, seconds.
         significance: standard deviations that a turn or delay must exceed.
-        explained: least share of the cost of the distances that it must explain.
-        ahead: share of the cost by which an explanation must be better than another.
+        complete: share of the balls that it must bring to a partner's epipolar line.
+        ahead: by which the log likelihood must be better than another cause's.
     """
 
     window: float = 0.9
-    reach: float = 12.0
-    noise: float = 0.25
+    reach: float = 6.0
+    max_delay: float = 0.02
+    partners: int = 5
+    noise: float = 0.15
     jitter: float = 3e-4
+    min_seconds: float = 0.4
     min_distances: int = 60
     min_turn: float = 1e-3
     min_delay: float = 4e-3
-    significance: float = 6.0
-    explained: float = 0.5
-    ahead: float = 0.03
+    significance: float = 7.0
+    complete: float = 0.7
+    ahead: float = 6.0
 
 
 _DEFAULT: Final = MonitorSettings()
@@ -87,20 +97,53 @@ class Finding:
     deviation: float
 
     def __str__(self) -> str:
-        size = f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+        size = (
+            f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+        )
         return f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Distances:
-    """Epipolar distances of one time: (n,) pixels, their variance, and derivatives by what may be wrong."""
+    """Epipolar distances of one time: (n,) pixels, their variance, their share in a place that is new, and derivatives.
+
+    A ball with several partners in reach has several; how many balls there are of the camera that sees fewer.
+    """
 
     stamp_ns: int
     distance: FloatArray
     variance: FloatArray
+    share: FloatArray
     by_turn: FloatArray
     by_delay: FloatArray
     by_calibration: FloatArray
+    balls: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explanation:
+    """A cause fitted to distances: its cost, how many it puts on their lines, the cause (k,), its covariance."""
+
+    cost: float
+    on_line: int
+    cause: FloatArray
+    covariance: FloatArray
+
+    @property
+    def size(self) -> float:
+        """Of a turn its angle, of a delay itself."""
+        return float(np.linalg.norm(self.cause)) if len(self.cause) > 1 else float(self.cause[0])
+
+    @property
+    def significance(self) -> float:
+        """Standard deviations."""
+        return float(np.sqrt(self.cause @ np.linalg.solve(self.covariance, self.cause)))
+
+    @property
+    def deviation(self) -> float:
+        """Of the size."""
+        direction = self.cause / max(float(np.linalg.norm(self.cause)), 1e-12)
+        return float(np.sqrt(direction @ self.covariance @ direction))
 
 
 class RigMonitor:
@@ -136,7 +179,7 @@ class RigMonitor:
         count = len(self._rig.cameras)
         for a in range(count):
             for b in range(a + 1, count):
-                first, second = self._lone_pairs(rays, a, b)
+                first, second = self._pairs_in_reach(rays, velocities, a, b)
                 self.add(
                     balls[0].stamp_ns,
                     (a, b),
@@ -175,42 +218,43 @@ class RigMonitor:
         distance = np.concatenate([np.zeros(0), *(each.distance for each in self._window)])
         if len(distance) < settings.min_distances:
             return None
+        passed = self._window[-1].stamp_ns - self._window[0].stamp_ns
+        if passed < settings.min_seconds * NANOSECONDS:
+            return None
+        balls = sum(each.balls for each in self._window)
         variance = np.concatenate([each.variance for each in self._window])
+        share = np.concatenate([each.share for each in self._window])
         by_turn = np.concatenate([each.by_turn for each in self._window])
         by_delay = np.concatenate([each.by_delay for each in self._window])
         by_calibration = np.concatenate([each.by_calibration for each in self._window])
-        nothing, _, _ = _explain(distance, variance, by_calibration, np.zeros((len(distance), 0)))
-        fits: list[tuple[float, Fault, str, float, float]] = []
+        limits = settings.reach / float(self._geometry.focal.mean()), settings.max_delay
+        nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
+        fits: list[tuple[float, Fault, str, _Explanation]] = []
         for camera in range(count):
             frame = self._rig.cameras[camera].frame_id
-            cost, turn, covariance = _explain(
-                distance, variance, by_calibration, by_turn[:, 3 * camera : 3 * camera + 3]
-            )
-            angle = float(np.linalg.norm(turn))
-            deviation = float(np.sqrt(turn @ covariance @ turn) / max(angle, 1e-12))
-            fits.append((cost, Fault.MOVED_CAMERA, frame, angle, deviation))
-            cost, delay, covariance = _explain(
-                distance, variance, by_calibration, by_delay[:, camera : camera + 1]
-            )
-            if delay[0] > 0.0 or count > 2:
-                fits.append((cost, Fault.OUT_OF_STEP, frame, float(delay[0]), float(np.sqrt(covariance[0, 0]))))
+            turn = by_turn[:, 3 * camera : 3 * camera + 3]
+            turn_fit = _explain(distance, variance, share, by_calibration, turn, limits[0])
+            fits.append((turn_fit.cost, Fault.MOVED_CAMERA, frame, turn_fit))
+            delay_fit = _explain(distance, variance, share, by_calibration, by_delay[:, camera : camera + 1], limits[1])
+            if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, that one is late is that the other is early
+                fits.append((delay_fit.cost, Fault.OUT_OF_STEP, frame, delay_fit))
         fits.sort(key=lambda fit: fit[0])
-        best, fault, frame, amount, deviation = fits[0]
-        gain = nothing - best
+        cost, fault, frame, best = fits[0]
         least = settings.min_turn if fault is Fault.MOVED_CAMERA else settings.min_delay
-        if gain < settings.explained * nothing or abs(amount) < max(least, settings.significance * deviation):
+        if best.on_line < settings.complete * balls or best.size < least:
             return None
-        margin = settings.ahead * gain
-        rivals = [fit for fit in fits[1:] if fit[0] - best < margin]
+        if nothing.cost - cost < settings.significance**2 or best.significance < settings.significance:
+            return None
+        rivals = [fit for fit in fits[1:] if fit[0] - cost < 2.0 * settings.ahead]
         if any(rival[1] is not fault for rival in rivals):
             return None  # not sure yet
-        return Finding(fault, (frame, *(rival[2] for rival in rivals)), amount, deviation)
+        return Finding(fault, (frame, *(rival[2] for rival in rivals)), best.size, best.deviation)
 
     def _in_order(self, balls: Sequence[ImageBalls]) -> list[ImageBalls]:
         return sorted(balls, key=lambda image: self._geometry.index[image.camera])
 
-    def _lone_pairs(self, rays: Rays, a: int, b: int) -> tuple[IntArray, IntArray]:
-        """Balls of two cameras that are within reach of each other's epipolar lines, and of no others'."""
+    def _pairs_in_reach(self, rays: Rays, velocities: FloatArray, a: int, b: int) -> tuple[IntArray, IntArray]:
+        """Balls of two cameras that are within reach of each other's epipolar lines, and of few others'."""
         geometry = self._geometry
         of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
         cross = so3.skew(geometry.positions[b] - geometry.positions[a])
@@ -220,8 +264,11 @@ class RigMonitor:
         # a pixel's width in image coordinates, without distortion: this is a coarse gate
         a_size = np.linalg.norm(by_a @ geometry.rotations[a, :2].T / geometry.focal[a], axis=-1)
         b_size = np.linalg.norm(by_b @ geometry.rotations[b, :2].T / geometry.focal[b], axis=-1)
-        near: BoolArray = np.abs(volume) < self._settings.reach * np.hypot(a_size[None, :], b_size[:, None])
-        near &= (near.sum(axis=0) == 1)[None, :] & (near.sum(axis=1) == 1)[:, None]
+        speed = np.nan_to_num(np.linalg.norm(velocities, axis=-1))
+        reach = self._settings.reach + self._settings.max_delay * np.maximum(speed[of_a, None], speed[None, of_b])
+        near: BoolArray = np.abs(volume) < reach * np.hypot(a_size[None, :], b_size[:, None])
+        most = self._settings.partners
+        near &= (near.sum(axis=0) <= most)[None, :] & (near.sum(axis=1) <= most)[:, None]
         first, second = np.nonzero(near)
         return first + of_a.start, second + of_b.start
 
@@ -268,13 +315,18 @@ class RigMonitor:
         by_calibration += np.cross(first, second) @ shift
         scale = 1.0 / np.sqrt(square)
         good = np.isfinite(volume * scale)
+        # the same ball at the same place says nothing new: its centroid's bias and a wrong partner stay
+        speed = np.minimum(*(np.linalg.norm(each, axis=-1) for each in velocities))
+        repeats = 1.0 + _RATE * np.minimum(settings.window, _PLACE / np.maximum(speed, 1e-3))
         return _Distances(
             stamp_ns,
             (volume * scale)[good],
             (settings.noise**2 + settings.jitter**2 * blur * scale**2)[good],
+            1.0 / repeats[good],
             (by_turn * scale[:, None])[good],
             (by_delay * scale[:, None])[good],
             (by_calibration * scale[:, None])[good],
+            min((len(np.unique(each[:, 0])) for each in pixels), default=0),
         )
 
 
@@ -293,25 +345,33 @@ def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
 
 
 def _explain(
-    distance: FloatArray, variance: FloatArray, by_calibration: FloatArray, by_cause: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Cost of the distances when a cause explains them beside the calibration; the cause, and its covariance.
+    distance: FloatArray,
+    variance: FloatArray,
+    share: FloatArray,
+    by_calibration: FloatArray,
+    by_cause: FloatArray,
+    limit: float,
+) -> _Explanation:
+    """Distances (n,) explained by a cause with derivative (n, k) beside what the calibration leaves open.
+
+    The cause has a prior of this deviation about zero: what is larger is out of reach.
 
     Iteratively reweighted least squares with the weights of Geman and McClure (1987), its scale from wide to narrow.
     """
     r, k = by_calibration.shape[1], by_cause.shape[1]
     derivative = np.concatenate([by_calibration, by_cause], axis=1)
-    prior = np.diag(np.concatenate([np.ones(r), np.full(k, 1e-9)]))
+    prior = np.diag(np.concatenate([np.ones(r), np.full(k, limit**-2)]))
     unknown, information = np.zeros(r + k), prior
     for scale in _SCALES:
         for _ in range(3):
             left = distance - derivative @ unknown
             # of balls that move fast, more is no outlier yet
-            limit = scale**2 * variance / variance.min() + _CUT * variance
-            weight = 1.0 / variance / (1.0 + left**2 / limit) ** 2
+            width = scale**2 * variance / variance.min() + _CUT * variance
+            weight = share / variance / (1.0 + left**2 / width) ** 2
             weighted = derivative * weight[:, None]
             information = prior + weighted.T @ derivative
             unknown = np.linalg.solve(information, weighted.T @ distance)
     left = distance - derivative @ unknown
-    cost = float(np.minimum(left**2 / variance, _CUT).sum() + unknown[:r] @ unknown[:r])
-    return cost, unknown[r:], np.linalg.inv(information)[r:, r:]
+    cost = float(share @ np.minimum(left**2 / variance, _CUT) + unknown[:r] @ unknown[:r])
+    on_line = int((left**2 < _CUT * variance).sum())
+    return _Explanation(cost, on_line, unknown[r:], np.linalg.inv(information)[r:, r:])
