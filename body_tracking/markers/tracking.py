@@ -11,7 +11,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST, chi_square_gate
@@ -187,10 +187,10 @@ class TargetTracker:
         pairs = Pairs(rows[pairs.first], rows[pairs.second], pairs.low, pairs.high)
         return {name: self._near(name, points, pairs, gate, until) for name, gate in gates.items()}
 
-    def _near(self, name: str, points: Points, pairs: Pairs, gate: FloatArray, until: Deadline) -> list[Candidate]:
+    def _near(self, name: str, points: Points, pairs: Pairs, gate: BoolArray, until: Deadline) -> list[Candidate]:
         target, shape, track = self._targets[name], self._recogniser.shapes[name], self._tracks[name]
-        inside = gate.any(axis=0)
-        both = inside[pairs.first] & inside[pairs.second]
+        inside: BoolArray = np.asarray(gate.any(axis=0))
+        both: BoolArray = inside[pairs.first] & inside[pairs.second]
         own = Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both])
         relations = shape.relations(own)
         allowed = [sum(1 << point for point in np.flatnonzero(row).tolist()) for row in gate]
@@ -231,7 +231,7 @@ class TargetTracker:
         return _Track(pose.rotation, pose.translation, np.zeros(6), covariance, pose.stamp_ns)
 
 
-def _gates(target: Target, track: _Track, points: Points) -> FloatArray:
+def _gates(target: Target, track: _Track, points: Points) -> BoolArray:
     """(k, n) whether a point may be a ball of a target, by where the ball is expected."""
     arms = target.points @ track.rotation.T
     jacobian = np.zeros((len(arms), 3, 6))
@@ -244,7 +244,7 @@ def _gates(target: Target, track: _Track, points: Points) -> FloatArray:
     difference = points.positions - (arms + track.translation)[:, None]
     squared = (difference**2).sum(axis=2)
     widest = np.trace(expected, axis1=1, axis2=2)[:, None] + np.trace(points.covariance, axis1=1, axis2=2)
-    gates = squared <= GATE**2 * widest
+    gates: BoolArray = np.asarray(squared <= GATE**2 * widest)
     ball, point = np.nonzero(gates)
     noise = expected[ball] + points.covariance[point]
     chosen = difference[ball, point][:, :, None]
