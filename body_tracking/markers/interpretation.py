@@ -31,6 +31,8 @@ MAX_CHANCE: Final = 1e-3
 Desolneux, Moisan and Morel 2000)."""
 _SAME: Final = 0.1
 """Two poses are one interpretation when no ball differs by more than this part of the target's size."""
+_BATCH: Final = 50
+"""Fits between two looks at the clock, half a millisecond."""
 _MOST: Final = 6
 """Ways to see one target that are compared with those of the others."""
 _MAX_COMBINATIONS: Final = 20_000
@@ -84,10 +86,11 @@ def fitted(
             if not any(frozenset((ball, assignment[ball]) for ball in seen) <= larger for larger in known):
                 by_balls.setdefault(seen, []).append(assignment)
         for seen, same in by_balls.items():
-            deadline.check()
-            for candidate in _fit(target, points, seen, same, missed):
-                candidates.append(candidate)
-                known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
+            for start in range(0, len(same), _BATCH):
+                deadline.check()
+                for candidate in _fit(target, points, seen, same[start : start + _BATCH], missed):
+                    candidates.append(candidate)
+                    known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 

@@ -112,9 +112,9 @@ def maximum_likelihood(
             information = np.linalg.inv(dense.reshape(count, 3 * balls, 3 * balls) + _turned(shape, rotation))
             weighted = information @ flat
             weighted_missing = information @ missing.reshape(count, 3 * balls, 1)
-        covariance: FloatArray = np.linalg.inv(flat.swapaxes(1, 2) @ weighted)
-        step: FloatArray = (covariance @ (weighted.swapaxes(1, 2) @ missing.reshape(count, 3 * balls, 1)))[..., 0]
-        translation = translation + step[:, :3]
+        covariance = np.asarray(np.linalg.inv(flat.swapaxes(1, 2) @ weighted), dtype=np.float64)
+        step = np.asarray(covariance @ (weighted.swapaxes(1, 2) @ missing.reshape(count, 3 * balls, 1)))[..., 0]
+        translation += step[:, :3]
         rotation = so3.quat_to_matrix(so3.exp(step[:, 3:])) @ rotation
         if (np.abs(step) < _CONVERGED).all():
             break

@@ -259,8 +259,8 @@ def _poses(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: Float
         missing = (views - turned - translation[:, None])[..., None]
         weighted = (weights @ jacobian).reshape(count, -1, 6).swapaxes(1, 2)
         information = weighted @ jacobian.reshape(count, -1, 6)
-        step: FloatArray = np.linalg.solve(information, weighted @ missing.reshape(count, -1, 1))[..., 0]
-        translation = translation + step[:, :3]
+        step = np.asarray(np.linalg.solve(information, weighted @ missing.reshape(count, -1, 1)))[..., 0]
+        translation += step[:, :3]
         rotation = so3.quat_to_matrix(so3.exp(step[:, 3:])) @ rotation
         if np.abs(step).max() < _CONVERGED:
             break
