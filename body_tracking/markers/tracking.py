@@ -140,7 +140,10 @@ class TargetTracker:
         unsure: set[str] = set()
         recognised: tuple[TargetPose, ...] = ()
         try:
-            chosen, unsure = decide(self._candidates(points, until))
+            chosen, unsure = decide(
+                self._candidates(points, until),
+                lambda name, each: _believed(self._targets[name], points, each, self._tracks[name]),
+            )
             for name, candidate in chosen.items():
                 self._tracks[name] = _updated(self._tracks[name], candidate, points.stamp_ns)
             recognised, others = self._recognise(points, chosen, unsure, until)
@@ -194,13 +197,12 @@ class TargetTracker:
         own = Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both])
         relations = shape.relations(own)
         allowed = [sum(1 << point for point in np.flatnonzero(row).tolist()) for row in gate]
-        prior = track.covariance[:6, :6]
         for fewest in sorted({max(FEWEST, shape.balls - 1), FEWEST}, reverse=True):
             found = list(shape.assignments(relations, fewest, until, allowed))
             candidates = [
                 expected
                 for candidate in fitted(target, points, found, until)
-                if (expected := _expected(track, candidate)) is not None and _believed(target, points, candidate, prior)
+                if (expected := _expected(track, candidate)) is not None
             ]
             if candidates:
                 return sorted(candidates, key=lambda candidate: candidate.cost)
@@ -266,10 +268,11 @@ def _expected(track: _Track, candidate: Candidate) -> Candidate | None:
     return replace(candidate, cost=candidate.cost + distance) if distance <= _INNOVATION_GATE else None
 
 
-def _believed(target: Target, points: Points, candidate: Candidate, prior: FloatArray) -> bool:
+def _believed(target: Target, points: Points, candidate: Candidate, track: _Track) -> bool:
     """Whether chance does not explain a candidate with hidden balls, among the poses within the gate."""
     if min(candidate.assignment) >= 0:
         return True
+    prior = track.covariance[:6, :6]
     poses = math.pi**3 / 6.0 * _INNOVATION_GATE**3 * math.sqrt(max(np.linalg.det(prior + candidate.covariance), 0.0))
     return expected_by_chance(target, points, candidate, poses) < MAX_CHANCE
 

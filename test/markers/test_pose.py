@@ -27,7 +27,7 @@ def test_exact_points_give_the_pose(hidden: int) -> None:
     rng = np.random.default_rng(hidden)
     for _ in range(20):
         rotation, place = random_rotation(rng), rng.normal(size=3)
-        assignment = np.where(ALL < hidden, -1, ALL)
+        assignment = np.where(hidden > ALL, -1, ALL)
         fit = fit_pose(TARGET, exact(TARGET_POINTS @ rotation.T + place), assignment)
         assert np.allclose(fit.rotation, rotation, atol=1e-9)
         assert np.allclose(fit.translation, place, atol=1e-9)

@@ -180,9 +180,10 @@ def test_depth_first_search_finds_most_targets_of_a_clean_scene() -> None:
     for seed in range(count):
         rng = np.random.default_rng([seed, 31])
         targets = random_targets(rng, 1)
-        true, _, _, assignments = scene(targets, 1.0, rng, spurious=8, hidden=0)
+        true, _, poses, _ = scene(targets, 1.0, rng, spurious=8, hidden=0)
         matching = gaschler_depth_first(targets[0].points, measure(true, rng).positions)
-        found += matching is not None and bool((matching.assignment == assignments[0]).all())
+        # eq. 3.13 may leave out the ball that fits worst
+        found += matching is not None and np.linalg.norm(rotation_error(poses[0][0], matching.rotation)) < 0.1
     assert found >= count - 1
 
 
