@@ -6,7 +6,7 @@ import sys
 import time
 
 import numpy as np
-from scenes import TARGET_POINTS, measure, moving, random_rotation, random_targets, rotation_error, scene
+from scenes import TARGET_POINTS, measure, moving, random_rotation, rotation_error, scene, target_set
 
 from body_tracking.markers.pose import fit_pose
 from body_tracking.markers.recognition import Recogniser
@@ -44,7 +44,7 @@ def recognition(count: int = 1000) -> None:
         spent = []
         for seed in range(count if distance < 3.0 and spurious == 80 else count // 10):
             rng = np.random.default_rng([seed, 7])
-            targets = random_targets(rng, 5)
+            targets = target_set(seed % 100)
             true, _, poses, assignments = scene(targets, distance, rng, spurious)
             points = measure(true, rng)
             recogniser = Recogniser(targets)
@@ -65,10 +65,10 @@ def recognition(count: int = 1000) -> None:
                     extra += 1
         ms = 1e3 * np.array(spent)
         print(
-            f"recognition at {distance:g} m, {spurious} spurious: all found in {100 * found / frames:.2f} % of {frames}, "
-            f"{wrong} wrong poses, {extra} with a spurious ball, {ambiguous} ambiguous, {100 * complete / frames:.1f} % "
-            f"complete; CPU median {np.median(ms[:, 1]):.2f} ms, 99 % {np.quantile(ms[:, 1], 0.99):.1f}, "
-            f"wall median {np.median(ms[:, 0]):.2f} ms, max {ms[:, 0].max():.1f} ms"
+            f"recognition at {distance:g} m, {spurious} spurious: all {100 * found / frames:.2f} % of {frames} frames\n"
+            f"    {wrong} wrong poses, {extra} with a spurious ball, {ambiguous} ambiguous, "
+            f"{100 * complete / frames:.1f} % complete; CPU median {np.median(ms[:, 1]):.2f} ms, 99 % "
+            f"{np.quantile(ms[:, 1], 0.99):.1f}, max {ms[:, 1].max():.1f}, wall median {np.median(ms[:, 0]):.2f} ms"
         )
 
 
@@ -80,7 +80,7 @@ def tracking(count: int = 10, frames: int = 120) -> None:
         for seed in range(count):
             met: set[str] = set()
             rng = np.random.default_rng([seed, 11])
-            targets = random_targets(rng, 5)
+            targets = target_set(seed % 100)
             tracker = TargetTracker(
                 targets,
             )

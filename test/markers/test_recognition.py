@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scenes import measure, random_rotation, random_targets, rotation_error, scene
+from scenes import measure, random_rotation, random_targets, rotation_error, scene, target_set
 
 from body_tracking.markers.depth_first import gaschler_depth_first
 from body_tracking.markers.observations import Points
@@ -24,7 +24,7 @@ def test_five_targets_among_spurious_points(distance: float) -> None:
     missing = 0
     for seed in range(count):
         rng = np.random.default_rng([seed, 21])
-        targets = random_targets(rng, 5)
+        targets = target_set(seed % 10)
         true, _, poses, assignments = scene(targets, distance, rng)
         result = Recogniser(targets).recognise(measure(true, rng))
         missing += len(result.poses) < 5
@@ -40,7 +40,7 @@ def test_absent_targets_are_not_recognised() -> None:
     count, found = draws(20, 200), 0
     for seed in range(count):
         rng = np.random.default_rng([seed, 22])
-        targets = random_targets(rng, 10)
+        targets = target_set(seed % 5, 10)
         true, _, _, _ = scene(targets[:5], 3.0, rng)
         found += len(Recogniser(targets[5:]).recognise(measure(true, rng)).poses)
     assert found <= 1e-3 * 5 * count + 3.0 * np.sqrt(1e-3 * 5 * count)
