@@ -8,7 +8,7 @@ at most, so the targets that compete for points are judged together.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import chi_square_gate, maximum_likelihood, shape_covariance
+from body_tracking.markers.pose import FEWEST, chi_square_gate, maximum_likelihood, shape_covariance
 from body_tracking.markers.search import Deadline
 from body_tracking.markers.targets import Target
 
@@ -24,6 +24,9 @@ HIDDEN_COST: Final = 20.0
 """Cost of a ball that is not seen: a point of three dimensions is worse with a probability of 1.7e-4."""
 MARGIN: Final = 9.0
 """By how much the cost of a second interpretation must be larger: a ratio of the likelihoods of 90."""
+BELIEVED_MARGIN: Final = 40.0
+"""The same for a second interpretation at another place with as many balls that chance does not explain: hardly ever is
+one of them the target and the other nothing, however well they fit."""
 MISSED: Final = 1e-4
 """Share of right assignments that the test of their fit refuses."""
 MAX_CHANCE: Final = 1e-3
@@ -31,6 +34,8 @@ MAX_CHANCE: Final = 1e-3
 Desolneux, Moisan and Morel 2000)."""
 _SAME: Final = 0.1
 """Two poses are one interpretation when no ball differs by more than this part of the target's size."""
+_BATCH: Final = 50
+"""Fits between two looks at the clock, half a millisecond."""
 _MOST: Final = 6
 """Ways to see one target that are compared with those of the others."""
 _MAX_COMBINATIONS: Final = 20_000
@@ -84,10 +89,11 @@ def fitted(
             if not any(frozenset((ball, assignment[ball]) for ball in seen) <= larger for larger in known):
                 by_balls.setdefault(seen, []).append(assignment)
         for seen, same in by_balls.items():
-            deadline.check()
-            for candidate in _fit(target, points, seen, same, missed):
-                candidates.append(candidate)
-                known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
+            for start in range(0, len(same), _BATCH):
+                deadline.check()
+                for candidate in _fit(target, points, seen, same[start : start + _BATCH], missed):
+                    candidates.append(candidate)
+                    known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 
@@ -166,11 +172,14 @@ def spread(points: FloatArray, least: float = 0.1) -> bool:
     return bool(widths[1] > least * widths[0])
 
 
-def decide(candidates: dict[str, list[Candidate]]) -> tuple[dict[str, Candidate], set[str]]:
+def decide(
+    candidates: dict[str, list[Candidate]], believed: Callable[[str, Candidate], bool]
+) -> tuple[dict[str, Candidate], set[str]]:
     """The likeliest way to see the targets, and the targets for which a second way is nearly as likely.
 
     Args:
         candidates: by target, the likeliest first.
+        believed: whether chance does not explain a candidate of a target.
 
     Returns:
         The candidates of the targets that are certain, and the names of those that are not.
@@ -190,17 +199,31 @@ def decide(candidates: dict[str, list[Candidate]]) -> tuple[dict[str, Candidate]
                 # seen as something else, though not for sure
                 unsure.add(name)
                 continue
-            other = min((cost for choice, cost in combinations if not _same(own, choice[name])), default=np.inf)
-            if other < least + MARGIN:
+            others = [(choice[name], cost) for choice, cost in combinations if cost < least + BELIEVED_MARGIN]
+            if not believed(name, own) or any(
+                _rivals(own, other, cost - least, name, believed) for other, cost in others
+            ):
                 unsure.add(name)
             else:
                 chosen[name] = own
     return chosen, unsure
 
 
-def _same(first: Candidate, second: Candidate | None) -> bool:
-    if second is None:
+def _rivals(
+    own: Candidate, other: Candidate | None, more: float, name: str, believed: Callable[[str, Candidate], bool]
+) -> bool:
+    """Whether another way to see the target, at so much more cost, makes it uncertain."""
+    if other is None:
+        return more < MARGIN
+    if _same(own, other):
         return False
+    # of the same points, the likelihoods tell; points at another place need an explanation, too
+    shared = len(set(own.assignment) & set(other.assignment) - {-1})
+    fewer = other.assignment.count(-1) > own.assignment.count(-1)
+    return more < MARGIN or (shared < FEWEST and not fewer and believed(name, other))
+
+
+def _same(first: Candidate, second: Candidate) -> bool:
     apart = np.abs(first.balls - second.balls).max()
     return bool(apart <= _SAME * (first.balls.max(axis=0) - first.balls.min(axis=0)).max())
 

@@ -91,6 +91,8 @@ def maximum_likelihood(
     """
     count, balls = model.shape[:2]
     weights = np.linalg.inv(noise)
+    rotation: FloatArray
+    translation: FloatArray
     rotation, translation = umeyama(model, measured, 3.0 / np.trace(noise, axis1=2, axis2=3))
     jacobian = np.zeros((count, balls, 3, 6))
     jacobian[..., :3] = np.eye(3)
@@ -110,14 +112,14 @@ def maximum_likelihood(
             information = np.linalg.inv(dense.reshape(count, 3 * balls, 3 * balls) + _turned(shape, rotation))
             weighted = information @ flat
             weighted_missing = information @ missing.reshape(count, 3 * balls, 1)
-        covariance = np.linalg.inv(flat.swapaxes(1, 2) @ weighted)
-        step = (covariance @ (weighted.swapaxes(1, 2) @ missing.reshape(count, 3 * balls, 1)))[..., 0]
-        translation = translation + step[:, :3]
+        covariance = np.asarray(np.linalg.inv(flat.swapaxes(1, 2) @ weighted), dtype=np.float64)
+        step = np.asarray(covariance @ (weighted.swapaxes(1, 2) @ missing.reshape(count, 3 * balls, 1)))[..., 0]
+        translation += step[:, :3]
         rotation = so3.quat_to_matrix(so3.exp(step[:, 3:])) @ rotation
         if (np.abs(step) < _CONVERGED).all():
             break
-    chi_square = (missing.reshape(count, 1, 3 * balls) @ weighted_missing)[:, 0, 0]
-    residual: FloatArray = np.sqrt((missing**2).sum(axis=(1, 2)) / balls)
+    chi_square: FloatArray = (missing.reshape(count, 1, 3 * balls) @ weighted_missing)[:, 0, 0]
+    residual = np.asarray(np.sqrt((missing**2).sum(axis=(1, 2)) / balls), dtype=np.float64)
     return Fits(rotation, translation, covariance, chi_square, residual)
 
 

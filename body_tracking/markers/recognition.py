@@ -91,11 +91,9 @@ class Recogniser:
                 candidates[name] = self._candidates(name, points, pairs, until)
         except DeadlineError:
             complete = False
-        chosen, unsure = decide(candidates)
-        for name, candidate in list(chosen.items()):
-            if expected_by_chance(self.targets[name], points, candidate) > MAX_CHANCE:
-                del chosen[name]
-                unsure.add(name)
+        chosen, unsure = decide(
+            candidates, lambda name, each: expected_by_chance(self.targets[name], points, each) <= MAX_CHANCE
+        )
         return Recognition(
             tuple(target_pose(name, points, candidate) for name, candidate in chosen.items()),
             tuple(name for name in wanted if name in unsure),

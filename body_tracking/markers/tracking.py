@@ -11,7 +11,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST, chi_square_gate
@@ -140,7 +140,10 @@ class TargetTracker:
         unsure: set[str] = set()
         recognised: tuple[TargetPose, ...] = ()
         try:
-            chosen, unsure = decide(self._candidates(points, until))
+            chosen, unsure = decide(
+                self._candidates(points, until),
+                lambda name, each: _believed(self._targets[name], points, each, self._tracks[name]),
+            )
             for name, candidate in chosen.items():
                 self._tracks[name] = _updated(self._tracks[name], candidate, points.stamp_ns)
             recognised, others = self._recognise(points, chosen, unsure, until)
@@ -187,20 +190,19 @@ class TargetTracker:
         pairs = Pairs(rows[pairs.first], rows[pairs.second], pairs.low, pairs.high)
         return {name: self._near(name, points, pairs, gate, until) for name, gate in gates.items()}
 
-    def _near(self, name: str, points: Points, pairs: Pairs, gate: FloatArray, until: Deadline) -> list[Candidate]:
+    def _near(self, name: str, points: Points, pairs: Pairs, gate: BoolArray, until: Deadline) -> list[Candidate]:
         target, shape, track = self._targets[name], self._recogniser.shapes[name], self._tracks[name]
-        inside = gate.any(axis=0)
-        both = inside[pairs.first] & inside[pairs.second]
+        inside: BoolArray = np.asarray(gate.any(axis=0))
+        both: BoolArray = inside[pairs.first] & inside[pairs.second]
         own = Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both])
         relations = shape.relations(own)
         allowed = [sum(1 << point for point in np.flatnonzero(row).tolist()) for row in gate]
-        prior = track.covariance[:6, :6]
         for fewest in sorted({max(FEWEST, shape.balls - 1), FEWEST}, reverse=True):
             found = list(shape.assignments(relations, fewest, until, allowed))
             candidates = [
                 expected
                 for candidate in fitted(target, points, found, until)
-                if (expected := _expected(track, candidate)) is not None and _believed(target, points, candidate, prior)
+                if (expected := _expected(track, candidate)) is not None
             ]
             if candidates:
                 return sorted(candidates, key=lambda candidate: candidate.cost)
@@ -231,7 +233,7 @@ class TargetTracker:
         return _Track(pose.rotation, pose.translation, np.zeros(6), covariance, pose.stamp_ns)
 
 
-def _gates(target: Target, track: _Track, points: Points) -> FloatArray:
+def _gates(target: Target, track: _Track, points: Points) -> BoolArray:
     """(k, n) whether a point may be a ball of a target, by where the ball is expected."""
     arms = target.points @ track.rotation.T
     jacobian = np.zeros((len(arms), 3, 6))
@@ -244,7 +246,7 @@ def _gates(target: Target, track: _Track, points: Points) -> FloatArray:
     difference = points.positions - (arms + track.translation)[:, None]
     squared = (difference**2).sum(axis=2)
     widest = np.trace(expected, axis1=1, axis2=2)[:, None] + np.trace(points.covariance, axis1=1, axis2=2)
-    gates = squared <= GATE**2 * widest
+    gates: BoolArray = np.asarray(squared <= GATE**2 * widest)
     ball, point = np.nonzero(gates)
     noise = expected[ball] + points.covariance[point]
     chosen = difference[ball, point][:, :, None]
@@ -266,10 +268,11 @@ def _expected(track: _Track, candidate: Candidate) -> Candidate | None:
     return replace(candidate, cost=candidate.cost + distance) if distance <= _INNOVATION_GATE else None
 
 
-def _believed(target: Target, points: Points, candidate: Candidate, prior: FloatArray) -> bool:
+def _believed(target: Target, points: Points, candidate: Candidate, track: _Track) -> bool:
     """Whether chance does not explain a candidate with hidden balls, among the poses within the gate."""
     if min(candidate.assignment) >= 0:
         return True
+    prior = track.covariance[:6, :6]
     poses = math.pi**3 / 6.0 * _INNOVATION_GATE**3 * math.sqrt(max(np.linalg.det(prior + candidate.covariance), 0.0))
     return expected_by_chance(target, points, candidate, poses) < MAX_CHANCE
 

@@ -7,11 +7,13 @@ in the middle between the cameras, z forward.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.distinct import TargetsAlikeError, check_distinct
 from body_tracking.markers.observations import Points
 from body_tracking.markers.targets import Target
 
@@ -65,9 +67,9 @@ def random_rotation(rng: np.random.Generator) -> FloatArray:
 
 
 def random_targets(
-    rng: np.random.Generator, count: int, balls: int = 5, extent: float = 0.098, apart: float = 0.015
+    rng: np.random.Generator, count: int, balls: int = 5, extent: float = 0.098, noise: float = 8e-4
 ) -> list[Target]:
-    """Targets whose balls are at least 25 mm apart and whose distances differ where chance allows it."""
+    """Targets whose balls are at least 25 mm apart, not flat, and which can be told apart at a noise (metres)."""
     targets: list[Target] = []
     while len(targets) < count:
         points = rng.uniform(-1.0, 1.0, (balls, 3))
@@ -76,11 +78,22 @@ def random_targets(
         distances *= extent / distances.max()
         off = distances[np.triu_indices(balls, 1)]
         widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if off.min() < 0.025 or widths[2] < apart:
+        if off.min() < 0.025 or widths[2] < 0.015:
             continue
         points = points - points.mean(axis=0)
-        targets.append(Target(f"target{len(targets)}", points, np.zeros((3 * balls, 3 * balls)), 0.012))
+        target = Target(f"target{len(targets)}", points, np.zeros((3 * balls, 3 * balls)), 0.012)
+        try:
+            check_distinct([*targets, target], noise)
+        except TargetsAlikeError:
+            continue
+        targets.append(target)
     return targets
+
+
+@lru_cache(maxsize=100)
+def target_set(number: int, count: int = 5) -> list[Target]:
+    """A set of targets of five balls, the same for the same number."""
+    return random_targets(np.random.default_rng([number, 1]), count)
 
 
 def scene(
