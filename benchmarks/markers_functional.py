@@ -176,7 +176,10 @@ def main() -> int:
         lower = cluster(trial, (f"{side}FRM", f"{side}WRA", f"{side}WRB"))
         fits[f"elbow {side}"] = fit_hinge_joint(upper, lower, "elbow")
 
-    met = {f"knee's axis of both halves within {HALVES_BAR_DEG:g} deg {where}": value <= HALVES_BAR_DEG for where, value in halves.items()}
+    met = {
+        f"knee's axis of both halves within {HALVES_BAR_DEG:g} deg {where}": value <= HALVES_BAR_DEG
+        for where, value in halves.items()
+    }
     met["hip: soft tissue is named"] = any("soft tissue" in warning for warning in fits["hip"].warnings)
     met["hip with the epicondyles: not rigid"] = fits["hip, wrong"].verdict == "not_rigid"
     for side in ("L", "R"):

@@ -123,7 +123,7 @@ class AngleEstimator:
             derivative = differentiate(self._tree, posture, rotations, translations, True)
             white = (table.whitening @ derivative).reshape(-1, derivative.shape[-1])
             error = (table.whitening @ errors(table, rotations, translations)[..., None]).reshape(-1)
-            covariance = np.linalg.inv(_information(white[:, :size]))
+            covariance = np.asarray(np.linalg.inv(_information(white[:, :size])), dtype=np.float64)
             step = covariance @ (white[:, :size].T @ error)
             posture = moved(self._tree, posture, step[None])
             if np.abs(step).max() < _CONVERGED:
@@ -184,7 +184,9 @@ class AngleEstimator:
             self.chain.angle_names,
             angles,
             np.sqrt(total),
-            *np.sqrt(variances),
+            np.sqrt(variances[0]),
+            np.sqrt(variances[1]),
+            np.sqrt(variances[2]),
             turns,
             turn_covariance,
             float(np.sqrt(squares / freedom)) if freedom > 0 else float("nan"),

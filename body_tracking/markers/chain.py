@@ -119,7 +119,7 @@ def fit_chain(frames: Sequence[Sequence[TargetPose]], description: Sequence[Join
         ]
     )
     poses = pose_table(frames, tree.targets)
-    poses = poses.rows(poses.seen.any(axis=1))
+    poses = poses.rows(np.asarray(poses.seen.any(axis=1)))
     fits = tuple(fit_joint(joint.name, joint.kind, poses, joint.parent, joint.child) for joint in tree.joints)
     warnings = [warning for fit in fits for warning in fit.warnings]
     found = maximise(tree.with_joints([fit.joint for fit in fits]), poses, MISFIT_WARNING)

@@ -133,7 +133,7 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
         information = white.swapaxes(-1, -2) @ white
         diagonal = np.einsum("nii->ni", information)
         diagonal += damping[:, None] * diagonal + _LOOSE
-        step = np.linalg.solve(information, white.swapaxes(-1, -2) @ residual)[..., 0]
+        step = np.asarray(np.linalg.solve(information, white.swapaxes(-1, -2) @ residual), dtype=np.float64)[..., 0]
         trial = moved(tree, posture, step)
         squares = (residual**2).sum(axis=(1, 2))
         better = _frame_squares(poses, errors(poses, *place(tree, trial))) < squares
@@ -141,8 +141,7 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
             np.where(better[:, None, None], trial.rotation, posture.rotation),
             np.where(better[:, None], trial.translation, posture.translation),
             tuple(
-                np.where(better[:, None, None], new, old)
-                for new, old in zip(trial.turns, posture.turns, strict=True)
+                np.where(better[:, None, None], new, old) for new, old in zip(trial.turns, posture.turns, strict=True)
             ),
         )
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
@@ -201,8 +200,8 @@ def _covariance(
     """
     prior, _ = _prior(tree, directions)
     surplus = np.zeros_like(prior)
-    factors = np.linalg.inv(normal.frames).swapaxes(-1, -2)
-    spread = np.minimum(np.abs(factors), 0.1) * np.sign(factors)
+    factors = np.asarray(np.linalg.inv(normal.frames), dtype=np.float64).swapaxes(-1, -2)
+    spread: FloatArray = np.minimum(np.abs(factors), 0.1) * np.sign(factors)
     for column in range(tree.size):
         for sign in (1.0, -1.0):
             other = moved(tree, posture, sign * spread[:, :, column])
@@ -242,10 +241,7 @@ def _prior(tree: Tree, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(p, p) information and (p,) gradient of what is known of the joints before any measurement."""
     weights = np.tile(np.repeat([REACH**-2, np.pi**-2, REACH**-2, np.pi**-2], 3), len(tree.joints))
     centres = np.concatenate(
-        [
-            np.concatenate([joint.parent_centre, np.zeros(3), joint.child_centre, np.zeros(3)])
-            for joint in tree.joints
-        ]
+        [np.concatenate([joint.parent_centre, np.zeros(3), joint.child_centre, np.zeros(3)]) for joint in tree.joints]
     )
     return (directions.T * weights) @ directions, -directions.T @ (weights * centres)
 
@@ -285,7 +281,7 @@ def _normal(
     by_frame, by_joint = white[..., : tree.size], white[..., tree.size :] @ directions
     information = by_frame.swapaxes(-1, -2) @ by_frame
     information[:, range(tree.size), range(tree.size)] += _LOOSE
-    frames = np.linalg.cholesky(information)
+    frames = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
     mixed = by_frame.swapaxes(-1, -2) @ by_joint
     residual = np.zeros((n, white.shape[1], 1))
     if error is not None:

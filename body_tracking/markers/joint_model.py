@@ -133,9 +133,7 @@ class Joint:
 
     def difference(self, other: Joint) -> FloatArray:
         """(12,) the step by which ``other.changed(step)`` is this joint."""
-        turns = np.stack(
-            [self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T]
-        )
+        turns = np.stack([self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T])
         parent, child = so3.log(so3.matrix_to_quat(turns))
         return np.concatenate(
             [self.parent_centre - other.parent_centre, parent, self.child_centre - other.child_centre, child]
@@ -231,7 +229,9 @@ def conventional(joint: Joint) -> tuple[Joint, FloatArray]:
     """
     if joint.kind is JointKind.BALL:
         return joint, free_directions(joint)
-    flip_parent, flip_child = (bool(axis[np.abs(axis).argmax()] < 0.0) for axis in (joint.parent_axis, joint.child_axis))
+    flip_parent, flip_child = (
+        bool(axis[np.abs(axis).argmax()] < 0.0) for axis in (joint.parent_axis, joint.child_axis)
+    )
     if joint.kind is JointKind.HINGE:
         flip_child = flip_parent
     joint = replace(

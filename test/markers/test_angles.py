@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import pytest
-from draws import draws
 from marker_people import measured, random_joint, random_posture
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +17,7 @@ from body_tracking.markers.joint_model import SIZE, JointKind, turn_angles
 from body_tracking.markers.joint_tree import Posture, Tree, place, tree_of
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTableError
+from draws import draws
 
 ARM = (
     ("shoulder", "torso", "upper_arm", JointKind.BALL),
@@ -77,7 +77,9 @@ def test_angles_of_a_single_joint_reach_the_bars(kind: JointKind, bar: float) ->
         far = np.abs(np.cos(true[:, 1])) > 0.2 if kind is JointKind.BALL else np.ones(len(true), dtype=bool)
         outer.append((apart <= 1.96 * np.stack([each.stddev for each in found]))[far])
     error_deg, share, named = rms_deg(np.concatenate(errors)), np.mean(inside), np.concatenate(outer).mean()
-    print(kind, f"{error_deg:.4f} deg, stated {np.degrees(np.sqrt(np.mean(stated))):.4f}, 95 %: {share:.3f}, {named:.3f}")
+    print(
+        kind, f"{error_deg:.4f} deg, stated {np.degrees(np.sqrt(np.mean(stated))):.4f}, 95 %: {share:.3f}, {named:.3f}"
+    )
     assert error_deg < bar
     assert 0.92 < share < 0.98 and 0.92 < named < 0.98
 
@@ -117,7 +119,9 @@ def test_the_whole_is_more_exact_than_the_difference_of_orientations() -> None:
     relative = np.stack([frame[0].rotation.T @ frame[1].rotation for frame in frames])
     plain = turn_angles(joint.kind, joint.parent_rotation.T @ relative @ joint.child_rotation)
     true = turn_angles(joint.kind, posture.turns[0])
-    errors = [np.abs(np.exp(1j * angles) - np.exp(1j * true)) for angles in (np.stack([each.angles for each in found]), plain)]
+    errors = [
+        np.abs(np.exp(1j * angles) - np.exp(1j * true)) for angles in (np.stack([each.angles for each in found]), plain)
+    ]
     assert np.sqrt((errors[0] ** 2).mean()) < 0.9 * np.sqrt((errors[1] ** 2).mean())
 
 
@@ -252,4 +256,6 @@ def test_places_follow_from_turns() -> None:
         behind = translations[:, child] + rotations[:, child] @ joint.child_centre
         assert np.abs(before - behind).max() < 1e-12
         if joint.kind is JointKind.HINGE:
-            assert np.abs(rotations[:, parent] @ joint.parent_axis - rotations[:, child] @ joint.child_axis).max() < 1e-12
+            assert (
+                np.abs(rotations[:, parent] @ joint.parent_axis - rotations[:, child] @ joint.child_axis).max() < 1e-12
+            )

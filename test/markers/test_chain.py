@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import pytest
-from draws import draws
 from marker_people import measured, random_joint, random_posture
 from scipy.stats import chi2
 
@@ -14,6 +13,7 @@ from body_tracking.markers.chain import Chain, ChainError, JointDescription, fit
 from body_tracking.markers.joint_model import SIZE, JointError, JointKind
 from body_tracking.markers.joint_tree import Tree, TreeError, tree_of
 from body_tracking.markers.joints import JointFitError
+from draws import draws
 
 UPPER_BODY = (
     ("shoulder", "torso", "upper_arm", JointKind.BALL),

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from draws import draws
 from marker_people import columns, measured, pair, pose_covariances, random_posture
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -27,9 +26,10 @@ from body_tracking.markers.joints import (
 )
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTableError
+from draws import draws
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from markers_functional import EPICONDYLES, PELVIS, SHANK, THIGH, axis_angle, cluster, markers  # noqa: E402
+from markers_functional import EPICONDYLES, PELVIS, SHANK, THIGH, axis_angle, cluster, markers
 
 FITS = {
     JointKind.BALL: fit_ball_joint,
@@ -39,7 +39,9 @@ FITS = {
 CENTRES = [0, 1, 2, 6, 7, 8]
 
 
-def drawn(seed: int, kind: JointKind, frames: int, motion: float, about: int = 3) -> tuple[Joint, list[list[TargetPose]]]:
+def drawn(
+    seed: int, kind: JointKind, frames: int, motion: float, about: int = 3
+) -> tuple[Joint, list[list[TargetPose]]]:
     """A random joint and a recording of its targets."""
     rng = np.random.default_rng(seed)
     tree = pair(rng, kind)
