@@ -32,6 +32,7 @@ SIZE: Final = 12
 _CENTRES: Final = [0, 1, 2, 6, 7, 8]
 _NEAR_AXIS: Final = 0.01
 """Metres: a target whose origin is nearer to the axis gets its x axis from an axis of its own instead."""
+_AXES: FloatArray = np.eye(3)[None]
 _STEP: Final = 1e-6
 _QUARTER: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rx(-90 deg)."""
@@ -149,9 +150,9 @@ def is_rotation(matrix: FloatArray) -> bool:
 
 
 def turn_axes(kind: JointKind, turns: FloatArray) -> FloatArray:
-    """(n, 3, d) axes of the joint's coordinates in its frame in the parent, of (n, 3, 3) turns."""
+    """(n, 3, d) axes of the joint's coordinates in its frame in the parent, of (n, 3, 3) turns; (1, 3, 3) of a ball's."""
     if kind is JointKind.BALL:
-        return np.broadcast_to(np.eye(3), turns.shape)
+        return _AXES
     axes = np.zeros((len(turns), 3, kind.coordinates))
     axes[:, 2, 0] = 1.0
     if kind is JointKind.UNIVERSAL:

@@ -33,7 +33,7 @@ def arm(seed: int, joints: tuple[tuple[str, str, str, JointKind], ...] = ARM) ->
 
 def known(tree: Tree) -> Chain:
     size = SIZE * len(tree.joints)
-    return Chain(tree.joints, np.zeros((size, size)))
+    return Chain(tree.joints, np.zeros((size, size)), np.zeros((size, 0)))
 
 
 def turn_errors(found: list[ChainAngles], posture: Posture, joint: int) -> FloatArray:
@@ -207,7 +207,7 @@ def test_the_chain_is_in_the_deviation() -> None:
     for _ in range(300):
         step = root @ rng.normal(size=len(root))
         joints = tuple(joint.changed(step[SIZE * i : SIZE * (i + 1)]) for i, joint in enumerate(chain.joints))
-        estimator = AngleEstimator(Chain(joints, chain.covariance))
+        estimator = AngleEstimator(Chain(joints, chain.covariance, chain.sensitivity))
         drawn.append(estimator.estimate(frame).angles)
     ratio = np.std(drawn, axis=0) / stated.model
     assert (ratio > 0.8).all() and (ratio < 1.2).all()

@@ -145,6 +145,19 @@ def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None
     assert 1.0 / 1.5 < ratio < 1.5
 
 
+@pytest.mark.parametrize("noise", [1.0, 1e-6])
+@pytest.mark.parametrize("kind", JointKind)
+def test_targets_that_stand_still_say_nothing_of_a_joint(kind: JointKind, noise: float) -> None:
+    rng = np.random.default_rng(5)
+    tree = pair(rng, kind)
+    poses = columns(measured(rng, tree, random_posture(rng, tree, 20, 0.0), scale=noise))
+    fit = FITS[kind](*poses)
+    assert fit.verdict in (Verdict.SMALL_MOTION, Verdict.ONE_AXIS)
+    deviation = np.sqrt(fit.joint.covariance.diagonal())
+    assert np.linalg.norm(deviation[:3]) > 0.1
+    assert np.linalg.norm(fit.joint.parent_centre - tree.joints[0].parent_centre) < 3.0 * np.linalg.norm(deviation[:3])
+
+
 def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
     for seed in range(draws(3, 20)):
         truth, poses = drawn(seed, JointKind.BALL, 500, 40.0, about=1)
