@@ -56,7 +56,8 @@ class ChainAngles:
         stddev: (k,) radians, of all below together; infinity where the angle is NaN.
         noise: (k,) radians, what of it is from the noise of the poses,
         model: (k,) radians, from the chain's covariance, and
-        calibration: (k,) radians, from the calibration of the cameras. The last two are the same errors in all frames.
+        calibration: (k,) radians, from the calibration of the cameras, which the chain was measured by too where its
+            sensitivity is known. The last two are the same errors in all frames.
         rotations: (j, 3, 3) each joint's turn (:mod:`body_tracking.markers.joint_model`), NaN likewise.
         rotation_covariance: (j, 3, 3) square radians, of w such that the true turn is ``exp(w) @ rotation``.
         scale: root of the reduced chi squared of the fit; NaN where there are no more poses than coordinates.
@@ -118,15 +119,16 @@ class AngleEstimator:
         systematic = self._systematic(table, sensitivities, calibration)
         posture = first_posture(self._tree, table, self._posture)
         size = self._tree.size
-        for _ in range(_ITERATIONS):
+        for count in range(_ITERATIONS):
             rotations, translations = place(self._tree, posture)
-            derivative = differentiate(self._tree, posture, rotations, translations, True)
+            # the first step is never the last: those by the joints' parameters are not needed yet
+            derivative = differentiate(self._tree, posture, rotations, translations, count > 0)
             white = (table.whitening @ derivative).reshape(-1, derivative.shape[-1])
             error = (table.whitening @ errors(table, rotations, translations)[..., None]).reshape(-1)
-            covariance = np.linalg.inv(_information(white[:, :size]))
+            covariance = np.asarray(np.linalg.inv(_information(white[:, :size])), dtype=np.float64)
             step = covariance @ (white[:, :size].T @ error)
             posture = moved(self._tree, posture, step[None])
-            if np.abs(step).max() < _CONVERGED:
+            if count > 0 and np.abs(step).max() < _CONVERGED:
                 break
         self._posture = posture
         # the last step is too small for derivatives to change by it
@@ -149,6 +151,10 @@ class AngleEstimator:
                     raise AngleError(f"target {target}: sensitivities {shape}, expected (6, {size}) as the calibration")
                 result[index] = given
         assert calibration is not None
+        if self.chain.sensitivity.shape[1] not in (0, size):
+            raise AngleError(
+                f"calibration of {size} parameters, expected {self.chain.sensitivity.shape[1]} as the chain's"
+            )
         return result, calibration
 
     def _stated(
@@ -170,6 +176,8 @@ class AngleEstimator:
         if systematic is not None:
             by_poses = gain.reshape(size, len(tree.targets), 6).swapaxes(0, 1) @ table.whitening[0]
             by_calibration = (by_poses @ systematic[0]).sum(axis=0)
+            if self.chain.sensitivity.shape[1]:
+                by_calibration = by_calibration - by_joints @ self.chain.sensitivity
             parts[2] = by_calibration @ systematic[1] @ by_calibration.T
         known = covariance.diagonal() < UNKNOWN**2
         angles, gradient, unknown = self._angles(posture, parts.sum(axis=0), known)
@@ -184,7 +192,9 @@ class AngleEstimator:
             self.chain.angle_names,
             angles,
             np.sqrt(total),
-            *np.sqrt(variances),
+            np.sqrt(variances[0]),
+            np.sqrt(variances[1]),
+            np.sqrt(variances[2]),
             turns,
             turn_covariance,
             float(np.sqrt(squares / freedom)) if freedom > 0 else float("nan"),
@@ -211,7 +221,7 @@ class AngleEstimator:
                 angles[rows], gradient[rows, where] = split.angles[ball], split.gradients[ball]
                 ball += 1
                 continue
-            near = np.nan_to_num(self._previous[rows])
+            near = np.where(np.isnan(self._previous[rows]), 0.0, self._previous[rows])
             found = turn_angles(joint.kind, turns)[0]
             angles[rows] = found + _TURN * np.rint((near - found) / _TURN)
             gradient[rows, where] = np.eye(len(found))
@@ -221,7 +231,8 @@ class AngleEstimator:
     def _near(self) -> FloatArray | None:
         """(b, 3) the last angles of all ball joints, or None at the beginning."""
         near = np.stack([self._previous[self._rows(index)] for index in self._balls])
-        return None if np.isnan(near).all() else np.nan_to_num(near)
+        unknown = np.isnan(near)
+        return None if unknown.all() else np.where(unknown, 0.0, near)
 
     def _rows(self, index: int) -> slice:
         where = self._tree.slices[index]

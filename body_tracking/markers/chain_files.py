@@ -23,7 +23,7 @@ _HEADER = """\
 # (metres) and orientation (unit quaternion x y z w); a hinge turns about z of both, a universal joint first about z of
 # the parent's, then about z of the child's. covariance: lower triangle, row by row, of all joints' parameters: parent
 # centre, parent rotation, child centre, child rotation (metres, radians), joint by joint. scale: errors of the fit in
-# units of the poses' noise.
+# units of the poses' noise. sensitivity: derivative of the parameters by those of the cameras' calibration.
 """
 
 
@@ -52,6 +52,7 @@ def save_chain(chain: Chain, path: Path) -> None:
             }
             for joint in chain.joints
         ],
+        "sensitivity": chain.sensitivity.tolist(),
         "covariance": [row[: index + 1].tolist() for index, row in enumerate(chain.covariance)],
     }
     text = _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
@@ -75,7 +76,7 @@ def load_chain(path: Path) -> Chain:
     except files.FileError as error:
         raise ChainFileError(f"{path}: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("joints"), list):
-        raise ChainFileError(f"{path}: expected the keys scale, joints and covariance")
+        raise ChainFileError(f"{path}: expected the keys scale, joints, covariance and sensitivity")
     try:
         count = SIZE * len(data["joints"])
         covariance = _triangle(data["covariance"], count)
@@ -83,7 +84,8 @@ def load_chain(path: Path) -> Chain:
             _joint(entry, covariance[SIZE * index : SIZE * (index + 1), SIZE * index : SIZE * (index + 1)])
             for index, entry in enumerate(data["joints"])
         )
-        return Chain(joints, covariance, float(data["scale"]))
+        sensitivity = np.asarray(data["sensitivity"], dtype=float)
+        return Chain(joints, covariance, sensitivity, float(data["scale"]))
     except BodyTrackingError as error:
         raise ChainFileError(f"{path}: {error}") from error
     except KeyError as error:

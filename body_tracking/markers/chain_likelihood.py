@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.markers.joint_model import SIZE, Joint, conventional, free_directions
 from body_tracking.markers.joint_tree import (
     Posture,
@@ -37,6 +37,8 @@ _CONVERGED: Final = 1e-8
 _SETTLING: Final = 12
 _LOST: Final = 10.0
 """Times the usual squared error of a frame."""
+_ROUNDING: Final = 1e-14
+"""Share of the largest eigenvalue of an information that rounding errors make of zero."""
 _BLOCKS: Final = 12
 """Parts of a recording over which errors that exceed the poses' noise are taken as independent."""
 
@@ -48,7 +50,8 @@ class Likelihood:
     Attributes:
         tree: with joints by their conventions, each with its own covariance.
         posture: of each frame.
-        covariance: (12 j, 12 j) of all joints' parameters together.
+        covariance: (12 j, 12 j) of all joints' parameters together, by the noise of the poses.
+        sensitivity: (12 j, q) derivative of them by what the poses of all frames share.
         errors: (n, m, 6) of the measured poses against the adjusted ones.
         scale: root of the reduced chi squared: the size of the errors in units of the poses' noise.
         iterations: that were needed.
@@ -57,6 +60,7 @@ class Likelihood:
     tree: Tree
     posture: Posture
     covariance: FloatArray
+    sensitivity: FloatArray
     errors: FloatArray
     scale: float
     iterations: int
@@ -81,7 +85,7 @@ class _Normal:
     pulls: FloatArray
 
 
-def maximise(tree: Tree, poses: PoseTable, misfit: float) -> Likelihood:
+def maximise(tree: Tree, poses: PoseTable, misfit: float, shared: FloatArray | None = None) -> Likelihood:
     """Adjust the joints of a tree to measured poses.
 
     Args:
@@ -89,9 +93,16 @@ def maximise(tree: Tree, poses: PoseTable, misfit: float) -> Likelihood:
         poses: of the tree's targets.
         misfit: from which :attr:`Likelihood.scale` on the errors are no longer the poses' noise: the covariance is then
             that of the errors as they are, correlated over time.
+        shared: (n, m, 6, q) derivative of the poses by q parameters that are wrong by the same in all frames, those of
+            the cameras' calibration.
     """
-    posture = settled(tree, first_posture(tree, poses), poses)
-    poses, posture = _without_lost(tree, poses, posture)
+    posture = first_posture(tree, poses)
+    if not poses.seen.all():
+        posture = settled(tree, posture, poses)
+        rows = _found(tree, poses, posture)
+        turns = tuple(each[rows] for each in posture.turns)
+        poses, posture = poses.rows(rows), Posture(posture.rotation[rows], posture.translation[rows], turns)
+        shared = None if shared is None else shared[rows]
     cost, error = _cost(tree, posture, poses)
     damping, count = 0.0, 0
     for count in range(1, _ITERATIONS + 1):  # noqa: B007
@@ -118,7 +129,7 @@ def maximise(tree: Tree, poses: PoseTable, misfit: float) -> Likelihood:
         damping = 0.0 if damping < 1e-4 else 0.1 * damping
         if gain < _CONVERGED * max(cost, 1.0):
             break
-    return _stated(tree, posture, poses, misfit, count)
+    return _stated(tree, posture, poses, misfit, shared, count)
 
 
 def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
@@ -133,7 +144,7 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
         information = white.swapaxes(-1, -2) @ white
         diagonal = np.einsum("nii->ni", information)
         diagonal += damping[:, None] * diagonal + _LOOSE
-        step = np.linalg.solve(information, white.swapaxes(-1, -2) @ residual)[..., 0]
+        step = np.asarray(np.linalg.solve(information, white.swapaxes(-1, -2) @ residual), dtype=np.float64)[..., 0]
         trial = moved(tree, posture, step)
         squares = (residual**2).sum(axis=(1, 2))
         better = _frame_squares(poses, errors(poses, *place(tree, trial))) < squares
@@ -141,28 +152,26 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
             np.where(better[:, None, None], trial.rotation, posture.rotation),
             np.where(better[:, None], trial.translation, posture.translation),
             tuple(
-                np.where(better[:, None, None], new, old)
-                for new, old in zip(trial.turns, posture.turns, strict=True)
+                np.where(better[:, None, None], new, old) for new, old in zip(trial.turns, posture.turns, strict=True)
             ),
         )
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
     return posture
 
 
-def _without_lost(tree: Tree, poses: PoseTable, posture: Posture) -> tuple[PoseTable, Posture]:
-    """Without the frames of which a posture is not found because targets between others are not seen."""
+def _found(tree: Tree, poses: PoseTable, posture: Posture) -> BoolArray:
+    """(n,) whether a frame's posture is found, and not lost because a target between others is not seen."""
     squares = _frame_squares(poses, errors(poses, *place(tree, posture)))
     whole = poses.seen.all(axis=1)
     usual = np.median(squares[whole]) if whole.any() else np.median(squares)
-    rows = whole | (squares < _LOST * max(float(usual), 6.0 * len(tree.targets)))
-    if rows.all():
-        return poses, posture
-    turns = tuple(turns[rows] for turns in posture.turns)
-    return poses.rows(rows), Posture(posture.rotation[rows], posture.translation[rows], turns)
+    rows: BoolArray = whole | (squares < _LOST * max(float(usual), 6.0 * len(tree.targets)))
+    return rows
 
 
-def _stated(tree: Tree, posture: Posture, poses: PoseTable, misfit: float, iterations: int) -> Likelihood:
-    """The joints by their conventions, with their covariance."""
+def _stated(
+    tree: Tree, posture: Posture, poses: PoseTable, misfit: float, shared: FloatArray | None, iterations: int
+) -> Likelihood:
+    """The joints by their conventions, with their covariance and sensitivity."""
     made = [conventional(joint) for joint in tree.joints]
     tree, posture = reseated(tree, posture, [joint for joint, _ in made])
     rotations, translations = place(tree, posture)
@@ -182,11 +191,14 @@ def _stated(tree: Tree, posture: Posture, poses: PoseTable, misfit: float, itera
         conventions[SIZE * index : SIZE * (index + 1), column:end] = derivative
         column = end
     covariance = conventions @ free @ conventions.T
+    sensitivity = np.zeros((len(conventions), 0))
+    if shared is not None:
+        sensitivity = conventions @ _sensitivity(tree, posture, poses, directions, normal, shared)
     joints = [
         replace(joint, covariance=covariance[SIZE * index : SIZE * (index + 1), SIZE * index : SIZE * (index + 1)])
         for index, joint in enumerate(tree.joints)
     ]
-    return Likelihood(tree.with_joints(joints), posture, covariance, error, scale, iterations)
+    return Likelihood(tree.with_joints(joints), posture, covariance, sensitivity, error, scale, iterations)
 
 
 def _covariance(
@@ -201,15 +213,16 @@ def _covariance(
     """
     prior, _ = _prior(tree, directions)
     surplus = np.zeros_like(prior)
-    factors = np.linalg.inv(normal.frames).swapaxes(-1, -2)
-    spread = np.minimum(np.abs(factors), 0.1) * np.sign(factors)
+    factors = np.asarray(np.linalg.inv(normal.frames), dtype=np.float64).swapaxes(-1, -2)
+    spread: FloatArray = np.minimum(np.abs(factors), 0.1) * np.sign(factors)
     for column in range(tree.size):
         for sign in (1.0, -1.0):
             other = moved(tree, posture, sign * spread[:, :, column])
             surplus += 0.5 * (_normal(tree, other, poses, directions, None).information - normal.information)
     surplus *= scale**2 * (1.0 + 3.0 * np.sqrt(2.0 / len(poses)))
     # in units in which the information is the identity
-    root = np.linalg.inv(np.linalg.cholesky(normal.information + prior))
+    values, vectors = np.linalg.eigh(normal.information + prior)
+    root = (vectors / np.sqrt(np.maximum(values, _ROUNDING * values[-1]))).T
     values, vectors = np.linalg.eigh(root @ (normal.information - surplus) @ root.T)
     basis = root.T @ vectors
     before = np.einsum("ia,ij,ja->a", basis, prior, basis)
@@ -242,10 +255,7 @@ def _prior(tree: Tree, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(p, p) information and (p,) gradient of what is known of the joints before any measurement."""
     weights = np.tile(np.repeat([REACH**-2, np.pi**-2, REACH**-2, np.pi**-2], 3), len(tree.joints))
     centres = np.concatenate(
-        [
-            np.concatenate([joint.parent_centre, np.zeros(3), joint.child_centre, np.zeros(3)])
-            for joint in tree.joints
-        ]
+        [np.concatenate([joint.parent_centre, np.zeros(3), joint.child_centre, np.zeros(3)]) for joint in tree.joints]
     )
     return (directions.T * weights) @ directions, -directions.T @ (weights * centres)
 
@@ -275,19 +285,13 @@ def _normal(
     tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, error: FloatArray | None
 ) -> _Normal:
     """Normal equations; of no errors where these are None."""
-    rotations, translations = place(tree, posture)
-    derivative = differentiate(tree, posture, rotations, translations, True)
-    n = len(poses)
-    if error is not None:
-        # log(E exp(-w)) = log(E) - Jr^-1(log E) w
-        derivative[:, :, 3:] = so3.right_jacobian_inverse(error[..., 3:]) @ derivative[:, :, 3:]
-    white = (poses.whitening @ derivative).reshape(n, -1, derivative.shape[-1])
-    by_frame, by_joint = white[..., : tree.size], white[..., tree.size :] @ directions
+    by_frame, by_joint = _derivatives(tree, posture, poses, directions, error)
+    n, rows = by_frame.shape[:2]
     information = by_frame.swapaxes(-1, -2) @ by_frame
     information[:, range(tree.size), range(tree.size)] += _LOOSE
-    frames = np.linalg.cholesky(information)
+    frames = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
     mixed = by_frame.swapaxes(-1, -2) @ by_joint
-    residual = np.zeros((n, white.shape[1], 1))
+    residual = np.zeros((n, rows, 1))
     if error is not None:
         residual = (poses.whitening @ error[..., None]).reshape(n, -1, 1)
     pulls = by_frame.swapaxes(-1, -2) @ residual
@@ -297,6 +301,30 @@ def _normal(
     reduced = total - mixed.reshape(-1, p).T @ solved[..., :p].reshape(-1, p)
     gradients = (by_joint.swapaxes(-1, -2) @ residual - mixed.swapaxes(-1, -2) @ solved[..., p:])[..., 0]
     return _Normal(0.5 * (reduced + reduced.T), gradients, frames, mixed, pulls[..., 0])
+
+
+def _derivatives(
+    tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, error: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 6 m, f) and (n, 6 m, p) derivatives of the whitened poses by each frame's posture and by the parameters."""
+    derivative = differentiate(tree, posture, *place(tree, posture), True)
+    if error is not None:
+        # log(E exp(-w)) = log(E) - Jr^-1(log E) w
+        derivative[:, :, 3:] = so3.right_jacobian_inverse(error[..., 3:]) @ derivative[:, :, 3:]
+    white = (poses.whitening @ derivative).reshape(len(poses), -1, derivative.shape[-1])
+    return white[..., : tree.size], white[..., tree.size :] @ directions
+
+
+def _sensitivity(
+    tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, normal: _Normal, shared: FloatArray
+) -> FloatArray:
+    """(p, q) derivative of the adjusted parameters by what the poses share: the normal equations' right side by it."""
+    by_frame, by_joint = _derivatives(tree, posture, poses, directions, None)
+    residual = (poses.whitening @ shared).reshape(len(poses), by_frame.shape[1], -1)
+    solved = _solve(normal.frames, by_frame.swapaxes(-1, -2) @ residual)
+    right = by_joint.swapaxes(-1, -2) @ residual - normal.mixed.swapaxes(-1, -2) @ solved
+    prior, _ = _prior(tree, directions)
+    return np.asarray(np.linalg.solve(normal.information + prior, right.sum(axis=0)), dtype=np.float64)
 
 
 def _solve(factors: FloatArray, right: FloatArray) -> FloatArray:

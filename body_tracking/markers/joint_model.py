@@ -32,6 +32,7 @@ SIZE: Final = 12
 _CENTRES: Final = [0, 1, 2, 6, 7, 8]
 _NEAR_AXIS: Final = 0.01
 """Metres: a target whose origin is nearer to the axis gets its x axis from an axis of its own instead."""
+_AXES: FloatArray = np.eye(3)[None]
 _STEP: Final = 1e-6
 _QUARTER: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rx(-90 deg)."""
@@ -133,9 +134,7 @@ class Joint:
 
     def difference(self, other: Joint) -> FloatArray:
         """(12,) the step by which ``other.changed(step)`` is this joint."""
-        turns = np.stack(
-            [self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T]
-        )
+        turns = np.stack([self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T])
         parent, child = so3.log(so3.matrix_to_quat(turns))
         return np.concatenate(
             [self.parent_centre - other.parent_centre, parent, self.child_centre - other.child_centre, child]
@@ -151,9 +150,9 @@ def is_rotation(matrix: FloatArray) -> bool:
 
 
 def turn_axes(kind: JointKind, turns: FloatArray) -> FloatArray:
-    """(n, 3, d) axes of the joint's coordinates in its frame in the parent, of (n, 3, 3) turns."""
+    """(n, 3, d) axes of the joint's coordinates in its frame in the parent, of (n, 3, 3) turns; (1, 3, 3) of a ball's."""
     if kind is JointKind.BALL:
-        return np.broadcast_to(np.eye(3), turns.shape)
+        return _AXES
     axes = np.zeros((len(turns), 3, kind.coordinates))
     axes[:, 2, 0] = 1.0
     if kind is JointKind.UNIVERSAL:
@@ -231,7 +230,9 @@ def conventional(joint: Joint) -> tuple[Joint, FloatArray]:
     """
     if joint.kind is JointKind.BALL:
         return joint, free_directions(joint)
-    flip_parent, flip_child = (bool(axis[np.abs(axis).argmax()] < 0.0) for axis in (joint.parent_axis, joint.child_axis))
+    flip_parent, flip_child = (
+        bool(axis[np.abs(axis).argmax()] < 0.0) for axis in (joint.parent_axis, joint.child_axis)
+    )
     if joint.kind is JointKind.HINGE:
         flip_child = flip_parent
     joint = replace(

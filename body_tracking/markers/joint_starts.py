@@ -71,17 +71,21 @@ def hinge_axes(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
 def universal_axes(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The first axis in the parent and the second one in the child, (3,) unit vectors, from rotations (n, 3, 3).
 
-    The axes are perpendicular in every frame: a1 . R_i a2 = 0. The squares' sum is quadratic in either axis; both are
-    found in turn, from starts all over the half sphere.
+    The axes are perpendicular in every frame: a1 . R_i a2 = 0, linear in the products of their components. The null
+    space of that is exact where the motion is large; where it is small it is one of the starts all over the half sphere
+    from which the sum of the squares, quadratic in either axis, is minimised for both in turn.
     """
     flat = rotations.reshape(-1, 9)
-    moments = (flat.T @ flat).reshape(3, 3, 3, 3)
+    moments = flat.T @ flat
+    null = np.linalg.eigh(moments)[1][:, 0].reshape(3, 3)
+    moments = moments.reshape(3, 3, 3, 3)
     count = 40
     height = (np.arange(count) + 0.5) / count
     around = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     ring = np.sqrt(1.0 - height**2)
     first = np.stack([ring * np.cos(around), ring * np.sin(around), height], axis=-1)
-    for _ in range(200):
+    first = np.concatenate([np.linalg.svd(null)[0][:, :1].T, first])
+    for _ in range(100):
         second = np.linalg.eigh(np.einsum("si,ijkl,sk->sjl", first, moments, first))[1][:, :, 0]
         values, vectors = np.linalg.eigh(np.einsum("sj,ijkl,sl->sik", second, moments, second))
         first = vectors[:, :, 0]

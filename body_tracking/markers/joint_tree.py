@@ -1,7 +1,7 @@
 """A tree of targets that joints connect: its posture, and how that depends on coordinates and parameters.
 
-The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``) and those
-of each joint, in their order (:func:`body_tracking.markers.joint_model.step_turns`).
+The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``) and
+those of each joint, in their order (:func:`body_tracking.markers.joint_model.step_turns`).
 """
 
 from __future__ import annotations
@@ -167,9 +167,11 @@ def moved(tree: Tree, posture: Posture, steps: FloatArray) -> Posture:
 
 
 def reseated(tree: Tree, posture: Posture, joints: Sequence[Joint]) -> tuple[Tree, Posture]:
-    """The same motion by joints whose frames are turned about their z axes or shifted along them, or have them flipped."""
+    """The same motion by joints whose frames are turned about z, shifted along it, or have it flipped."""
     turns = tuple(
-        nearest_turns(new.kind, new.parent_rotation.T @ old.parent_rotation @ turns @ old.child_rotation.T @ new.child_rotation)
+        nearest_turns(
+            new.kind, new.parent_rotation.T @ old.parent_rotation @ turns @ old.child_rotation.T @ new.child_rotation
+        )
         for old, new, turns in zip(tree.joints, joints, posture.turns, strict=True)
     )
     return tree.with_joints(joints), replace(posture, turns=turns)
@@ -215,7 +217,7 @@ def differentiate(
 
 
 def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
-    """(n, m, 6) of the measured poses against the tree's: translation, and w of ``exp(w) @ rotation``; zeros where not seen."""
+    """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to those that are seen."""
     turn = so3.log(so3.matrix_to_quat(poses.rotations @ rotations.swapaxes(-1, -2)))
     result: FloatArray = np.concatenate([poses.translations - translations, turn], axis=-1) * poses.seen[..., None]
     return result

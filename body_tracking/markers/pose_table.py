@@ -60,7 +60,8 @@ class PoseTable:
     def only(self, targets: Sequence[str]) -> PoseTable:
         """The frames in which all of these targets are seen, and only these targets."""
         columns = [self.targets.index(target) for target in targets]
-        return self._taken(tuple(targets), self.seen[:, columns].all(axis=1), columns)
+        rows: BoolArray = np.asarray(self.seen[:, columns].all(axis=1))
+        return self._taken(tuple(targets), rows, columns)
 
     def rows(self, rows: BoolArray) -> PoseTable:
         """Some of the frames: (n,) whether each is among them."""
@@ -118,7 +119,9 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
     try:
         whitening = np.linalg.inv(np.linalg.cholesky(covariance)) * seen[..., None, None]
     except np.linalg.LinAlgError as error:
-        raise PoseTableError(f"poses: a covariance is not positive definite {_first_bad(covariance, targets)}") from error
+        raise PoseTableError(
+            f"{_first_bad(covariance, targets)}: a covariance that is not positive definite"
+        ) from error
     return PoseTable(
         tuple(targets),
         rotations,
@@ -133,9 +136,7 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
 
 def _check(rotations: FloatArray, translations: FloatArray, covariance: FloatArray, targets: Sequence[str]) -> None:
     n, m = rotations.shape[:2]
-    numbers = np.concatenate(
-        [rotations.reshape(n, m, 9), translations, covariance.reshape(n, m, 36)], axis=-1
-    )
+    numbers = np.concatenate([rotations.reshape(n, m, 9), translations, covariance.reshape(n, m, 36)], axis=-1)
     if not np.isfinite(numbers).all():
         row, index = np.argwhere(~np.isfinite(numbers).all(axis=-1))[0]
         raise PoseTableError(f"frame {row}, target {targets[index]}: numbers that are not finite")
@@ -149,4 +150,4 @@ def _check(rotations: FloatArray, translations: FloatArray, covariance: FloatArr
 def _first_bad(covariance: FloatArray, targets: Sequence[str]) -> str:
     least = np.linalg.eigvalsh(covariance)[..., 0]
     row, index = np.unravel_index(int(least.argmin()), least.shape)
-    return f"(frame {row}, target {targets[int(index)]})"
+    return f"frame {row}, target {targets[int(index)]}"

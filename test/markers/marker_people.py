@@ -35,6 +35,7 @@ def pose_covariances(rotations: FloatArray, scale: float = 1.0) -> FloatArray:
 
 def random_joint(rng: np.random.Generator, kind: JointKind, name: str, parent: str, child: str) -> Joint:
     """A joint about 120 mm from both targets, by the conventions."""
+
     def centre() -> FloatArray:
         direction = rng.normal(size=3)
         return rng.uniform(0.09, 0.15) * direction / np.linalg.norm(direction)
@@ -54,7 +55,8 @@ def random_posture(
         t = np.linspace(0.0, 1.0, frames)[:, None]
         phases = rng.uniform(0, 2 * np.pi, (3, width))
         rates = rng.uniform(3.0, 20.0, (3, width))
-        return size / 1.5 * sum(np.sin(2 * np.pi * r * t + p) / (i + 1) for i, (r, p) in enumerate(zip(rates, phases)))
+        waves = np.sin(2.0 * np.pi * rates[:, None] * t + phases[:, None])
+        return size / 1.5 * (waves / np.arange(1, 4)[:, None, None]).sum(axis=0)
 
     turns = []
     for joint in tree.joints:

@@ -27,7 +27,7 @@ def a_chain(rng: np.random.Generator) -> Chain:
     tree = tree_of(joints)
     root = 1e-4 * rng.normal(size=(36, 20))
     covariance = root @ root.T
-    return Chain(tree.joints, covariance, 1.25)
+    return Chain(tree.joints, covariance, rng.normal(size=(36, 5)), 1.25)
 
 
 def test_a_chain_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -35,6 +35,7 @@ def test_a_chain_is_read_as_it_was_written(tmp_path: Path) -> None:
     save_chain(chain, tmp_path / "chain.yaml")
     read = load_chain(tmp_path / "chain.yaml")
     assert read.names == chain.names and read.targets == chain.targets and read.scale == chain.scale
+    assert np.array_equal(read.sensitivity, chain.sensitivity)
     assert np.allclose(read.covariance, chain.covariance, rtol=0, atol=1e-20)
     for a, b in zip(read.joints, chain.joints, strict=True):
         assert a.kind is b.kind
@@ -47,6 +48,7 @@ def test_a_chain_is_read_as_it_was_written(tmp_path: Path) -> None:
         (lambda data: data.pop("covariance"), "covariance"),
         (lambda data: data["covariance"].pop(), "36 rows"),
         (lambda data: data["covariance"][3].__setitem__(3, -1.0), "negative eigenvalue"),
+        (lambda data: data["sensitivity"].pop(), "sensitivity"),
         (lambda data: data["joints"][1].pop("kind"), "kind"),
         (lambda data: data["joints"][1].__setitem__("kind", "slider"), "slider"),
         (lambda data: data["joints"][1].__setitem__("parent_centre", [0.0, float("nan"), 0.0]), "parent_centre"),
