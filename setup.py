@@ -39,6 +39,7 @@ setup(
         *COMMANDS,
         share("config", "*.yaml"),
         share("config/robots", "*.yaml"),
+        share("config/marker_setup", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         share("foxglove", "*.json"),

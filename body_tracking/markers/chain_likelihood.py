@@ -31,6 +31,8 @@ REACH: Final = 1.0
 """Metres: standard deviation of a joint's centre before any measurement; no target is mounted farther away."""
 _LOOSE: Final = 1e-6
 """Information that a coordinate of a posture has before any measurement, so that one that nobody sees can be solved."""
+_LEAST: Final = 1e-12
+"""The same as a share of the largest information in the frame, beside which it has to survive rounding."""
 _ITERATIONS: Final = 100
 _CONVERGED: Final = 1e-8
 """Relative decrease of the cost that ends the iteration."""
@@ -288,7 +290,8 @@ def _normal(
     by_frame, by_joint = _derivatives(tree, posture, poses, directions, error)
     n, rows = by_frame.shape[:2]
     information = by_frame.swapaxes(-1, -2) @ by_frame
-    information[:, range(tree.size), range(tree.size)] += _LOOSE
+    largest = information[:, range(tree.size), range(tree.size)].max(axis=1, keepdims=True)
+    information[:, range(tree.size), range(tree.size)] += _LOOSE + _LEAST * largest
     frames = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
     mixed = by_frame.swapaxes(-1, -2) @ by_joint
     residual = np.zeros((n, rows, 1))

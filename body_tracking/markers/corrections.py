@@ -56,4 +56,4 @@ def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
         information += pixels_by_pose.T @ pixels_by_pose
         pull[:, start:end] = pixels_by_pose.T @ seen.by_parameters.reshape(-1, end - start)
         start = end
-    return -np.linalg.solve(information, pull)
+    return np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)

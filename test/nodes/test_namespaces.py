@@ -30,6 +30,10 @@ NEEDED: dict[str, dict[str, object]] = {
     "bag_player": {"bag": BAG},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},
+    **dict.fromkeys(
+        ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles"),
+        {"setup": ROOT / "config" / "marker_setup"},
+    ),
 }
 """Parameters without which an executable does not start, or has fewer topics."""
 

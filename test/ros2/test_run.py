@@ -27,6 +27,10 @@ class AllNodes:
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
+            **dict.fromkeys(
+                ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles"),
+                {"setup": tools.share / "config" / "marker_setup"},
+            ),
         }
         self.tools_of: dict[str, Tool] = {
             executable: tools.run(executable, **parameters.get(executable, {})) for executable in systems.EXECUTABLES
