@@ -35,7 +35,7 @@ _LEAST_REACH: Final = 1.2
 """Pixels."""
 _SATURATED_REACH: Final = 2.5
 """Pixels; what is left of the edge of a saturated ball is its long tail."""
-_APART: Final = 4.0
+_APART: Final = 5.0
 """Pixels between the edges of balls that are near enough to disturb each other's centroids."""
 _TOGETHER: Final = 0.06
 """Misfit up to which regions that are near to each other are one ball each."""
@@ -125,6 +125,9 @@ class DetectionSettings:
         check_fields(self, "detection of balls", ImageError)
 
 
+_DEFAULT: Final = DetectionSettings()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Regions:
     """Pixels of all regions in one list, and what is known of each region; label 0 is none.
@@ -167,7 +170,7 @@ def detect(
     Raises:
         ImageError: another shape or type, or no pixels.
     """
-    settings = settings or DetectionSettings()
+    settings = settings or _DEFAULT
     if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         shape, kind = getattr(image, "shape", ()), getattr(image, "dtype", type(image).__name__)
         raise ImageError(f"image of camera {camera or '(no name)'}: {shape} of {kind}, expected (h, w) uint8 or uint16")
@@ -241,9 +244,9 @@ def _regions(
     image: NDArray[Any], labels: NDArray[np.uint16], count: int, histogram: _Histogram, settings: DetectionSettings
 ) -> tuple[_Regions, FloatArray, BoolArray]:
     """Regions with the margin around them; (count,) pixels above the threshold; (count,) which are off the border."""
-    margin, ring = (np.ones((2 * size + 1, 2 * size + 1), dtype=np.uint8) for size in (_MARGIN, _MARGIN + _RING))
-    near = cv2.dilate(labels, margin).ravel()
-    wide = cv2.dilate(labels, ring).ravel()
+    margin, ring = (np.ones((2 * size + 1, 2 * size + 1), dtype=np.uint8) for size in (_MARGIN, _RING))
+    grown = cv2.dilate(labels, margin)
+    near, wide = grown.ravel(), cv2.dilate(grown, ring).ravel()
     at = np.flatnonzero(wide != 0)
     label, in_near = wide[at].astype(np.intp), near[at] != 0
     value = image.ravel()[at].astype(np.float64)
@@ -255,14 +258,16 @@ def _regions(
     squares = np.bincount(label[around], (value[around] - background[label[around]]) ** 2, count)
     noise = np.where(enough, squares / np.maximum(pixels - 1, 1), 0.0)
     noise = np.maximum(noise, histogram.variance)
-    # from here on what is a ball's
-    at, value, label = at[in_near], value[in_near], near[at[in_near]].astype(np.intp)
+    # from here on what is a ball's; the margin of one must not take the core of another
+    core_label = labels.ravel()[at].astype(np.intp)
+    label = np.where(core_label > 0, core_label, near[at])
+    at, value, label, core_label = at[in_near], value[in_near], label[in_near], core_label[in_near]
     saturation = settings.saturation or float(np.iinfo(image.dtype).max)
     above = value - background[label]
     variance = noise[label] + saturation / settings.full_well * np.maximum(above, 0.0)
     variance[value >= saturation] = 0.0
     row, column = np.divmod(at, image.shape[1])
-    core = np.bincount(labels.ravel()[at], minlength=count).astype(np.float64)
+    core = np.bincount(core_label, minlength=count).astype(np.float64)
     inside = np.ones(count, dtype=bool)
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         inside[border] = False

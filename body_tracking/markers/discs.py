@@ -31,6 +31,8 @@ _MISFIT: Final = 0.01
 _GAUSS: Final = np.polynomial.legendre.leggauss(5)
 _BLURRED: Final = 4.0
 """Standard deviations of the blur by which discs must be apart not to hide each other."""
+_LEAST_GAP: Final = 0.25
+"""Radii between the centres of discs that are two."""
 _CONVINCING: Final = 1.0
 """Weighted sum of squares over the number of pixels of a model that needs no rival."""
 _EXPLAINED: Final = 0.06
@@ -215,7 +217,12 @@ def _several(
     found, covariance, *quality = _fit(overlapping, start, x, y, values, variance, ceiling)
     discs = found[:-1].reshape(count, 4)
     blocks = np.stack([covariance[4 * i : 4 * i + 2, 4 * i : 4 * i + 2] for i in range(count)])
-    return Discs(discs[:, :2], discs[:, 2], blocks, *quality)
+    centres, radii = discs[:, :2], discs[:, 2]
+    gaps = np.linalg.norm(centres[:, None] - centres, axis=2)[np.triu_indices(count, 1)]
+    inside = (centres > [x.min(), y.min()]) & (centres < [x.max(), y.max()])
+    if not inside.all() or gaps.min() < _LEAST_GAP * radii.max():
+        return Discs(centres, radii, blocks, np.inf, np.inf, np.inf)
+    return Discs(centres, radii, blocks, *quality)
 
 
 def _single(

@@ -18,7 +18,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import centred, pose_sensitivity
+from body_tracking.markers.corrections import centred, pose_sensitivity, well_placed
 from body_tracking.markers.detection import DetectionSettings, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
@@ -28,6 +28,7 @@ from body_tracking.markers.tracking import TargetTracker
 from body_tracking.markers.triangulation import TriangulationSettings, triangulate
 from body_tracking.messages.codecs import Angles
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
@@ -58,7 +59,7 @@ class DetectorStage(Stage):
     """Finds the balls in the images of cameras."""
 
     NAME = "marker_detector"
-    PARAMETERS = (SETUP, CAMERAS, *parameters_from(DetectionSettings, only=_DETECTION, live=True))
+    PARAMETERS = (SETUP, CAMERAS, *parameters_from(DetectionSettings, only=_DETECTION, live=True), TRANSPORT)
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
@@ -98,6 +99,7 @@ class TriangulationStage(Stage):
         Parameter("tolerance", 0.002, "by which the stamps of one set of images may differ", "s", 0.0, 0.1),
         Parameter("max_wait", 0.03, "how long a set of images waits for a missing one", "s", 0.0, 1.0),
         *parameters_from(TriangulationSettings, only=_TRIANGULATION, live=True),
+        TRANSPORT,
     )
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
@@ -134,9 +136,10 @@ class TriangulationStage(Stage):
     def _points(self, sets: Iterable[Mapping[str, ImageBalls]]) -> Iterator[Output]:
         for frames in sets:
             balls = tuple(frames.values())
-            points = triangulate(self.rig, balls, self._settings)
+            points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
             if self._diameter and len(points.positions):
-                points = triangulate(self.rig, centred(self.rig, balls, points, self._diameter), self._settings)
+                balls = centred(self.rig, balls, points, self._diameter)
+                points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
             yield Output(setup.POINTS, points, points.stamp_ns)
 
     @property
@@ -153,6 +156,7 @@ class TrackerStage(Stage):
         Parameter(
             "deadline", 0.02, "time for one frame, after which the search for targets is given up", "s", 0.001, 1.0
         ),
+        TRANSPORT,
     )
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
@@ -184,6 +188,7 @@ class AnglesOfTargetsStage(Stage):
     PARAMETERS = (
         SETUP,
         Parameter("max_wait", 0.02, "how long the poses of one time wait for that of another target", "s", 0.0, 1.0),
+        TRANSPORT,
     )
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:

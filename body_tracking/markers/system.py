@@ -9,14 +9,24 @@ from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.qos import RELIABLE
 from body_tracking.markers import setup
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.system import Command, NodeSpec, NodeType, Option, Options, Place, System, TopicSpec
+from body_tracking.pipeline.system import (
+    Command,
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    System,
+    TopicSpec,
+    transport,
+)
 
 _STAGES = "body_tracking.markers.stages"
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["marker_setup"]:
-        given = {"setup": options["marker_setup"]}
+        given = {"setup": options["marker_setup"], **transport(options)}
         yield NodeSpec("marker_detector", "marker_detector", parameters=given)
         yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
         yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
