@@ -26,6 +26,10 @@ from body_tracking.markers.rig import Rig
 
 _SCALES: Final = (4.0, 2.0, 1.0, 0.5)
 """Pixels beyond which a distance is an outlier, from the first fit to the last."""
+_PLACE: Final = 5.0
+"""Pixels after which a ball's distance is another, independent one."""
+_RATE: Final = 60.0
+"""Images per second, about."""
 _CUT: Final = 9.0
 """Squared standard deviations at which the cost of an outlier ends."""
 
@@ -101,7 +105,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Distances:
-    """Epipolar distances of one time: (n,) pixels, their variance, and derivatives by what may be wrong.
+    """Epipolar distances of one time: (n,) pixels, their variance, their share in a place that is new, and derivatives.
 
     A ball with several partners in reach has several; how many balls there are of the camera that sees fewer.
     """
@@ -109,6 +113,7 @@ class _Distances:
     stamp_ns: int
     distance: FloatArray
     variance: FloatArray
+    share: FloatArray
     by_turn: FloatArray
     by_delay: FloatArray
     by_calibration: FloatArray
@@ -218,18 +223,19 @@ class RigMonitor:
             return None
         balls = sum(each.balls for each in self._window)
         variance = np.concatenate([each.variance for each in self._window])
+        share = np.concatenate([each.share for each in self._window])
         by_turn = np.concatenate([each.by_turn for each in self._window])
         by_delay = np.concatenate([each.by_delay for each in self._window])
         by_calibration = np.concatenate([each.by_calibration for each in self._window])
         limits = settings.reach / float(self._geometry.focal.mean()), settings.max_delay
-        nothing = _explain(distance, variance, by_calibration, np.zeros((len(distance), 0)), 1.0)
+        nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
         fits: list[tuple[float, Fault, str, _Explanation]] = []
         for camera in range(count):
             frame = self._rig.cameras[camera].frame_id
             turn = by_turn[:, 3 * camera : 3 * camera + 3]
-            turn_fit = _explain(distance, variance, by_calibration, turn, limits[0])
+            turn_fit = _explain(distance, variance, share, by_calibration, turn, limits[0])
             fits.append((turn_fit.cost, Fault.MOVED_CAMERA, frame, turn_fit))
-            delay_fit = _explain(distance, variance, by_calibration, by_delay[:, camera : camera + 1], limits[1])
+            delay_fit = _explain(distance, variance, share, by_calibration, by_delay[:, camera : camera + 1], limits[1])
             if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, that one is late is that the other is early
                 fits.append((delay_fit.cost, Fault.OUT_OF_STEP, frame, delay_fit))
         fits.sort(key=lambda fit: fit[0])
@@ -311,10 +317,14 @@ class RigMonitor:
         by_calibration += np.cross(first, second) @ shift
         scale = 1.0 / np.sqrt(square)
         good = np.isfinite(volume * scale)
+        # the same ball at the same place says nothing new: its centroid's bias and a wrong partner stay
+        speed = np.minimum(*(np.linalg.norm(each, axis=-1) for each in velocities))
+        repeats = 1.0 + _RATE * np.minimum(settings.window, _PLACE / np.maximum(speed, 1e-3))
         return _Distances(
             stamp_ns,
             (volume * scale)[good],
             (settings.noise**2 + settings.jitter**2 * blur * scale**2)[good],
+            1.0 / repeats[good],
             (by_turn * scale[:, None])[good],
             (by_delay * scale[:, None])[good],
             (by_calibration * scale[:, None])[good],
@@ -337,7 +347,12 @@ def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
 
 
 def _explain(
-    distance: FloatArray, variance: FloatArray, by_calibration: FloatArray, by_cause: FloatArray, limit: float
+    distance: FloatArray,
+    variance: FloatArray,
+    share: FloatArray,
+    by_calibration: FloatArray,
+    by_cause: FloatArray,
+    limit: float,
 ) -> _Explanation:
     """Distances (n,) explained by a cause with derivative (n, k) beside what the calibration leaves open.
 
@@ -354,11 +369,11 @@ def _explain(
             left = distance - derivative @ unknown
             # of balls that move fast, more is no outlier yet
             width = scale**2 * variance / variance.min() + _CUT * variance
-            weight = 1.0 / variance / (1.0 + left**2 / width) ** 2
+            weight = share / variance / (1.0 + left**2 / width) ** 2
             weighted = derivative * weight[:, None]
             information = prior + weighted.T @ derivative
             unknown = np.linalg.solve(information, weighted.T @ distance)
     left = distance - derivative @ unknown
-    cost = float(np.minimum(left**2 / variance, _CUT).sum() + unknown[:r] @ unknown[:r])
+    cost = float(share @ np.minimum(left**2 / variance, _CUT) + unknown[:r] @ unknown[:r])
     on_line = int((left**2 < _CUT * variance).sum())
     return _Explanation(cost, on_line, unknown[r:], np.linalg.inv(information)[r:, r:])
