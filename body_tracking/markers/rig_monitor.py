@@ -57,8 +57,7 @@ class MonitorSettings:
         min_turn: least turn that is told, radians.
         min_delay: least delay that is told, seconds.
         significance: standard deviations that a turn or delay must exceed.
-        explained: share of balls on their partner's epipolar line that it must add.
-        complete: share of the balls that must then be on a partner's epipolar line.
+        complete: share of the balls that it must bring to a partner's epipolar line.
         ahead: by which the log likelihood must be better than another cause's.
     """
 
@@ -72,8 +71,7 @@ class MonitorSettings:
     min_distances: int = 60
     min_turn: float = 1e-3
     min_delay: float = 4e-3
-    significance: float = 6.0
-    explained: float = 0.15
+    significance: float = 7.0
     complete: float = 0.7
     ahead: float = 6.0
 
@@ -241,9 +239,7 @@ class RigMonitor:
         fits.sort(key=lambda fit: fit[0])
         cost, fault, frame, best = fits[0]
         least = settings.min_turn if fault is Fault.MOVED_CAMERA else settings.min_delay
-        if best.on_line < (1.0 + settings.explained) * nothing.on_line or best.size < least:
-            return None
-        if best.on_line < settings.complete * balls:
+        if best.on_line < settings.complete * balls or best.size < least:
             return None
         if nothing.cost - cost < settings.significance**2 or best.significance < settings.significance:
             return None
