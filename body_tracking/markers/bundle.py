@@ -130,8 +130,8 @@ def _reduced(equations: Equations, damping: float) -> tuple[FloatArray, FloatArr
     # a local parameter that no residual depends on keeps its value
     damped = blocks + np.where(diagonal > 0.0, damping * diagonal, 1.0)[:, :, None] * eye
     try:
-        by_shared = np.linalg.solve(damped, mixed.transpose(0, 2, 1))  # (v, k, p)
-        by_right = np.linalg.solve(damped, block_right[:, :, None])[:, :, 0]
+        by_shared: FloatArray = np.linalg.solve(damped, mixed.transpose(0, 2, 1))  # (v, k, p)
+        by_right: FloatArray = np.linalg.solve(damped, block_right[:, :, None])[:, :, 0]
     except np.linalg.LinAlgError as error:
         raise BundleError("the pose of a board, or the place of a point, is not determined by its pixels") from error
     whole = shared + damping * np.diag(np.diag(shared))
@@ -201,9 +201,7 @@ class Adjusted:
 _Boards = tuple[Rig, FloatArray, FloatArray]
 
 
-def adjust(
-    rig: Rig, rotations: FloatArray, translations: FloatArray, corners: Corners, free: BoolArray
-) -> Adjusted:
+def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: Corners, free: BoolArray) -> Adjusted:
     """Fit cameras and boards to corners.
 
     Args:
@@ -231,7 +229,11 @@ def adjust(
         residuals = np.empty((len(corners), 2))
         shared, by_point = np.zeros((len(corners), 2, rig.size)), np.empty((len(corners), 2, 3))
         for index, rows in enumerate(members):
-            camera, rotation, translation = cameras.cameras[index], cameras.rotations[index], cameras.translations[index]
+            camera, rotation, translation = (
+                cameras.cameras[index],
+                cameras.rotations[index],
+                cameras.translations[index],
+            )
             made = projection.project(camera, rotation, translation, points[rows])
             residuals[rows] = made.pixels - corners.pixels[rows]
             shared[rows, :, starts[index] : starts[index + 1]] = made.by_parameters

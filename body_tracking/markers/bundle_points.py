@@ -156,6 +156,4 @@ def adjust_points(
     whole[np.ix_(chosen, chosen)] = variance * covariance
     errors = np.full((count, len(lengths.pairs)), np.nan)
     errors[at, pair] = lengths.deviation * all_residuals[2 * len(seen.pixels) :]
-    return AdjustedPoints(
-        replace(fitted, covariance=whole), places, pixels, errors, float(noise * np.sqrt(variance))
-    )
+    return AdjustedPoints(replace(fitted, covariance=whole), places, pixels, errors, float(noise * np.sqrt(variance)))

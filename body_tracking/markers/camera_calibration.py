@@ -83,9 +83,7 @@ class CameraCalibration:
 
     def rms(self) -> FloatArray:
         """(c,) each camera's root mean squared distance, pixels; of the 2D norm, as OpenCV gives it."""
-        return np.array(
-            [self.adjusted.rms(self.corners.cameras == index) for index in range(len(self.rig.cameras))]
-        )
+        return np.array([self.adjusted.rms(self.corners.cameras == index) for index in range(len(self.rig.cameras))])
 
     def rms_by_axis(self) -> FloatArray:
         """(c, 2) each camera's root mean squared residual in x and in y, pixels, as Gaschler's table 4.1 has it."""
@@ -326,9 +324,7 @@ def _camera_poses(
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     known, rest = [0], set(range(1, count))
     while rest:
-        shared, best, new = max(
-            (len(seen[old].keys() & seen[new].keys()), -old, -new) for old in known for new in rest
-        )
+        shared, best, new = max((len(seen[old].keys() & seen[new].keys()), -old, -new) for old in known for new in rest)
         old, new = -best, -new
         if not shared:
             names = ", ".join(cameras[each].frame_id for each in sorted(rest))
@@ -360,9 +356,7 @@ def _moved(board: _Seen, rotation: FloatArray, translation: FloatArray) -> _Seen
     return _Seen(board.rows, rotation @ board.rotation, rotation @ board.translation + translation)
 
 
-def _reject_contradictions(
-    rig: Rig, seen: list[dict[int, _Seen]], corners: Corners, rejected: list[Rejected]
-) -> None:
+def _reject_contradictions(rig: Rig, seen: list[dict[int, _Seen]], corners: Corners, rejected: list[Rejected]) -> None:
     """Take out boards that are not where other cameras see them; both of two that contradict each other."""
     distances: dict[tuple[int, int, int], float] = {}
     for a in range(len(seen)):
@@ -418,9 +412,7 @@ def _adjusted(
         adjusted = bundle.adjust(rig, turns, shifts, used, free)
         rig, turns, shifts = adjusted.rig, adjusted.rotations, adjusted.translations
         keys = [(index, view) for index, boards in enumerate(seen) for view in boards]
-        errors = np.array(
-            [adjusted.rms((used.cameras == index) & (used.views == view)) for index, view in keys]
-        )
+        errors = np.array([adjusted.rms((used.cameras == index) & (used.views == view)) for index, view in keys])
         worst = int(errors.argmax())
         if not _too_large(errors, _ADJUSTED)[worst]:
             return CameraCalibration(rig, adjusted, used, tuple(rejected))

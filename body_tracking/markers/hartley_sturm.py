@@ -83,7 +83,7 @@ def _minimum(
 ) -> tuple[FloatArray, FloatArray]:
     """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t; (n,) each.
 
-    The cost is at most that of t = 0, the line through the first pixel, so that \|t\| has a bound. Where the pixels are
+    The cost is at most that of t = 0, the line through the first pixel, so that the size of t has a bound. Where the pixels are
     near their epipolar lines against the distance to the epipoles, the cost is a parabola within it, and Newton's
     method finds its one minimum; all roots are computed for the others.
     """
@@ -141,9 +141,7 @@ def _frame(pixels: FloatArray, epipole: FloatArray) -> tuple[FloatArray, FloatAr
     return frame, epipole[2] / length
 
 
-def _polynomial(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray
-) -> FloatArray:
+def _polynomial(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
     """(7, n) coefficients of eq. 3.12, the highest first."""
     f2, g2 = f * f, g * g
     # (at+b)^2 + g^2 (ct+d)^2 = s2 t^2 + s1 t + s0, and (at+b)(ct+d) = m2 t^2 + m1 t + m0
@@ -179,7 +177,7 @@ def _roots(coefficients: FloatArray) -> FloatArray:
     companion = np.zeros((coefficients.shape[1], 6, 6))
     companion[:, 0] = np.nan_to_num((-coefficients[1:] / leading).T, posinf=0.0, neginf=0.0)
     companion[:, np.arange(1, 6), np.arange(5)] = 1.0
-    roots = np.linalg.eigvals(companion).real
+    roots: FloatArray = np.linalg.eigvals(companion).real.astype(np.float64)
     with np.errstate(all="ignore"):
         for _ in range(_POLISH):
             value, slope = _value(coefficients[:, :, None], roots)

@@ -130,7 +130,8 @@ def _square_root(covariance: FloatArray) -> FloatArray:
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     kept = values > 1e-12
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    root: FloatArray = scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return root
 
 
 def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:

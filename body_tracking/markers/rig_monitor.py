@@ -97,7 +97,9 @@ class Finding:
     deviation: float
 
     def __str__(self) -> str:
-        size = f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+        size = (
+            f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+        )
         return f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
 
 

@@ -117,5 +117,3 @@ def _camera(entry: Any) -> Camera:
     fx, fy, cx, cy = _numbers(entry, "lens", 4).tolist()
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return Camera(frame, size[0], size[1], matrix, _numbers(entry, "distortion", MODELS[model]), model)
-
-

@@ -86,9 +86,7 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
     geometry = rig_rays(rig)
     rays = make_rays(geometry, balls)
     count = len(rig.cameras)
-    found = [
-        (a, b, epipolar_pairs(geometry, rays, a, b, settings)) for a in range(count) for b in range(a + 1, count)
-    ]
+    found = [(a, b, epipolar_pairs(geometry, rays, a, b, settings)) for a in range(count) for b in range(a + 1, count)]
     members = np.full((sum(len(pairs.first) for _, _, pairs in found), count), -1, dtype=np.intp)
     positions, row = np.zeros((len(members), 3)), 0
     for a, b, pairs in found:
@@ -142,9 +140,7 @@ def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: Tria
     return Pairs(first + of_a.start, second + of_b.start, distance[first, second])
 
 
-def _two_rays(
-    geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optimal: bool
-) -> FloatArray:
+def _two_rays(geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optimal: bool) -> FloatArray:
     """(n, 3) where two rays meet: after their optimal correction, or where they pass each other."""
     if not len(pairs.first):
         return np.zeros((0, 3))
@@ -181,9 +177,7 @@ def _directions(geometry: RigRays, camera: int, flat: FloatArray) -> FloatArray:
     return directions
 
 
-def _in_range(
-    geometry: RigRays, positions: FloatArray, seen: BoolArray, settings: TriangulationSettings
-) -> BoolArray:
+def _in_range(geometry: RigRays, positions: FloatArray, seen: BoolArray, settings: TriangulationSettings) -> BoolArray:
     """(n,) which points are in the range of all cameras that see them."""
     depth = positions @ geometry.rotations[:, 2].T + geometry.translations[:, 2]
     return np.asarray((~seen | ((depth > settings.nearest) & (depth < settings.farthest))).all(axis=1))
@@ -300,11 +294,11 @@ def _completed(
 def _moves(
     geometry: RigRays, rays: Rays, balls: IntArray, camera: int, flat: FloatArray, depth: FloatArray
 ) -> FloatArray:
-    """(n, 2, r) what the calibration's unknowns add to a point's image in a camera, against that of the ball's pixel."""
+    """(n, 2, r) what the calibration's unknowns add to a point's image in a camera, against the ball's pixel."""
     shift = geometry.translation_factor[camera]
-    result: FloatArray = rays.flat_factor[balls] + (
-        shift[None, :2] - flat[:, :, None] * shift[None, 2:]
-    ) / depth[:, None, None]
+    result: FloatArray = (
+        rays.flat_factor[balls] + (shift[None, :2] - flat[:, :, None] * shift[None, 2:]) / depth[:, None, None]
+    )
     return result
 
 
@@ -351,4 +345,5 @@ def sensitivity(rig: Rig, positions: FloatArray, seen: BoolArray | None = None) 
         pulls[:, :, starts[index] : starts[index + 1]] = turned @ np.nan_to_num(made.by_parameters)
     if (seen.sum(axis=1) < 2).any():
         raise TriangulationError("a point that fewer than two cameras see has no position")
-    return -np.linalg.solve(information, pulls)
+    moved: FloatArray = -np.linalg.solve(information, pulls)
+    return moved
