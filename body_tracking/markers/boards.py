@@ -76,7 +76,9 @@ class Chessboard:
             return None
         grid = np.asarray(corners, dtype=np.float64).reshape(self.rows, self.columns, 2)
         spacing = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-        return np.arange(self.columns * self.rows, dtype=np.intp), _refined(image, grid.reshape(-1, 2), spacing)
+        return np.arange(self.columns * self.rows, dtype=np.intp), _refined(
+            image, grid.reshape(-1, 2), WINDOW * spacing
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +141,9 @@ class CharucoBoard:
         pixel_width = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
         neighbours = np.abs(board_width - self.square) < 1e-3 * self.square
         spacing = float(pixel_width[neighbours].min()) if neighbours.any() else 0.0
-        return numbers, _refined(image, pixels, spacing)
+        # nor may it reach the markers
+        reach = min(WINDOW, 0.5 * (1.0 - self.marker / self.square))
+        return numbers, _refined(image, pixels, reach * spacing)
 
 
 def _grid(columns: int, rows: int) -> FloatArray:
@@ -153,9 +157,9 @@ def _check(image: Image) -> None:
         raise BoardError(f"image {image.shape} {image.dtype}, expected (height, width) uint8")
 
 
-def _refined(image: Image, corners: FloatArray, spacing: float) -> FloatArray:
-    """Corners (n, 2) to a fraction of a pixel; the spacing of the nearest two in pixels says how wide it looks."""
-    half = max(_MIN_HALF, int(WINDOW * spacing))
+def _refined(image: Image, corners: FloatArray, reach: float) -> FloatArray:
+    """Corners (n, 2) to a fraction of a pixel, by what is within reach of them, pixels."""
+    half = max(_MIN_HALF, int(reach))
     start = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
     refined = _CV.cornerSubPix(image, start, (half, half), (-1, -1), _CRITERIA)
     return np.asarray(refined, dtype=np.float64).reshape(-1, 2)

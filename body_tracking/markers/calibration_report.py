@@ -34,7 +34,9 @@ def table(calibration: CameraCalibration) -> str:
         if index:
             lines += _pose(rig, index)
         x, y = by_axis[index]
-        lines.append(f"  residual    x {x:.3f} px, y {y:.3f} px; as OpenCV gives it, of the 2D norm: {rms[index]:.3f} px")
+        lines.append(
+            f"  residual    x {x:.3f} px, y {y:.3f} px; as OpenCV gives it, of the 2D norm: {rms[index]:.3f} px"
+        )
     for each in calibration.rejected:
         who = "in both cameras" if each.camera is None else f"in camera {each.camera}"
         lines.append(f"left out: view {each.view} {who}, {each.reason}")

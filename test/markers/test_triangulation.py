@@ -72,7 +72,10 @@ def test_the_optimal_correction_meets_the_epipolar_constraint_at_no_more_cost_th
 
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial"])
 def test_rays_are_those_of_the_camera(model: str) -> None:
-    lens = {"plumb_bob": (-0.24, 0.3, 0.001, -0.002, 0.05), "rational_polynomial": (5.1, 3.2, 4e-4, -6e-4, 0.2, 5.4, 5, 0.9)}
+    lens = {
+        "plumb_bob": (-0.24, 0.3, 0.001, -0.002, 0.05),
+        "rational_polynomial": (5.1, 3.2, 4e-4, -6e-4, 0.2, 5.4, 5, 0.9),
+    }
     truth = rig()
     cameras = [replace(each, model=model, distortion=np.array(lens[model])) for each in truth.cameras]
     size = sum(10 + len(each.distortion) for each in cameras)
@@ -195,7 +198,9 @@ def test_cameras_without_balls_and_missing_cameras_give_no_points() -> None:
     nothing = ImageBalls(0, "b", np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
     for given in ([balls[0]], [nothing], [balls[0], nothing]):
         points = triangulate(truth, given)
-        assert points.positions.shape == (0, 3) and points.covariance.shape == (0, 3, 3) and points.balls.shape == (0, 3)
+        assert (
+            points.positions.shape == (0, 3) and points.covariance.shape == (0, 3, 3) and points.balls.shape == (0, 3)
+        )
     assert len(triangulate(truth, [balls[2], balls[0]]).positions) >= 10
 
 
