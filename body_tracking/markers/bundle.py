@@ -130,8 +130,8 @@ def _reduced(equations: Equations, damping: float) -> tuple[FloatArray, FloatArr
     # a local parameter that no residual depends on keeps its value
     damped = blocks + np.where(diagonal > 0.0, damping * diagonal, 1.0)[:, :, None] * eye
     try:
-        by_shared: FloatArray = np.linalg.solve(damped, mixed.transpose(0, 2, 1))  # (v, k, p)
-        by_right: FloatArray = np.linalg.solve(damped, block_right[:, :, None])[:, :, 0]
+        by_shared = np.asarray(np.linalg.solve(damped, mixed.transpose(0, 2, 1)), dtype=np.float64)  # (v, k, p)
+        by_right = np.asarray(np.linalg.solve(damped, block_right[:, :, None])[:, :, 0], dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise BundleError("the pose of a board, or the place of a point, is not determined by its pixels") from error
     whole = shared + damping * np.diag(np.diag(shared))

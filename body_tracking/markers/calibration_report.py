@@ -74,7 +74,7 @@ def edge_errors(rig: Rig, board: Chessboard, corners: Corners) -> FloatArray:
         rig, Sightings(corners.cameras, corners.views, numbers, corners.pixels), board.columns * board.rows
     )
     edges = board.edges()
-    known = points.any(axis=-1)
+    known = np.asarray(points.any(axis=-1))
     lengths = np.linalg.norm(points[:, edges[:, 1]] - points[:, edges[:, 0]], axis=-1)
     errors: FloatArray = (lengths / board.square - 1.0)[known[:, edges].all(axis=-1)]
     return errors

@@ -83,9 +83,9 @@ def _minimum(
 ) -> tuple[FloatArray, FloatArray]:
     """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t; (n,) each.
 
-    The cost is at most that of t = 0, the line through the first pixel, so that the size of t has a bound. Where the pixels are
-    near their epipolar lines against the distance to the epipoles, the cost is a parabola within it, and Newton's
-    method finds its one minimum; all roots are computed for the others.
+    The cost is at most that of t = 0, the line through the first pixel, which bounds the size of t. Where the pixels
+    are near their epipolar lines against the distance to the epipoles, the cost is a parabola within that bound, and
+    Newton's method finds its one minimum; all roots are computed for the others.
     """
     coefficients = _polynomial(a, b, c, d, f, g)
     t, one = np.zeros_like(a), np.ones_like(a)

@@ -345,5 +345,4 @@ def sensitivity(rig: Rig, positions: FloatArray, seen: BoolArray | None = None) 
         pulls[:, :, starts[index] : starts[index + 1]] = turned @ np.nan_to_num(made.by_parameters)
     if (seen.sum(axis=1) < 2).any():
         raise TriangulationError("a point that fewer than two cameras see has no position")
-    moved: FloatArray = -np.linalg.solve(information, pulls)
-    return moved
+    return -np.asarray(np.linalg.solve(information, pulls), dtype=np.float64)

@@ -133,7 +133,7 @@ def calibrate_wand(
     size = sum(projection.size(camera) for camera in cameras)
     rig = Rig(tuple(cameras), rotations, translations, np.zeros((size, size)))
     free = bundle.free_parameters(rig, coefficients)
-    used = np.isfinite(flat).all(axis=-1)
+    used: BoolArray = np.asarray(np.isfinite(flat).all(axis=-1))
     for last in (index == _ROUNDS - 1 for index in range(_ROUNDS)):
         used = used & (_counts(seen, used) >= 2)
         points = intersect(rig, seen.where(used), len(wand.places), flat[used])

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rigs import rig, seen_boards
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
@@ -29,7 +30,6 @@ from body_tracking.markers.camera_calibration import (
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.wand import intersect
 from draws import draws, some
-from rigs import rig, seen_boards
 
 BOARD = Chessboard(9, 6, 0.025)
 FRAMES, SIZES = ("left", "right"), ((640, 480), (640, 480))

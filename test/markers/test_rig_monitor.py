@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from rigs import images, rig, seen_boards, turned
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
@@ -14,7 +15,6 @@ from body_tracking.markers.camera_calibration import calibrate_cameras
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_monitor import Fault, Finding, RigMonitor
 from draws import draws
-from rigs import images, rig, seen_boards, turned
 
 RATE = 60.0
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import rig
 
 from body_tracking.markers.rig_storage import RigFileError, load_rig, save_rig
-from rigs import rig
 
 
 def test_a_rig_comes_back_as_it_was_saved(tmp_path: Path) -> None:

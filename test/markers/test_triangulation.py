@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from rigs import images, rig, seen_boards
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import hartley_sturm
@@ -17,7 +18,6 @@ from body_tracking.markers.rays import TriangulationError, make_rays, rig_rays
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.triangulation import TriangulationSettings, sensitivity, triangulate
 from draws import draws
-from rigs import images, rig, seen_boards
 
 
 def places(rng: np.random.Generator, count: int = 15) -> FloatArray:

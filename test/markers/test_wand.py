@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs import rig
 
 from body_tracking.core import so3
 from body_tracking.markers.bundle_points import Sightings
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.wand import Wand, WandError, calibrate_wand
 from draws import draws
-from rigs import rig
 
 WAND = Wand((0.0, 0.15, 0.45))
 
