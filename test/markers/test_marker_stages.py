@@ -25,7 +25,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 from body_tracking.simulation.marker_scene import DIAMETER, MarkerScene, marker_scene
 
-RATE = 30.0
+RATE, FRAMES = 30.0, 20
 START_NS = 1_750_000_000 * NANOSECONDS
 JOINTS = (
     JointDescription("shoulder", "shoulder", "upper_arm", JointKind.BALL),
@@ -87,7 +87,7 @@ def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> d
     found: dict[str, list[bytes]] = {}
     runner = OfflineRunner(stages, BAG_WIRE, lambda topic, cdr, at_ns: found.setdefault(topic, []).append(cdr))
     runner.start(START_NS)
-    for index in range(60):
+    for index in range(FRAMES):
         at_ns = stamp_ns(scene, index)
         for camera, rotation, translation in zip(
             scene.rig.cameras, scene.rig.rotations, scene.rig.translations, strict=True
@@ -101,10 +101,10 @@ def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> d
 
 
 def test_targets_are_where_they_are(scene: MarkerScene, published: dict[str, list[bytes]]) -> None:
-    stamps = {stamp_ns(scene, index): index for index in range(60)}
+    stamps = {stamp_ns(scene, index): index for index in range(FRAMES)}
     for number, target in enumerate(scene.targets):
         poses = [PoseOfTarget(target.name).decode(cdr, BAG_WIRE) for cdr in published[setup.pose_topic(target.name)]]
-        assert len(poses) > 45
+        assert len(poses) > 0.75 * FRAMES
         rows = [stamps[pose.stamp_ns] for pose in poses]
         away = np.array([pose.translation for pose in poses]) - scene.translations[rows, number]
         assert np.sqrt((away**2).sum(axis=1).mean()) < 0.0003
@@ -112,8 +112,8 @@ def test_targets_are_where_they_are(scene: MarkerScene, published: dict[str, lis
 
 def test_angles_follow_the_truth(scene: MarkerScene, published: dict[str, list[bytes]]) -> None:
     topic = graph.joint_states_topic(setup.BODY)
-    stamps = {stamp_ns(scene, index): index for index in range(60)}
-    assert len(published[topic]) > 45
+    stamps = {stamp_ns(scene, index): index for index in range(FRAMES)}
+    assert len(published[topic]) > 0.75 * FRAMES
     found = []
     for values, deviations in zip(published[topic], published[f"{topic}_stddev"], strict=True):
         pair = deserialize(JOINT_STATE, values), deserialize(JOINT_STATE, deviations)
