@@ -111,9 +111,15 @@ class Recogniser:
     def _candidates(self, name: str, points: Points, pairs: Pairs, deadline: Deadline) -> list[Candidate]:
         target, shape = self.targets[name], self.shapes[name]
         relations = shape.relations(pairs)
-        found = shape.assignments(relations, min(SURE, shape.balls), deadline)
-        candidates = fitted(target, points, list(found), deadline)
-        if not candidates and shape.balls > 3 and sum(map(len, relations)) <= _MAX_THREES * len(relations):
+        fewest = min(SURE, shape.balls)
+        candidates: list[Candidate] = []
+        # an interpretation with two balls less than another costs so much more that it does not matter
+        for balls in range(max(shape.balls - 1, fewest), fewest - 1, -1):
+            found = shape.assignments(relations, balls, deadline)
+            candidates = fitted(target, points, list(found), deadline)
+            if candidates:
+                return candidates
+        if shape.balls > 3 and sum(map(len, relations)) <= _MAX_THREES * len(relations):
             found = shape.assignments(relations, 3, deadline)
             candidates = fitted(target, points, list(found), deadline, _MISSED_THREE)
         return candidates

@@ -26,6 +26,8 @@ GATE: Final = 4.5
 MAX_PAIRS: Final = 60_000
 """Pairs of points within the reach of a target; more take longer than any frame has."""
 
+_MOST_GROUPINGS: Final = 60
+
 Relation = dict[int, int]
 """Points, as bits, at which one ball of an edge may be, by the point of the other one; for one edge of a target."""
 
@@ -240,11 +242,13 @@ def bits(number: int) -> Iterator[int]:
 
 @lru_cache(maxsize=64)
 def _groupings(balls: int, groups: int) -> list[list[tuple[int, int]]]:
-    """The edges within the groups, for all ways to make so many groups of as equal size as can be."""
+    """The edges within the groups, for ways to make so many groups of as equal size as can be; not all if many."""
     sizes = [balls // groups + (number < balls % groups) for number in range(groups)]
     results: list[list[tuple[int, int]]] = []
 
     def divide(rest: tuple[int, ...], sizes: list[int], edges: list[tuple[int, int]]) -> None:
+        if len(results) == _MOST_GROUPINGS:
+            return
         if not rest:
             results.append(edges)
             return

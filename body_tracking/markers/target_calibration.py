@@ -25,6 +25,8 @@ _MISSED: Final = 1e-4
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-8
 """Metres."""
+_RIGID: Final = 0.1
+"""Noise of a coordinate, as a part of a target's size, above which its balls do not keep their places."""
 _BENT: Final = 3.0
 """How much more than its median a flexible target may bend in a view; a person's skin does so in each step."""
 _PROCRUSTES: Final = 10
@@ -108,6 +110,12 @@ def calibrate_target(
     reduced = total / freedom
     residuals = _residuals(shape, views[used], seen[used], weights[used])
     noise = float(np.sqrt((residuals**2).sum() / freedom))
+    size = float(np.linalg.norm(shape[:, None] - shape, axis=2).max())
+    if noise > _RIGID * size:
+        raise TargetCalibrationError(
+            f"target {name}: no views agree, balls are off by {1e3 * noise:.1f} mm in a target of {1e3 * size:.0f} mm; "
+            "are they in the same order?"
+        )
     covariance_of_shape = fit.covariance * (reduced if covariance is None else 1.0)
     if flexible:
         flex = _flexibility(residuals, seen[used], None if covariance is None else covariance[used])

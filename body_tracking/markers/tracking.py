@@ -197,7 +197,7 @@ class TargetTracker:
         own = Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both])
         relations = shape.relations(own)
         allowed = [sum(1 << point for point in np.flatnonzero(row).tolist()) for row in gate]
-        for fewest in sorted({max(FEWEST, shape.balls - 1), FEWEST}, reverse=True):
+        for fewest in range(max(FEWEST, shape.balls - 1), FEWEST - 1, -1):
             found = list(shape.assignments(relations, fewest, until, allowed))
             candidates = [
                 expected
