@@ -112,10 +112,11 @@ def maximise(tree: Tree, poses: PoseTable, misfit: float, shared: FloatArray | N
         normal = _normal(tree, posture, poses, directions, error)
         prior, pull = _prior(tree, directions)
         gradient = normal.gradients.sum(axis=0) + pull
+        diagonal = normal.information.diagonal()
+        regular = normal.information + prior + np.diag(np.full(len(diagonal), _ROUNDING * diagonal.max()))
         decreased = False
         for _ in range(12):
-            damped = normal.information + prior + damping * np.diag(np.diag(normal.information))
-            step = np.linalg.solve(damped, gradient)
+            step = np.linalg.solve(regular + np.diag(damping * diagonal), gradient)
             frames = _solve(normal.frames, (normal.pulls - normal.mixed @ step)[..., None])[..., 0]
             trial = tree.with_joints(_changed(tree.joints, directions @ step))
             trial_posture = moved(tree, posture, frames)

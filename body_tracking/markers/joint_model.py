@@ -150,7 +150,7 @@ def is_rotation(matrix: FloatArray) -> bool:
 
 
 def turn_axes(kind: JointKind, turns: FloatArray) -> FloatArray:
-    """(n, 3, d) axes of the joint's coordinates in its frame in the parent, of (n, 3, 3) turns; (1, 3, 3) of balls."""
+    """(n, 3, d) axes of the coordinates in the frame in the parent, of (n, 3, 3) turns; (1, 3, 3) for a ball joint."""
     if kind is JointKind.BALL:
         return _AXES
     axes = np.zeros((len(turns), 3, kind.coordinates))

@@ -172,7 +172,7 @@ def test_the_calibration_of_the_cameras_is_in_the_deviation() -> None:
     assert (stated.calibration > 10.0 * stated.noise).all() and np.allclose(stated.model, 0.0)
     assert np.allclose(stated.stddev**2, stated.noise**2 + stated.calibration**2)
     drawn = []
-    for _ in range(400):
+    for _ in range(250):
         shared = root @ rng.normal(size=size)
         steps = {name: sensitivity @ shared for name, sensitivity in sensitivities.items()}
         changed = [
@@ -204,7 +204,7 @@ def test_the_chain_is_in_the_deviation() -> None:
     values, vectors = np.linalg.eigh(chain.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = []
-    for _ in range(300):
+    for _ in range(200):
         step = root @ rng.normal(size=len(root))
         joints = tuple(joint.changed(step[SIZE * i : SIZE * (i + 1)]) for i, joint in enumerate(chain.joints))
         estimator = AngleEstimator(Chain(joints, chain.covariance, chain.sensitivity))

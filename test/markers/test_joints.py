@@ -132,7 +132,7 @@ def test_a_recording_of_2000_frames_reaches_the_bars(kind: JointKind) -> None:
 @pytest.mark.parametrize("kind", JointKind)
 def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None:
     errors, variances = [], []
-    for seed in range(draws(8, 60)):
+    for seed in range(draws(5, 60)):
         truth, poses = drawn(200 + seed, kind, draws(300, 1000), 3.0)
         fit = FITS[kind](*poses)
         assert fit.verdict is Verdict.SMALL_MOTION and "deg RMS only" in fit.warnings[0]
@@ -145,7 +145,7 @@ def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None
     assert 1.0 / 1.5 < ratio < 1.5
 
 
-@pytest.mark.parametrize("noise", [1.0, 1e-6])
+@pytest.mark.parametrize("noise", [1.0, 1e-2])
 @pytest.mark.parametrize("kind", JointKind)
 def test_targets_that_stand_still_say_nothing_of_a_joint(kind: JointKind, noise: float) -> None:
     rng = np.random.default_rng(5)
@@ -159,8 +159,8 @@ def test_targets_that_stand_still_say_nothing_of_a_joint(kind: JointKind, noise:
 
 
 def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
-    for seed in range(draws(3, 20)):
-        truth, poses = drawn(seed, JointKind.BALL, 500, 40.0, about=1)
+    for seed in range(draws(2, 20)):
+        truth, poses = drawn(seed, JointKind.BALL, 200, 40.0, about=1)
         fit = fit_ball_joint(*poses)
         assert fit.verdict is Verdict.ONE_AXIS and "up to a line" in fit.warnings[0]
         covariance = fit.joint.covariance[np.ix_(CENTRES, CENTRES)]
@@ -171,7 +171,7 @@ def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
 
 
 def test_a_pronating_elbow_is_no_hinge_but_a_universal_joint() -> None:
-    _, poses = drawn(7, JointKind.UNIVERSAL, 400, 30.0)
+    _, poses = drawn(7, JointKind.UNIVERSAL, 150, 30.0)
     hinge, universal = fit_hinge_joint(*poses), fit_universal_joint(*poses)
     assert hinge.verdict is Verdict.NOT_OF_KIND and "soft tissue" in hinge.warnings[0]
     assert hinge.scale > 10.0 and np.degrees(hinge.turn) > 3.0
@@ -256,7 +256,8 @@ def test_a_real_knee_is_the_same_hinge_in_both_halves_of_a_trial(shared_data: Pa
 
 
 def test_a_real_hip_tells_of_soft_tissue_and_of_a_cluster_that_is_not_rigid(shared_data: Path) -> None:
-    pelvis, thigh, wrong = real(shared_data, "right_hip.c3d", PELVIS, THIGH, THIGH + EPICONDYLES)
+    found = real(shared_data, "right_hip.c3d", PELVIS, THIGH, THIGH + EPICONDYLES)
+    pelvis, thigh, wrong = (poses[::4] for poses in found)
     hip = fit_ball_joint(pelvis, thigh, "hip")
     assert "soft tissue" in hip.warnings[0] and 3e-3 < hip.gap < 20e-3
     assert fit_ball_joint(pelvis, wrong, "hip").verdict is Verdict.NOT_RIGID
