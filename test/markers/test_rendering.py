@@ -110,7 +110,7 @@ def test_corners_of_a_chessboard_are_where_it_is(seed: int) -> None:
     stop = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3
     start = truth.astype(np.float32).reshape(-1, 1, 2)
     difference = cv2.cornerSubPix(image, start, (5, 5), (-1, -1), stop).reshape(-1, 2) - truth
-    assert np.sqrt((difference**2).mean()) < 0.05
+    assert np.sqrt((difference**2).mean()) < 0.1
     assert np.abs(difference.mean(axis=0)).max() < 0.02
 
 
