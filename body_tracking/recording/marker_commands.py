@@ -26,6 +26,7 @@ from body_tracking.markers.camera_calibration import calibrate_cameras, find_boa
 from body_tracking.markers.chain import JointDescription, fit_chain
 from body_tracking.markers.chain_files import save_chain, to_urdf
 from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
+from body_tracking.markers.corrections import pose_sensitivity
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
@@ -221,7 +222,11 @@ def fit(args: argparse.Namespace) -> int:
         if len(parts) != 4 or parts[1] not in tuple(JointKind):
             raise MarkerCommandError(f"joint {entry!r}: expected NAME:KIND:PARENT:CHILD, KIND {', '.join(JointKind)}")
         joints.append(JointDescription(parts[0], parts[2], parts[3], JointKind(parts[1])))
-    found = fit_chain(poses_of(args.bag, args.setup), joints)
+    rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
+    targets = {each.name: each for each in load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))}
+    frames = poses_of(args.bag, args.setup)
+    sensitivities = [{each.name: pose_sensitivity(rig, targets[each.name], each) for each in poses} for poses in frames]
+    found = fit_chain(frames, joints, sensitivities)
     path = args.setup / setup.CHAIN
     save_chain(found.chain, path)
     path.with_suffix(".urdf").write_text(to_urdf(found.chain, "markers"), encoding="utf-8")
