@@ -16,6 +16,8 @@ _POLISH: Final = 2
 """Newton steps on the roots: a leading coefficient near zero (an epipole far away) costs the eigenvalues digits."""
 _LEADING: Final = 1e-10
 _NEWTON: Final = 4
+_ON_EPIPOLE: Final = 1e-9
+"""Distance from the epipole, in units of the image's size, below which a pixel is on it."""
 _PARABOLA: Final = 0.03
 """Relative size below which terms that bend the parabola are small enough for its minimum to be the only one."""
 
@@ -133,7 +135,10 @@ def _frame(pixels: FloatArray, epipole: FloatArray) -> tuple[FloatArray, FloatAr
     """(n, 3, 3) from frames with a pixel at the origin and the epipole at (1, 0, f), and (n,) f (eq. 3.8, 3.9)."""
     moved = epipole[:2] - epipole[2] * pixels
     length = np.hypot(moved[:, 0], moved[:, 1])
-    cosine, sine = moved[:, 0] / length, moved[:, 1] / length
+    # a pixel on the epipole: any direction does
+    at_epipole = length < _ON_EPIPOLE * np.abs(epipole[2])
+    length = np.where(at_epipole, _ON_EPIPOLE * max(abs(float(epipole[2])), 1e-300), length)
+    cosine, sine = np.where(at_epipole, [[1.0], [0.0]], moved.T / length)
     frame = np.zeros((len(pixels), 3, 3))
     frame[:, 0, 0], frame[:, 0, 1] = cosine, -sine
     frame[:, 1, 0], frame[:, 1, 1] = sine, cosine

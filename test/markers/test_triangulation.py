@@ -238,3 +238,21 @@ def test_fifteen_balls_in_two_cameras_take_less_than_a_millisecond() -> None:
         times.append((time.process_time() - start) / 10)
     print(f"15 balls, 2 cameras: {min(times) * 1e3:.2f} ms of CPU")
     assert min(times) < 2e-3  # 0.5 ms where nothing else runs
+
+
+@pytest.mark.filterwarnings("error")
+def test_rays_that_do_not_meet_give_no_points() -> None:
+    rng, truth = np.random.default_rng(0), rig()
+    there = np.concatenate([places(rng), [[0.0, 0.0, 1.0]]])
+    one_place = Rig(truth.cameras, truth.rotations, 0.0 * truth.translations, truth.covariance)
+    assert len(triangulate(one_place, images(one_place, [there] * 2, rng)[0]).positions) == 0
+    # one camera before the other, and a ball on the line that joins them: it has no depth
+    shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
+    behind = Rig(truth.cameras, np.tile(np.eye(3), (2, 1, 1)), shift, truth.covariance)
+    balls, numbers = images(behind, [there] * 2, rng, noise=0.0)
+    rows, number = true_points(points := triangulate(behind, balls), numbers)
+    assert 15 not in number and len(rows) > 10 and np.isfinite(points.positions).all()
+    # far outside the image, where the distortion has no inverse
+    far = np.array([[900.0, 900.0], [-900.0, 3.0]])
+    outside = [ImageBalls(0, each, far, np.ones(2), np.tile(np.eye(2), (2, 1, 1))) for each in "ab"]
+    assert len(triangulate(truth, outside).positions) == 0
