@@ -47,8 +47,8 @@ _LEAST_RING: Final = 12
 """Pixels from which the background around a ball is known."""
 _LOWER: Final = 0.2
 _UPPER: Final = 0.8
-_LOST: Final = 1.45
-"""Pixels of area that the blur of an edge takes from :attr:`_Measured.fill`."""
+_LOST: Final = 3.0
+"""Pixels of area by which the blur of an edge lowers :attr:`_Measured.fill` at most."""
 _ELONGATION_NOISE: Final = 4.0
 """Elongation by noise, standard deviations of the centroid in radii of the ball."""
 _EDGE: Final = 1.3

@@ -58,6 +58,18 @@ def test_balls_that_nearly_touch_do_not_disturb_each_other() -> None:
     assert rms(errors) < 0.03
 
 
+def test_three_balls_that_touch_are_three() -> None:
+    for seed in range(draws(3, 15)):
+        for depth in (0.8, 1.2, 1.8):
+            angle = seed + np.arange(3) * 2.0 * np.pi / 3.0
+            side = DIAMETER / np.sqrt(3.0) * 834.0 / depth
+            pixels = np.array([300.0, 200.0]) + side * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            points = at(pixels, depth + np.array([0.0, 0.02, 0.04]))
+            errors, _, missed, extra = found([render(CAMERA, *HERE, points, DIAMETER, Sensor(), seed)])
+            assert missed == extra == 0
+            assert np.abs(errors).max() < 0.1
+
+
 def test_the_centre_of_a_ball_that_a_limb_half_hides() -> None:
     scenes = [half_hidden(seed, depth, Sensor()) for seed in range(draws(5, 30)) for depth in (0.7, 1.0, 1.5)]
     errors, deviations, missed, extra = found(scenes)
