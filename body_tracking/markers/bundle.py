@@ -2,8 +2,7 @@
 
 What is shared by all images (cameras) is dense, what belongs to one instant (the pose of a board, the ends of a wand)
 is a small block each. Levenberg-Marquardt eliminates the blocks by the Schur complement (Triggs et al. 2000, section
-6.1), whose inverse is the covariance of the shared parameters. scipy's ``least_squares`` takes no such structure:
-with three hundred positions of a wand it is a hundred times as slow.
+6.1), whose inverse is the covariance of the shared parameters. scipy's ``least_squares`` takes no such structure.
 """
 
 from __future__ import annotations

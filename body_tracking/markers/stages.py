@@ -22,6 +22,7 @@ from body_tracking.markers.corrections import centred, pose_sensitivity, well_pl
 from body_tracking.markers.detection import DetectionSettings, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
+from body_tracking.markers.rig_monitor import RigMonitor
 from body_tracking.markers.rig_storage import load_rig
 from body_tracking.markers.targets_file import load_targets
 from body_tracking.markers.tracking import TargetTracker
@@ -106,6 +107,7 @@ class TriangulationStage(Stage):
         super().__init__(values, wanted)
         self.rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
         self._settings = TriangulationSettings(**fields_of(TriangulationSettings, values))
+        self._monitor = RigMonitor(self.rig)
         self._diameter = float(str(values["diameter"]))
         frames = [camera.frame_id for camera in self.rig.cameras]
         tolerance, wait = float(str(values["tolerance"])), float(str(values["max_wait"]))
@@ -132,10 +134,17 @@ class TriangulationStage(Stage):
 
     def reset(self, topic: str) -> None:
         self._sets.reset()
+        self._monitor.reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """A camera that was moved, or one out of step with the others, is named."""
+        finding = self._monitor.finding()
+        return (0, "", {}) if finding is None else (1, str(finding), {})
 
     def _points(self, sets: Iterable[Mapping[str, ImageBalls]]) -> Iterator[Output]:
         for frames in sets:
             balls = tuple(frames.values())
+            self._monitor.take(balls)
             points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
             if self._diameter and len(points.positions):
                 balls = centred(self.rig, balls, points, self._diameter)

@@ -142,7 +142,7 @@ def errors(truth: Rig, made: Rig) -> FloatArray:
     return np.concatenate(parts)
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", some([2, 3]))
 def test_errors_of_parameters_are_within_their_stated_deviations(count: int) -> None:
     truth, standard = rig(count), []
     for seed in range(20 if count == 2 else draws(8, 20)):

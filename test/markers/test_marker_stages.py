@@ -25,7 +25,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 from body_tracking.simulation.marker_scene import DIAMETER, MarkerScene, marker_scene
 
-RATE, FRAMES = 30.0, 20
+RATE, FRAMES = 30.0, 12
 START_NS = 1_750_000_000 * NANOSECONDS
 JOINTS = (
     JointDescription("shoulder", "shoulder", "upper_arm", JointKind.BALL),
@@ -74,7 +74,7 @@ def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> d
     folder = tmp_path_factory.mktemp("lab")
     save_rig(folder / setup.RIG, scene.rig)
     save_targets(scene.targets, folder / setup.TARGETS)
-    save_chain(fit_chain(true_poses(scene, 2), JOINTS).chain, folder / setup.CHAIN)
+    save_chain(fit_chain(true_poses(scene, 4), JOINTS).chain, folder / setup.CHAIN)
     stages = [
         stage(check_all(stage.PARAMETERS, given))
         for stage, given in (

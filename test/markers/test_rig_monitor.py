@@ -14,7 +14,7 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.camera_calibration import calibrate_cameras
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_monitor import Fault, Finding, RigMonitor
-from draws import draws
+from draws import draws, some
 
 RATE = 60.0
 
@@ -74,20 +74,20 @@ def outcomes(fault: Fault, count: int, speed: float, **kind: float) -> Counter[s
     return result
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("speed", some([1.0, 0.0, 3.0]))
 def test_of_three_cameras_the_turned_one_is_named_within_a_second(speed: float) -> None:
     result = outcomes(Fault.MOVED_CAMERA, 3, speed, turn=np.radians(0.2))
     assert result["wrong"] == 0 and result["named"] >= 0.8 * result.total()
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0])
+@pytest.mark.parametrize("speed", some([1.0, 0.0]))
 def test_of_two_cameras_a_turned_one_is_among_the_named(speed: float) -> None:
     # turns about the line that joins them look alike, turns in the epipolar planes hardly show
     result = outcomes(Fault.MOVED_CAMERA, 2, speed, turn=np.radians(0.2))
     assert result["wrong"] <= 0.05 * result.total() and result["none"] <= 0.4 * result.total()
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", some([2, 3]))
 def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
     result = outcomes(Fault.OUT_OF_STEP, count, 1.0, delay=1.0 / RATE)
     assert result["wrong"] == 0 and result["named"] >= 0.8 * result.total()
@@ -96,7 +96,7 @@ def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
     assert "cameras out of step" in str(found) and "ms" in str(found)
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("speed", some([1.0, 0.0, 4.0]))
 def test_nothing_is_told_of_a_rig_that_is_well(speed: float) -> None:
     for seed in range(draws(5, 30)):
         assert watched(2 + seed % 2, seed, speed) == (watched(2 + seed % 2, seed, speed, seconds=0.0)[0], None)
