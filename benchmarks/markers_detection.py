@@ -8,10 +8,10 @@ two balls of which one hides half of the other; the errors of both, or of the hi
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 
+import common
 import cv2
 import numpy as np
 
@@ -104,7 +104,7 @@ def _milliseconds(image: np.ndarray) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__)
     parser.add_argument("--images", type=int, default=20, help="of each row (default 20)")
     count = parser.parse_args().images
     cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""From images to joint angles: the stages of the marker nodes."""
+"""From images to joint angles: the stages of the marker nodes (Gaschler 2011, figure 2.1)."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def with_rates(found: ChainAngles, last: JointAngles | None) -> JointAngles:
 
 
 class DetectorStage(Stage):
-    """Finds the balls in the images of cameras."""
+    """Finds the balls in the images of cameras, the first stage of figure 2.1 of Gaschler (2011)."""
 
     NAME = "marker_detector"
     PARAMETERS = (SETUP, CAMERAS, *parameters_from(DetectionSettings, only=_DETECTION, live=True), TRANSPORT)
