@@ -39,6 +39,7 @@ setup(
         *COMMANDS,
         share("config", "*.yaml"),
         share("config/robots", "*.yaml"),
+        share("config/marker_setup", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         share("foxglove", "*.json"),
@@ -55,6 +56,7 @@ setup(
         "lz4>=4",
         "zstandard>=0.22",
         "rosbags>=0.10,<0.12",
+        "opencv-python-headless>=4.6",
     ],
     extras_require={
         "ros": [
@@ -78,7 +80,6 @@ setup(
             "setuptools>=77",
             "ezc3d>=1.7",
             "import-linter>=2",
-            "opencv-python-headless>=4.6",
             "mujoco-core>=4",
             "playwright>=1.50",
         ],

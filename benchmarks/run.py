@@ -125,6 +125,15 @@ BENCHMARKS = (
         PAIRS,
         4,
     ),
+    Benchmark(
+        "markers_detection", "centroids of rendered balls, by distance, overlap, saturation and blur", NOTHING, 2
+    ),
+    Benchmark(
+        "markers_functional",
+        "joints of real marker clusters on skin, beside biobuddy where it is installed",
+        recordings("marker_functional"),
+        1,
+    ),
     Benchmark("latency", "delay from capture to angles through the live graph, beside bare relays", NOTHING, 1),
     Benchmark("four_sensors", "four sensors live with `ekf`: frames lost, processor time, delay", NOTHING, 1),
     Benchmark("imu_live", "ten inertial sensors and two Kinects live: delay, and whether it grows", NOTHING, 2),

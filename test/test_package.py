@@ -27,6 +27,7 @@ SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
 LIBRARIES = {
     "numpy": ("numpy", "python3-numpy"),
     "scipy": ("scipy", "python3-scipy"),
+    "cv2": ("opencv-python-headless", "python3-opencv"),
     "yaml": ("pyyaml", "python3-yaml"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "filterpy": ("filterpy", "python3-filterpy-pip"),

@@ -17,6 +17,7 @@ class ImageBalls:
         pixels: (n, 2) centroids, pixels from the centre of the upper left one; of the image as it is, distorted.
         areas: (n,) pixels.
         covariance: (n, 2, 2) of the centroids by the noise of the image, pixels squared.
+        dropped: number of bright regions that are no balls.
     """
 
     stamp_ns: int
@@ -24,6 +25,7 @@ class ImageBalls:
     pixels: FloatArray
     areas: FloatArray
     covariance: FloatArray
+    dropped: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from body_tracking.core import files
 from body_tracking.core.errors import BodyTrackingError
 
 RIG, TARGETS, CHAIN = "rig.yaml", "targets.yaml", "chain.yaml"
@@ -37,6 +39,21 @@ def file_of(folder: object, name: str, made_by: str) -> Path:
     return path
 
 
+def camera_names(folder: Path) -> tuple[str, ...]:
+    """The names of the cameras of a setup's rig, without reading all of it.
+
+    Raises:
+        SetupError: no folder, or no such file in it, or it names no cameras.
+    """
+    path = file_of(folder, RIG, "calibrate")
+    try:
+        return tuple(camera_name(str(each["frame"])) for each in files.read_yaml(path)["cameras"])
+    except files.FileError as error:
+        raise SetupError(f"{path}: {error}") from error
+    except (KeyError, TypeError) as error:
+        raise SetupError(f"{path}: lists no cameras") from error
+
+
 def camera_name(frame_id: str) -> str:
     """The name of a camera in topics, from its optical frame."""
     return frame_id.removesuffix(_FRAME_SUFFIX)
@@ -60,3 +77,8 @@ def balls_topic(camera: str) -> str:
 def pose_topic(target: str) -> str:
     """The topic of a target's poses."""
     return f"/markers/{target}/pose"
+
+
+def sources(cameras: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    """The topics from which everything else follows: of images, or of balls, or of points."""
+    return tuple(map(image_topic, cameras)), tuple(map(balls_topic, cameras)), (POINTS,)

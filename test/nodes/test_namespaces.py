@@ -21,6 +21,7 @@ from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
 
+MARKER_NODES = ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles")
 NEEDED: dict[str, dict[str, object]] = {
     "kinect_skeleton": {"file": BAG},
     "imu_skeleton": {"segments": "[forearm_left]"},
@@ -30,6 +31,7 @@ NEEDED: dict[str, dict[str, object]] = {
     "bag_player": {"bag": BAG},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},
+    **{name: {"setup": ROOT / "config" / "marker_setup"} for name in MARKER_NODES},
 }
 """Parameters without which an executable does not start, or has fewer topics."""
 

@@ -10,6 +10,7 @@ from tools import Tool, Tools
 from body_tracking import systems
 from draws import some
 
+MARKER_NODES = ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles")
 LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
 """Nodes that do nothing without a parameter."""
 
@@ -27,6 +28,7 @@ class AllNodes:
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
+            **{name: {"setup": tools.share / "config" / "marker_setup"} for name in MARKER_NODES},
         }
         self.tools_of: dict[str, Tool] = {
             executable: tools.run(executable, **parameters.get(executable, {})) for executable in systems.EXECUTABLES

@@ -1,0 +1,219 @@
+"""Joints of real marker clusters on skin: Qualisys trials of a knee and a hip, a Plug-in Gait trial of two elbows.
+
+Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape, whose markers have a noise of 1 mm.
+
+- ``knee``: the hinge between the thigh's and the shank's cluster, and how far its axis in the thigh and in the shank
+  turns between the first and the second half of the trial; the first bends it by up to 70 deg, the second by 48.
+- ``hip``: the ball joint between the pelvis' markers and the thigh's cluster. ``hip, wrong``: with the epicondyles as
+  part of the thigh's cluster, which is not rigid then.
+- ``elbow``: a hinge between upper arm and forearm, which bend by 9 (left) and 15 deg (right).
+- ``gap``: RMS distance between both targets' centre, mm; ``turn``: RMS rotation that the joint cannot make, degrees;
+  ``scale``: errors in units of the markers' noise; ``motion``: RMS rotations about the principal axes, degrees.
+- biobuddy (SCoRE and SARA, Ehrig et al. 2006 and 2007) on the same poses, all of them, against our closed form and
+  against the maximum likelihood that starts from it: distance of the hip's centre and of the knee's axis (at the centre
+  of ours), mm, and the angle of the knee's axis, degrees. Left out where biobuddy is not installed.
+
+The exit code is 1 where a bar is missed.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import common
+import numpy as np
+
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.joint_model import Joint, JointKind
+from body_tracking.markers.joint_starts import closed_form
+from body_tracking.markers.joints import JointFit, fit_ball_joint, fit_hinge_joint, relative_poses
+from body_tracking.markers.observations import TargetPose
+from body_tracking.markers.pose_table import pose_table
+
+NOISE = 1e-3
+"""Metres, per axis of a marker."""
+HALVES_BAR_DEG, PEER_BAR_MM, PEER_BAR_DEG = 2.0, 0.5, 0.2
+THIGH, SHANK = ("RTHI1", "RTHI2", "RTHI3"), ("RLEG1", "RLEG2", "RLEG3")
+PELVIS, EPICONDYLES = ("LPSIS", "RPSIS", "LASIS", "RASIS"), ("RLFE", "RMFE")
+
+
+@dataclass(frozen=True)
+class Peer:
+    """How far a joint of ours is from biobuddy's: in the parent target and in the child target."""
+
+    joint: str
+    ours: str
+    parent_mm: float
+    child_mm: float
+    parent_deg: float
+    child_deg: float
+
+
+def markers(path: Path) -> dict[str, FloatArray]:
+    """(n, 3) metres of each marker of a C3D file."""
+    import ezc3d
+
+    file = ezc3d.c3d(str(path))
+    labels = file["parameters"]["POINT"]["LABELS"]["value"]
+    return dict(zip(labels, 1e-3 * np.moveaxis(file["data"]["points"][:3], 0, -1), strict=False))
+
+
+def cluster(trial: dict[str, FloatArray], names: tuple[str, ...], noise: float = NOISE) -> list[TargetPose]:
+    """The poses of a target of these markers, whose shape is the mean one (Umeyama 1991, eq. 39-42)."""
+    points = np.stack([trial[name] for name in names], axis=1)
+    centre = points.mean(axis=1, keepdims=True)
+    shape = points[0] - centre[0]
+    for _ in range(5):
+        u, _, v = np.linalg.svd(np.einsum("nki,kj->nij", points - centre, shape))
+        sign = np.tile(np.eye(3), (len(points), 1, 1))
+        sign[:, 2, 2] = np.linalg.det(u @ v)
+        rotations = u @ sign @ v
+        shape = np.einsum("nij,nki->nkj", rotations, points - centre).mean(axis=0)
+    turned = np.einsum("nij,kj->nki", rotations, shape)
+    residual = np.sqrt(((points - centre - turned) ** 2).sum(axis=-1).mean(axis=1))
+    information = np.zeros((len(points), 6, 6))
+    for x, y, z in np.moveaxis(turned, (1, 2), (0, 1)):
+        by_pose = np.zeros((len(points), 3, 6))
+        by_pose[:, :, :3] = np.eye(3)
+        by_pose[:, 0, 4], by_pose[:, 0, 5] = z, -y
+        by_pose[:, 1, 3], by_pose[:, 1, 5] = -z, x
+        by_pose[:, 2, 3], by_pose[:, 2, 4] = y, -x
+        information += by_pose.swapaxes(-1, -2) @ by_pose / noise**2
+    covariance = np.linalg.inv(information)
+    name, seen = "_".join(names), np.arange(len(names))
+    return [
+        TargetPose(name, 10_000_000 * row, "lab", rotations[row], centre[row, 0], covariance[row], seen, residual[row])
+        for row in range(len(points))
+    ]
+
+
+def axis_angle(first: FloatArray, second: FloatArray) -> float:
+    """Degrees between two axes, whatever their signs."""
+    angle = float(np.degrees(common.between(first, second)))
+    return min(angle, 180.0 - angle)
+
+
+def peers(name: str, parent: list[TargetPose], child: list[TargetPose], fit: JointFit) -> list[Peer]:
+    """The same joint by biobuddy; none where it is not installed."""
+    try:
+        from biobuddy.model_modifiers.joint_center_tool import Sara, Score
+        from biobuddy.utils.linear_algebra import RotoTransMatrixTimeSeries
+    except ImportError:
+        return []
+
+    def series(poses: list[TargetPose]) -> object:
+        matrices = np.tile(np.eye(4)[..., None], (1, 1, len(poses)))
+        matrices[:3, :3] = np.stack([pose.rotation for pose in poses], axis=-1)
+        matrices[:3, 3] = np.stack([pose.translation for pose in poses], axis=-1)
+        return RotoTransMatrixTimeSeries.from_rt_matrix(matrices)
+
+    poses = series(parent), series(child)
+    targets = parent[0].name, child[0].name
+    table = pose_table(list(zip(parent, child, strict=True)), targets)
+    start = closed_form(name, *targets, fit.joint.kind, *relative_poses(table))
+    hinge = fit.joint.kind is JointKind.HINGE
+    if hinge:
+        _, parent_axis, child_axis, _, parent_centre, child_centre, _, _ = Sara.perform_algorithm(
+            *poses, recursive_outlier_removal=False
+        )
+    else:
+        _, parent_centre, child_centre, _, _ = Score.perform_algorithm(*poses, recursive_outlier_removal=False)
+
+    def away(centre: FloatArray, axis: FloatArray, theirs: FloatArray) -> float:
+        apart = centre - theirs
+        return 1e3 * float(np.linalg.norm(np.cross(apart, axis) if hinge else apart))
+
+    def against(ours: str, joint: Joint) -> Peer:
+        if not hinge:
+            none = np.zeros(3)
+            distances = (
+                away(joint.parent_centre, none, parent_centre),
+                away(joint.child_centre, none, child_centre),
+            )
+            return Peer(name, ours, *distances, 0.0, 0.0)
+        return Peer(
+            name,
+            ours,
+            away(joint.parent_centre, parent_axis, parent_centre),
+            away(joint.child_centre, child_axis, child_centre),
+            axis_angle(joint.parent_axis, parent_axis),
+            axis_angle(joint.child_axis, child_axis),
+        )
+
+    return [against("closed form", start), against("maximum likelihood", fit.joint)]
+
+
+def main() -> int:
+    """The benchmark; exit code 1 where a bar is missed, 2 where the files are absent."""
+    args = common.parser(__doc__, data=True).parse_args()
+    knee_file, hip_file = common.recordings(args.data / "marker_functional", ["right_knee.c3d", "right_hip.c3d"])
+    (gait_file,) = common.recordings(args.data / "plug_in_gait", ["cgm__Test_Files__Movement_trial.c3d"])
+
+    trial = markers(knee_file)
+    thigh, shank = cluster(trial, THIGH), cluster(trial, SHANK)
+    half = len(thigh) // 2
+    fits = {"knee": fit_hinge_joint(thigh, shank, "knee")}
+    fits["knee, first half"] = fit_hinge_joint(thigh[:half], shank[:half], "knee")
+    fits["knee, second half"] = fit_hinge_joint(thigh[half:], shank[half:], "knee")
+    first, second = fits["knee, first half"].joint, fits["knee, second half"].joint
+    halves = {
+        "in the thigh": axis_angle(first.parent_axis, second.parent_axis),
+        "in the shank": axis_angle(first.child_axis, second.child_axis),
+    }
+    beside = peers("knee", thigh, shank, fits["knee"])
+
+    trial = markers(hip_file)
+    pelvis, thigh = cluster(trial, PELVIS), cluster(trial, THIGH)
+    fits["hip"] = fit_ball_joint(pelvis, thigh, "hip")
+    fits["hip, wrong"] = fit_ball_joint(pelvis, cluster(trial, THIGH + EPICONDYLES), "hip")
+    beside += peers("hip", pelvis, thigh, fits["hip"])
+
+    trial = markers(gait_file)
+    for side in ("L", "R"):
+        upper = cluster(trial, (f"{side}SHO", f"{side}UPA", f"{side}ELB"))
+        lower = cluster(trial, (f"{side}FRM", f"{side}WRA", f"{side}WRB"))
+        fits[f"elbow {side}"] = fit_hinge_joint(upper, lower, "elbow")
+
+    met = {
+        f"knee's axis of both halves within {HALVES_BAR_DEG:g} deg {where}": value <= HALVES_BAR_DEG
+        for where, value in halves.items()
+    }
+    met["hip: soft tissue is named"] = any("soft tissue" in warning for warning in fits["hip"].warnings)
+    met["hip with the epicondyles: not rigid"] = fits["hip, wrong"].verdict == "not_rigid"
+    for side in ("L", "R"):
+        met[f"elbow {side}: motion too small"] = fits[f"elbow {side}"].verdict == "small_motion"
+    for peer in beside:
+        if peer.ours == "closed form":
+            near = max(peer.parent_mm, peer.child_mm) <= PEER_BAR_MM
+            met[f"{peer.joint}: as biobuddy"] = near and max(peer.parent_deg, peer.child_deg) <= PEER_BAR_DEG
+    common.report(args, {"fits": fits, "halves": halves, "peers": beside}, lambda: show(fits, halves, beside))
+    return common.verdicts(args, met)
+
+
+def show(fits: dict[str, JointFit], halves: dict[str, float], beside: list[Peer]) -> None:
+    """The tables."""
+    names = ("frames", "motion, deg", "scale", "gap, mm", "turn, deg", "centre +-, mm", "axis +-, deg")
+    print(f"{'':<18}" + "".join(f"{name:>18}" for name in names) + "  verdict")
+    for name, fit in fits.items():
+        deviations = np.sqrt(fit.joint.covariance.diagonal())
+        motion = "/".join(f"{value:.1f}" for value in np.degrees(fit.motion))
+        values = fit.scale, 1e3 * fit.gap, np.degrees(fit.turn)
+        stated = 1e3 * np.linalg.norm(deviations[:3]), np.degrees(np.linalg.norm(deviations[3:6]))
+        cells = "".join(f"{value:>18.2f}" for value in (*values, *stated))
+        print(f"{name:<18}{fit.frames:>18}{motion:>18}{cells}  {fit.verdict.value}")
+        for warning in fit.warnings:
+            print(f"    {warning}")
+    print("knee's axis, first against second half: " + ", ".join(f"{v:.2f} deg {k}" for k, v in halves.items()))
+    if not beside:
+        print("biobuddy is not installed: no comparison")
+    for peer in beside:
+        print(
+            f"biobuddy against our {peer.ours}, {peer.joint}: {peer.parent_mm:.2g} and {peer.child_mm:.2g} mm, "
+            f"{peer.parent_deg:.2g} and {peer.child_deg:.2g} deg (parent, child)"
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

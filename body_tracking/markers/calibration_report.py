@@ -1,0 +1,102 @@
+"""How good a calibration of cameras is: Gaschler's table 4.1, and a board's squares measured by triangulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers import projection
+from body_tracking.markers.boards import Chessboard
+from body_tracking.markers.bundle import Corners
+from body_tracking.markers.bundle_points import Sightings
+from body_tracking.markers.camera_calibration import RADIAL, CalibrationError, CameraCalibration, calibrate_cameras
+from body_tracking.markers.rig import LENS, Rig
+from body_tracking.markers.wand import intersect
+
+
+def table(calibration: CameraCalibration) -> str:
+    """Parameters of the cameras with their standard deviations, and residuals by axis, in the form of table 4.1."""
+    rig, lines = calibration.rig, []
+    deviations = np.sqrt(np.diag(rig.covariance))
+    by_axis, rms = calibration.rms_by_axis(), calibration.rms()
+    for index, (camera, start) in enumerate(zip(rig.cameras, projection.offsets(rig)[:-1], strict=True)):
+        values = [*camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
+        names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
+        lines.append(f"camera {camera.frame_id}")
+        for offset, (name, value) in enumerate(zip(names, values, strict=False)):
+            deviation, unit = deviations[start + offset], " px" if offset < LENS else ""
+            if deviation > 0.0 or offset < LENS or value:
+                digits = 2 if offset < LENS else 4
+                lines.append(f"  {name:<12}{value:.{digits}f} +- {deviation:.{digits}f}{unit}")
+        if index:
+            lines += _pose(rig, index)
+        x, y = by_axis[index]
+        lines.append(
+            f"  residual    x {x:.3f} px, y {y:.3f} px; as OpenCV gives it, of the 2D norm: {rms[index]:.3f} px"
+        )
+    for each in calibration.rejected:
+        who = "in both cameras" if each.camera is None else f"in camera {each.camera}"
+        lines.append(f"left out: view {each.view} {who}, {each.reason}")
+    return "\n".join(lines) + "\n"
+
+
+def _pose(rig: Rig, index: int) -> list[str]:
+    start = projection.offsets(rig)[index + 1] - 6
+    covariance = rig.covariance[start : start + 6, start : start + 6]
+    turn = so3.log(so3.matrix_to_quat(rig.rotations[index]))
+    shift = rig.translations[index]
+    angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
+    # the axis turns with itself: the angle changes by the part of exp(w) along it
+    angle_deviation = float(np.sqrt(turn @ covariance[:3, :3] @ turn)) / max(angle, 1e-12)
+    distance_deviation = float(np.sqrt(shift @ covariance[3:, 3:] @ shift)) / max(distance, 1e-12)
+    return [
+        f"  R           [{turn[0]:.4f} {turn[1]:.4f} {turn[2]:.4f}] rad, "
+        f"{np.degrees(angle):.3f} +- {np.degrees(angle_deviation):.3f} deg",
+        f"  t           [{shift[0] * 1e3:.2f} {shift[1] * 1e3:.2f} {shift[2] * 1e3:.2f}] mm, "
+        f"{distance * 1e3:.2f} +- {distance_deviation * 1e3:.2f} mm",
+    ]
+
+
+def edge_errors(rig: Rig, board: Chessboard, corners: Corners) -> FloatArray:
+    """Relative errors (n,) of the triangulated edges of a board's squares, by all cameras that see both ends.
+
+    Args:
+        rig: the cameras.
+        board: the board.
+        corners: of it.
+    """
+    index = np.rint(corners.board[:, :2] / board.square).astype(np.intp)
+    numbers = index[:, 0] + board.columns * index[:, 1]
+    points = intersect(
+        rig, Sightings(corners.cameras, corners.views, numbers, corners.pixels), board.columns * board.rows
+    )
+    edges = board.edges()
+    known = np.asarray(points.any(axis=-1))
+    lengths = np.linalg.norm(points[:, edges[:, 1]] - points[:, edges[:, 0]], axis=-1)
+    errors: FloatArray = (lengths / board.square - 1.0)[known[:, edges].all(axis=-1)]
+    return errors
+
+
+def left_out_edge_errors(
+    frames: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    board: Chessboard,
+    corners: Corners,
+    coefficients: tuple[int, ...] = RADIAL,
+) -> FloatArray:
+    """As :func:`edge_errors`, each view's by the calibration of all others: what the calibration is worth elsewhere.
+
+    Raises:
+        CalibrationError: without one of the views the cameras cannot be calibrated.
+    """
+    errors = []
+    for view in np.unique(corners.views):
+        here = corners.views == view
+        rig = calibrate_cameras(frames, sizes, corners.where(~here), coefficients).rig
+        errors.append(edge_errors(rig, board, corners.where(here)))
+    if not errors:
+        raise CalibrationError("no boards")
+    return np.concatenate(errors)

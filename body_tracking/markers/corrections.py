@@ -1,0 +1,78 @@
+"""What the size of balls does to their images, and the calibration of the cameras to poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.skeleton import MAX_RANGE, FloatArray
+from body_tracking.markers import projection
+from body_tracking.markers.observations import ImageBalls, Points, TargetPose
+from body_tracking.markers.rig import Rig
+from body_tracking.markers.spheres import sphere_centre_correction
+from body_tracking.markers.targets import Target
+
+_WORST: Final = 0.1
+_NEAREST: Final = 0.05
+"""Metres before a camera."""
+
+
+def well_placed(rig: Rig, points: Points) -> Points:
+    """Without points behind a camera that sees them, or that are not known to a tenth of a metre: chance intersections.
+
+    Their covariances would not survive single precision either.
+    """
+    kept = np.trace(points.covariance, axis1=1, axis2=2) < _WORST**2
+    kept &= (np.abs(points.positions) < MAX_RANGE).all(axis=1)
+    for index, (rotation, translation) in enumerate(zip(rig.rotations, rig.translations, strict=True)):
+        kept &= (points.positions @ rotation[2] + translation[2] > _NEAREST) | (points.balls[:, index] < 0)
+    return replace(
+        points, positions=points.positions[kept], covariance=points.covariance[kept], balls=points.balls[kept]
+    )
+
+
+def centred(rig: Rig, balls: Sequence[ImageBalls], points: Points, diameter: float) -> tuple[ImageBalls, ...]:
+    """The balls with their pixels moved from the centroids of their images to the projections of their centres.
+
+    Args:
+        rig: the cameras, of which the frames of ``balls`` name some.
+        balls: as they were found.
+        points: triangulated from them, for the depths; balls that are in no point stay.
+        diameter: of the balls, metres.
+    """
+    frames, moved = [camera.frame_id for camera in rig.cameras], []
+    for each in balls:
+        index = frames.index(each.camera)
+        seen = points.balls[:, index] >= 0
+        which = points.balls[seen, index]
+        depths = points.positions[seen] @ rig.rotations[index][2] + rig.translations[index][2]
+        pixels = np.array(each.pixels)
+        pixels[which] += sphere_centre_correction(rig.cameras[index], pixels[which], depths, 0.5 * diameter)
+        moved.append(replace(each, pixels=pixels))
+    return tuple(moved)
+
+
+def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
+    """How a pose moves when the calibration's parameters are larger and the pixels stay.
+
+    As :func:`body_tracking.markers.triangulation.sensitivity`, for the pose that fits the pixels of all balls best,
+    each pixel as good as the other.
+
+    Returns:
+        (6, p) in the order of :attr:`TargetPose.covariance`, per unit of each parameter of :class:`Rig`.
+    """
+    turned = target.points @ pose.rotation.T
+    by_pose = np.concatenate([np.tile(np.eye(3), (len(turned), 1, 1)), -so3.skew(turned)], axis=-1)
+    information, pull, start = np.zeros((6, 6)), np.zeros((6, rig.size)), 0
+    for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
+        seen = projection.project(camera, rotation, translation, turned + pose.translation)
+        pixels_by_pose = (seen.by_point @ by_pose).reshape(-1, 6)
+        end = start + projection.size(camera)
+        information += pixels_by_pose.T @ pixels_by_pose
+        pull[:, start:end] = pixels_by_pose.T @ seen.by_parameters.reshape(-1, end - start)
+        start = end
+    return np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)

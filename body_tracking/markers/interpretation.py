@@ -1,0 +1,261 @@
+"""Which of several ways to see the targets in the points is right, or that it cannot be told.
+
+The cost of a way to see a target is minus twice the logarithm of its likelihood, but for a constant: the squared
+Mahalanobis distance of its points, and a fixed amount for each ball that is not seen. A point is a ball of one target
+at most, so the targets that compete for points are judged together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.observations import Points
+from body_tracking.markers.pose import FEWEST, chi_square_gate, maximum_likelihood, shape_covariance
+from body_tracking.markers.search import Deadline
+from body_tracking.markers.targets import Target
+
+HIDDEN_COST: Final = 20.0
+"""Cost of a ball that is not seen: a point of three dimensions is worse with a probability of 1.7e-4."""
+MARGIN: Final = 9.0
+"""By how much the cost of a second interpretation must be larger: a ratio of the likelihoods of 90."""
+BELIEVED_MARGIN: Final = 40.0
+"""The same for a second interpretation at another place with as many balls that chance does not explain: hardly ever is
+one of them the target and the other nothing, however well they fit."""
+MISSED: Final = 1e-4
+"""Share of right assignments that the test of their fit refuses."""
+MAX_CHANCE: Final = 1e-3
+"""Ways to see a target expected by chance alone, above which one is not believed (the number of false alarms of
+Desolneux, Moisan and Morel 2000)."""
+_SAME: Final = 0.1
+"""Two poses are one interpretation when no ball differs by more than this part of the target's size."""
+_BATCH: Final = 50
+"""Fits between two looks at the clock, half a millisecond."""
+_MOST: Final = 6
+"""Ways to see one target that are compared with those of the others."""
+_MAX_COMBINATIONS: Final = 20_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A way to see a target.
+
+    Attributes:
+        assignment: for each ball its point, -1 for one that is not seen.
+        rotation: (3, 3).
+        translation: (3,) metres.
+        covariance: (6, 6) of the pose.
+        residual: metres.
+        chi_square: of the fit.
+        cost: larger for what is less likely.
+        balls: (k, 3) where the balls are by the pose, metres.
+    """
+
+    assignment: tuple[int, ...]
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    residual: float
+    chi_square: float
+    cost: float
+    balls: FloatArray
+
+
+def fitted(
+    target: Target,
+    points: Points,
+    assignments: Sequence[tuple[int, ...]],
+    deadline: Deadline,
+    missed: float = MISSED,
+) -> list[Candidate]:
+    """Those of the assignments whose points fit the target, each with its pose.
+
+    A part of an assignment that fits is left out: the same with a ball less. Balls nearly on one line give no pose.
+    """
+    by_size: dict[int, list[tuple[int, ...]]] = {}
+    for assignment in dict.fromkeys(assignments):
+        by_size.setdefault(sum(point >= 0 for point in assignment), []).append(assignment)
+    known: list[frozenset[tuple[int, int]]] = []
+    candidates: list[Candidate] = []
+    for size in sorted(by_size, reverse=True):
+        by_balls: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
+        for assignment in by_size[size]:
+            seen = tuple(ball for ball, point in enumerate(assignment) if point >= 0)
+            if not any(frozenset((ball, assignment[ball]) for ball in seen) <= larger for larger in known):
+                by_balls.setdefault(seen, []).append(assignment)
+        for seen, same in by_balls.items():
+            for start in range(0, len(same), _BATCH):
+                deadline.check()
+                for candidate in _fit(target, points, seen, same[start : start + _BATCH], missed):
+                    candidates.append(candidate)
+                    known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
+    return sorted(candidates, key=lambda candidate: candidate.cost)
+
+
+def _fit(
+    target: Target, points: Points, seen: tuple[int, ...], assignments: list[tuple[int, ...]], missed: float
+) -> list[Candidate]:
+    balls = np.array(seen)
+    if not spread(target.points[balls]):
+        return []
+    count, size = len(assignments), len(seen)
+    chosen = np.array(assignments)[:, balls]
+    shape = shape_covariance(target, balls)
+    fits = maximum_likelihood(
+        np.broadcast_to(target.points[balls], (count, size, 3)),
+        points.positions[chosen],
+        points.covariance[chosen],
+        None if shape is None else np.broadcast_to(shape, (count, 3 * size, 3 * size)),
+    )
+    gate = chi_square_gate(3 * size - 6, missed)
+    hidden = HIDDEN_COST * (len(target.points) - size)
+    return [
+        Candidate(
+            assignments[row],
+            fits.rotation[row],
+            fits.translation[row],
+            fits.covariance[row],
+            float(fits.residual[row]),
+            float(fits.chi_square[row]),
+            float(fits.chi_square[row]) + hidden,
+            target.points @ fits.rotation[row].T + fits.translation[row],
+        )
+        for row in np.flatnonzero(fits.chi_square <= gate)
+    ]
+
+
+def expected_by_chance(target: Target, points: Points, candidate: Candidate, poses: float | None = None) -> float:
+    """How many ways to see a target that fit at least as well to expect of points that have nothing to do with it.
+
+    Of points with a density of q per cubic metre, independent of each other, the sets of m points within a squared
+    Mahalanobis distance c of a pose among a volume U of poses are ``q^m U V sqrt(det S / det P)``: V the volume of the
+    ball of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that of the pose. The density
+    is that of the other points within the size of the target, and of one more.
+
+    Args:
+        target: of the candidate.
+        points: of the frame.
+        candidate: with three balls or more.
+        poses: m^3 rad^3, the volume of the poses at which the target may be; when None, all rotations (8 pi^2) at as
+            many cubic metres as the points would fill at that density.
+    """
+    balls = [ball for ball, point in enumerate(candidate.assignment) if point >= 0]
+    chosen = np.array(candidate.assignment)[balls]
+    shape = target.covariance.reshape(len(target.points), 3, len(target.points), 3)[balls, :, balls]
+    noise = points.covariance[chosen] + np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+    size = np.linalg.norm(target.points[:, None] - target.points, axis=2).max()
+    centre = points.positions[chosen].mean(axis=0)
+    near = int((((points.positions - centre) ** 2).sum(axis=1) < size**2).sum())
+    density = (near - len(balls) + 1.0) / (4.0 / 3.0 * math.pi * size**3)
+    volume = 8.0 * math.pi**2 * len(points.positions) / density
+    degrees = 3 * len(balls) - 6
+    logarithm = (
+        math.log(math.comb(len(target.points), len(balls)))
+        + len(balls) * math.log(density)
+        + math.log(volume if poses is None else min(poses, volume))
+        + 0.5 * degrees * math.log(math.pi * max(candidate.chi_square, 1e-9))
+        - math.lgamma(0.5 * degrees + 1.0)
+        + 0.5 * float(np.linalg.slogdet(noise)[1].sum())
+        - 0.5 * float(np.linalg.slogdet(candidate.covariance)[1])
+    )
+    return math.exp(min(logarithm, 100.0))
+
+
+def spread(points: FloatArray, least: float = 0.1) -> bool:
+    """Whether points are wider across their longest direction than this part of their length along it."""
+    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(widths[1] > least * widths[0])
+
+
+def decide(
+    candidates: dict[str, list[Candidate]], believed: Callable[[str, Candidate], bool]
+) -> tuple[dict[str, Candidate], set[str]]:
+    """The likeliest way to see the targets, and the targets for which a second way is nearly as likely.
+
+    Args:
+        candidates: by target, the likeliest first.
+        believed: whether chance does not explain a candidate of a target.
+
+    Returns:
+        The candidates of the targets that are certain, and the names of those that are not.
+    """
+    chosen: dict[str, Candidate] = {}
+    unsure: set[str] = set()
+    for names in _competing(candidates):
+        some = {name: candidates[name][:_MOST] for name in names}
+        if np.prod([len(each) + 1 for each in some.values()]) > _MAX_COMBINATIONS:
+            unsure.update(names)
+            continue
+        combinations = _combinations(some)
+        best, least = min(combinations, key=lambda combination: combination[1])
+        for name in names:
+            own = best[name]
+            if own is None:
+                # seen as something else, though not for sure
+                unsure.add(name)
+                continue
+            others = [(choice[name], cost) for choice, cost in combinations if cost < least + BELIEVED_MARGIN]
+            if not believed(name, own) or any(
+                _rivals(own, other, cost - least, name, believed) for other, cost in others
+            ):
+                unsure.add(name)
+            else:
+                chosen[name] = own
+    return chosen, unsure
+
+
+def _rivals(
+    own: Candidate, other: Candidate | None, more: float, name: str, believed: Callable[[str, Candidate], bool]
+) -> bool:
+    """Whether another way to see the target, at so much more cost, makes it uncertain."""
+    if other is None:
+        return more < MARGIN
+    if _same(own, other):
+        return False
+    # of the same points, the likelihoods tell; points at another place need an explanation, too
+    shared = len(set(own.assignment) & set(other.assignment) - {-1})
+    fewer = other.assignment.count(-1) > own.assignment.count(-1)
+    return more < MARGIN or (shared < FEWEST and not fewer and believed(name, other))
+
+
+def _same(first: Candidate, second: Candidate) -> bool:
+    apart = np.abs(first.balls - second.balls).max()
+    return bool(apart <= _SAME * (first.balls.max(axis=0) - first.balls.min(axis=0)).max())
+
+
+def _competing(candidates: dict[str, list[Candidate]]) -> list[list[str]]:
+    """Groups of targets that want the same points, directly or by others."""
+    groups: list[tuple[list[str], set[int]]] = []
+    for name, each in candidates.items():
+        if not each:
+            continue
+        names, points = [name], {point for candidate in each for point in candidate.assignment if point >= 0}
+        apart = []
+        for group in groups:
+            if group[1] & points:
+                names, points = group[0] + names, group[1] | points
+            else:
+                apart.append(group)
+        groups = [*apart, (names, points)]
+    return [names for names, _ in groups]
+
+
+def _combinations(candidates: dict[str, list[Candidate]]) -> list[tuple[dict[str, Candidate | None], float]]:
+    """All ways to see targets that use each point once at most, with their costs; a target may be seen nowhere."""
+    results: list[tuple[dict[str, Candidate | None], set[int], float]] = [({}, set(), 0.0)]
+    for name, each in candidates.items():
+        nowhere = HIDDEN_COST * len(each[0].assignment)
+        extended: list[tuple[dict[str, Candidate | None], set[int], float]] = []
+        for choice, used, cost in results:
+            extended.append(({**choice, name: None}, used, cost + nowhere))
+            for candidate in each:
+                points = {point for point in candidate.assignment if point >= 0}
+                if not points & used:
+                    extended.append(({**choice, name: candidate}, used | points, cost + candidate.cost))
+        results = extended
+    return [(choice, cost) for choice, _, cost in results]

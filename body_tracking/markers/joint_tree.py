@@ -1,0 +1,223 @@
+"""A tree of targets that joints connect: its posture, and how that depends on coordinates and parameters.
+
+The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``) and
+those of each joint, in their order (:func:`body_tracking.markers.joint_model.step_turns`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.joint_model import (
+    SIZE,
+    Joint,
+    JointKind,
+    nearest_turns,
+    step_turns,
+    turn_axes,
+)
+from body_tracking.markers.pose_table import PoseTable
+
+ROOT: Final = 6
+"""Coordinates of the root target's pose."""
+
+
+class TreeError(BodyTrackingError):
+    """Joints that do not connect targets to one tree."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tree:
+    """The order of a tree.
+
+    Attributes:
+        targets: names, the root first.
+        joints: each after that of its parent.
+        parents: for each joint the index of its parent among the targets; its child has the joint's own index plus one.
+        slices: for each joint its coordinates.
+        size: number of coordinates.
+    """
+
+    targets: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    parents: tuple[int, ...]
+    slices: tuple[slice, ...]
+    size: int
+
+    def with_joints(self, joints: Sequence[Joint]) -> Tree:
+        """The same tree with joints of other numbers."""
+        return replace(self, joints=tuple(joints))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posture:
+    """n postures of a tree.
+
+    Attributes:
+        rotation: (n, 3, 3) and
+        translation: (n, 3) metres: the root target's pose.
+        turns: for each joint (n, 3, 3).
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    turns: tuple[FloatArray, ...]
+
+
+def tree_of(joints: Sequence[Joint]) -> Tree:
+    """The tree that joints make, whatever order they come in.
+
+    Raises:
+        TreeError: no joint, a name twice, a target with two parents, a circle, or several trees.
+    """
+    names = [joint.name for joint in joints]
+    angle_names = [name for joint in joints for name in joint.angle_names]
+    if not joints or len(set(names)) < len(names) or len(set(angle_names)) < len(angle_names):
+        raise TreeError(f"joints {', '.join(names) or 'none'}: each needs a name of its own")
+    children = [joint.child for joint in joints]
+    if len(set(children)) < len(children):
+        raise TreeError(f"targets {', '.join(children)}: one has two parents")
+    roots = sorted({joint.parent for joint in joints} - set(children))
+    if len(roots) != 1:
+        raise TreeError(f"joints {', '.join(names)}: {len(roots)} targets without a parent, expected one")
+    targets, ordered = [roots[0]], list[Joint]()
+    while True:
+        ready = [joint for joint in joints if joint.parent in targets and joint.child not in targets]
+        if not ready:
+            break
+        ordered.append(ready[0])
+        targets.append(ready[0].child)
+    if len(ordered) < len(joints):
+        raise TreeError(f"joints {', '.join(names)}: some make a circle")
+    slices, size = [], ROOT
+    for joint in ordered:
+        slices.append(slice(size, size + joint.kind.coordinates))
+        size += joint.kind.coordinates
+    parents = tuple(targets.index(joint.parent) for joint in ordered)
+    return Tree(tuple(targets), tuple(ordered), parents, tuple(slices), size)
+
+
+def first_posture(tree: Tree, poses: PoseTable, previous: Posture | None = None) -> Posture:
+    """Postures near to measured poses: the first seen target of each frame keeps its pose.
+
+    Where a target is not seen, its joints are turned as in the nearest frame in which they are seen, else as in the
+    previous posture, else as at zero.
+    """
+    n = len(poses)
+    seen = poses.seen
+    turns = []
+    for index, (joint, parent) in enumerate(zip(tree.joints, tree.parents, strict=True)):
+        relative = poses.rotations[:, parent].swapaxes(-1, -2) @ poses.rotations[:, index + 1]
+        measured = nearest_turns(joint.kind, joint.parent_rotation.T @ relative @ joint.child_rotation)
+        both = seen[:, parent] & seen[:, index + 1]
+        if not both.any():
+            measured[:] = nearest_turns(joint.kind, _zero(joint.kind)) if previous is None else previous.turns[index]
+        elif not both.all():
+            known = np.flatnonzero(both)
+            after = np.minimum(np.searchsorted(known, np.arange(n)), len(known) - 1)
+            before = np.maximum(after - 1, 0)
+            later = np.abs(known[after] - np.arange(n)) < np.abs(known[before] - np.arange(n))
+            measured = measured[known[np.where(later, after, before)]]
+        turns.append(measured)
+    posture = Posture(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), tuple(turns))
+    if seen[:, 0].all():
+        return replace(posture, rotation=poses.rotations[:, 0], translation=poses.translations[:, 0])
+    # the whole tree is moved so that the first seen target is where it was measured
+    rotations, translations = place(tree, posture)
+    frames, anchor = np.arange(n), seen.argmax(axis=1)
+    rotation = poses.rotations[frames, anchor] @ rotations[frames, anchor].swapaxes(-1, -2)
+    translation = poses.translations[frames, anchor] - (rotation @ translations[frames, anchor][..., None])[..., 0]
+    return replace(posture, rotation=rotation, translation=translation)
+
+
+def _zero(kind: JointKind) -> FloatArray:
+    if kind is JointKind.UNIVERSAL:
+        return np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]])
+    return np.eye(3)[None]
+
+
+def place(tree: Tree, posture: Posture) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, m, 3, 3) and translations (n, m, 3) of the targets of postures (Gaschler eq. 5.20)."""
+    rotations, translations = [posture.rotation], [posture.translation]
+    for joint, parent, turns in zip(tree.joints, tree.parents, posture.turns, strict=True):
+        rotation = rotations[parent] @ (joint.parent_rotation @ turns @ joint.child_rotation.T)
+        centre = translations[parent] + rotations[parent] @ joint.parent_centre
+        rotations.append(rotation)
+        translations.append(centre - rotation @ joint.child_centre)
+    return np.stack(rotations, axis=1), np.stack(translations, axis=1)
+
+
+def moved(tree: Tree, posture: Posture, steps: FloatArray) -> Posture:
+    """Postures further by (n, size) steps of their coordinates."""
+    return Posture(
+        so3.quat_to_matrix(so3.exp(steps[:, 3:6])) @ posture.rotation,
+        posture.translation + steps[:, :3],
+        tuple(
+            step_turns(joint.kind, turns, steps[:, where])
+            for joint, turns, where in zip(tree.joints, posture.turns, tree.slices, strict=True)
+        ),
+    )
+
+
+def reseated(tree: Tree, posture: Posture, joints: Sequence[Joint]) -> tuple[Tree, Posture]:
+    """The same motion by joints whose frames are turned about z, shifted along it, or have it flipped."""
+    turns = tuple(
+        nearest_turns(
+            new.kind, new.parent_rotation.T @ old.parent_rotation @ turns @ old.child_rotation.T @ new.child_rotation
+        )
+        for old, new, turns in zip(tree.joints, joints, posture.turns, strict=True)
+    )
+    return tree.with_joints(joints), replace(posture, turns=turns)
+
+
+def differentiate(
+    tree: Tree, posture: Posture, rotations: FloatArray, translations: FloatArray, parameters: bool
+) -> FloatArray:
+    """Derivatives of the targets' poses.
+
+    Args:
+        tree: with j joints.
+        posture: n of them.
+        rotations: of :func:`place`.
+        translations: of :func:`place`.
+        parameters: whether those of the joints are wanted.
+
+    Returns:
+        (n, m, 6, size + 12 j) of translation and rotation (w of ``exp(w) @ rotation``) by the coordinates, then by the
+        parameters of each joint as in :attr:`Joint.covariance`; (n, m, 6, size) without parameters.
+    """
+    n, count = len(posture.rotation), len(tree.targets)
+    result = np.zeros((n, count, 6, tree.size + (SIZE * len(tree.joints) if parameters else 0)))
+    result[:, 0, range(6), range(6)] = 1.0
+    for index, (joint, parent, turns) in enumerate(zip(tree.joints, tree.parents, posture.turns, strict=True)):
+        before, child = rotations[:, parent], index + 1
+        frame = before @ joint.parent_rotation
+        by_parent, by_child = result[:, parent], result[:, child]
+        by_child[:, 3:] = by_parent[:, 3:]
+        by_child[:, 3:, tree.slices[index]] = frame @ turn_axes(joint.kind, turns)
+        if parameters:
+            start = tree.size + SIZE * index
+            by_child[:, 3:, start + 3 : start + 6] = before
+            by_child[:, 3:, start + 9 : start + 12] = -rotations[:, child]
+        # centre = parent's translation + parent_arm = child's translation + child_arm
+        parent_arm = so3.skew(before @ joint.parent_centre)
+        child_arm = so3.skew(rotations[:, child] @ joint.child_centre)
+        by_child[:, :3] = by_parent[:, :3] - parent_arm @ by_parent[:, 3:] + child_arm @ by_child[:, 3:]
+        if parameters:
+            by_child[:, :3, start : start + 3] += before
+            by_child[:, :3, start + 6 : start + 9] -= rotations[:, child]
+    return result
+
+
+def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to those that are seen."""
+    turn = so3.log(so3.matrix_to_quat(poses.rotations @ rotations.swapaxes(-1, -2)))
+    result: FloatArray = np.concatenate([poses.translations - translations, turn], axis=-1) * poses.seen[..., None]
+    return result

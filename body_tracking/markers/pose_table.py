@@ -1,0 +1,153 @@
+"""Poses of several targets over time, as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BoolArray, FloatArray
+from body_tracking.markers.observations import TargetPose
+
+
+class PoseTableError(BodyTrackingError):
+    """Poses that do not belong to one instant and frame, or whose numbers are invalid."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseTable:
+    """Poses of m targets in n frames; what is not seen is the identity with a whitening of zeros.
+
+    Attributes:
+        targets: m names.
+        rotations: (n, m, 3, 3) and
+        translations: (n, m, 3) metres.
+        covariance: (n, m, 6, 6) as :attr:`TargetPose.covariance`.
+        whitening: (n, m, 6, 6) W such that ``W.T @ W`` is the inverse of the covariance.
+        seen: (n, m).
+        residuals: (n, m) metres, :attr:`TargetPose.residual`.
+        balls: (n, m) number of balls of the target that are seen.
+    """
+
+    targets: tuple[str, ...]
+    rotations: FloatArray
+    translations: FloatArray
+    covariance: FloatArray
+    whitening: FloatArray
+    seen: BoolArray
+    residuals: FloatArray
+    balls: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+    @property
+    def rigidity(self) -> FloatArray:
+        """(n, m) RMS distance of a target's balls from the target fitted to them, in units of their noise.
+
+        The covariance of the position given the orientation is that of the balls' centroid: a k-th of a ball's. Of the
+        3k coordinates of the balls the pose takes six. NaN where a target is not seen, or by fewer than three balls.
+        """
+        place, turn, mixed = self.covariance[..., :3, :3], self.covariance[..., 3:, 3:], self.covariance[..., :3, 3:]
+        centroid = place - mixed @ np.linalg.solve(turn, mixed.swapaxes(-1, -2))
+        squared = np.trace(centroid, axis1=-2, axis2=-1) * (self.balls - 2.0)
+        usable = self.seen & (self.balls >= 3) & (squared > 0.0)
+        result: FloatArray = np.where(usable, self.residuals / np.sqrt(np.where(usable, squared, 1.0)), np.nan)
+        return result
+
+    def only(self, targets: Sequence[str]) -> PoseTable:
+        """The frames in which all of these targets are seen, and only these targets."""
+        columns = [self.targets.index(target) for target in targets]
+        rows: BoolArray = np.asarray(self.seen[:, columns].all(axis=1))
+        return self._taken(tuple(targets), rows, columns)
+
+    def rows(self, rows: BoolArray) -> PoseTable:
+        """Some of the frames: (n,) whether each is among them."""
+        return self._taken(self.targets, rows, list(range(len(self.targets))))
+
+    def _taken(self, targets: tuple[str, ...], rows: BoolArray, columns: list[int]) -> PoseTable:
+        return PoseTable(
+            targets,
+            self.rotations[rows][:, columns],
+            self.translations[rows][:, columns],
+            self.covariance[rows][:, columns],
+            self.whitening[rows][:, columns],
+            self.seen[rows][:, columns],
+            self.residuals[rows][:, columns],
+            self.balls[rows][:, columns],
+        )
+
+
+def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -> PoseTable:
+    """The poses of these targets, frame by frame; poses of other targets are left out.
+
+    Raises:
+        PoseTableError: no frames, a target twice in a frame, poses of one frame with different stamps or frame_ids,
+            numbers that are not finite, a matrix that is no rotation, a covariance that is not positive definite.
+    """
+    n, m = len(frames), len(targets)
+    if n < 1:
+        raise PoseTableError("poses: no frame")
+    rotations, translations = np.tile(np.eye(3), (n, m, 1, 1)), np.zeros((n, m, 3))
+    covariance = np.tile(np.eye(6), (n, m, 1, 1))
+    seen, residual, balls = np.zeros((n, m), dtype=bool), np.full((n, m), np.nan), np.zeros((n, m))
+    column = {target: index for index, target in enumerate(targets)}
+    for row, frame in enumerate(frames):
+        for pose in frame:
+            index = column.get(pose.name)
+            if index is None:
+                continue
+            where = f"frame {row}, target {pose.name}"
+            if seen[row, index]:
+                raise PoseTableError(f"{where}: twice")
+            first = frame[0]
+            if pose.stamp_ns != first.stamp_ns or pose.frame_id != first.frame_id:
+                raise PoseTableError(
+                    f"{where}: stamp {pose.stamp_ns} in {pose.frame_id!r}, but {first.name} has {first.stamp_ns} in "
+                    f"{first.frame_id!r}"
+                )
+            shapes = pose.rotation.shape, pose.translation.shape, pose.covariance.shape
+            if shapes != ((3, 3), (3,), (6, 6)):
+                raise PoseTableError(f"{where}: rotation, translation, covariance {shapes}")
+            rotations[row, index], translations[row, index] = pose.rotation, pose.translation
+            covariance[row, index] = pose.covariance
+            seen[row, index], residual[row, index] = True, pose.residual
+            balls[row, index] = np.count_nonzero(pose.points >= 0)
+    _check(rotations, translations, covariance, targets)
+    try:
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance)) * seen[..., None, None]
+    except np.linalg.LinAlgError as error:
+        raise PoseTableError(
+            f"{_first_bad(covariance, targets)}: a covariance that is not positive definite"
+        ) from error
+    return PoseTable(
+        tuple(targets),
+        rotations,
+        translations,
+        covariance,
+        whitening,
+        seen,
+        residual,
+        balls,
+    )
+
+
+def _check(rotations: FloatArray, translations: FloatArray, covariance: FloatArray, targets: Sequence[str]) -> None:
+    n, m = rotations.shape[:2]
+    numbers = np.concatenate([rotations.reshape(n, m, 9), translations, covariance.reshape(n, m, 36)], axis=-1)
+    if not np.isfinite(numbers).all():
+        row, index = np.argwhere(~np.isfinite(numbers).all(axis=-1))[0]
+        raise PoseTableError(f"frame {row}, target {targets[index]}: numbers that are not finite")
+    product = rotations @ rotations.swapaxes(-1, -2) - np.eye(3)
+    proper = (np.abs(product).reshape(n, m, 9).max(axis=-1) < 1e-6) & (np.linalg.det(rotations) > 0.0)
+    if not proper.all():
+        row, index = np.argwhere(~proper)[0]
+        raise PoseTableError(f"frame {row}, target {targets[index]}: a matrix that is no rotation")
+
+
+def _first_bad(covariance: FloatArray, targets: Sequence[str]) -> str:
+    least = np.linalg.eigvalsh(covariance)[..., 0]
+    row, index = np.unravel_index(int(least.argmin()), least.shape)
+    return f"frame {row}, target {targets[int(index)]}"

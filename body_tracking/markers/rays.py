@@ -1,0 +1,245 @@
+"""Balls of all cameras as rays in the rig's frame, with what the noise and the calibration leave open of them.
+
+All balls of all cameras stand in one array, so that one numpy call does for them what :class:`Camera` does for one
+camera: with fifteen balls a camera, a call costs more than its numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray, IntArray
+from body_tracking.markers import projection
+from body_tracking.markers.observations import ImageBalls
+from body_tracking.markers.rig import POSE, Rig
+
+_NEWTON: Final = 20
+_CONVERGED: Final = 1e-10
+"""Image coordinates by which a Newton step, which squares the error, may still move: 1e-7 px."""
+_CELLS: Final = 16
+"""Of a camera's image, either way: within one the calibration's influence on a ray is taken as constant."""
+
+
+class TriangulationError(BodyTrackingError):
+    """Balls that do not go with a rig: unknown cameras, wrong shapes, numbers that are not finite."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigRays:
+    """What is the same for all images of a rig.
+
+    Attributes:
+        index: of each camera, by its frame.
+        focal: (c, 2) and
+        centre: (c, 2) pixels.
+        distortion: (8, c) coefficients, zeros where a model has fewer.
+        rotations: (c, 3, 3) and
+        translations: (c, 3) of the rig.
+        positions: (c, 3) the centres of the cameras in the rig's frame.
+        translation_factor: (c, 3, r) what r independent unknowns of variance 1, that make up the calibration's
+            covariance, add to each translation.
+        flat_factor: (c, cells, cells, 2, r) what they add to the image coordinates x/z, y/z of a far point, against
+            those of its pixel, by cells of the image.
+        cell: (c, 2) pixels.
+    """
+
+    index: dict[str, int]
+    focal: FloatArray
+    centre: FloatArray
+    distortion: FloatArray
+    rotations: FloatArray
+    translations: FloatArray
+    positions: FloatArray
+    translation_factor: FloatArray
+    flat_factor: FloatArray
+    cell: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """The balls of all cameras.
+
+    Attributes:
+        cameras: (m,) index of the camera of each ball.
+        balls: (m,) its index among the balls of its camera.
+        flat: (m, 2) x/z and y/z without distortion; NaN where a pixel has no direction.
+        spread: (m, 2, 2) a square root of their covariance by the noise of the centroids.
+        weight: (m, 2, 2) the inverse of their covariance.
+        directions: (m, 3) in the rig's frame, with the length of (x/z, y/z, 1).
+        flat_factor: (m, 2, r) see :class:`RigRays`.
+        first: (c + 1,) index of the first ball of each camera.
+    """
+
+    cameras: IntArray
+    balls: IntArray
+    flat: FloatArray
+    spread: FloatArray
+    weight: FloatArray
+    directions: FloatArray
+    flat_factor: FloatArray
+    first: list[int]
+
+
+@lru_cache(maxsize=8)
+def rig_rays(rig: Rig) -> RigRays:
+    """What is the same for all images of a rig."""
+    cameras = rig.cameras
+    coefficients = np.zeros((8, len(cameras)))
+    for index, camera in enumerate(cameras):
+        coefficients[: len(camera.distortion), index] = camera.distortion
+    factor = _square_root(rig.covariance)
+    starts, count = projection.offsets(rig), factor.shape[1]
+    translation_factor = np.zeros((len(cameras), 3, count))
+    flat_factor = np.zeros((len(cameras), _CELLS, _CELLS, 2, count))
+    cell = np.array([[camera.width / _CELLS, camera.height / _CELLS] for camera in cameras])
+    for index, camera in enumerate(cameras):
+        part = factor[starts[index] : starts[index + 1]]
+        lens, turn, shift = np.split(part, [len(part) - POSE, len(part) - 3])
+        translation_factor[index] = shift + so3.skew(rig.translations[index]) @ turn
+        grid = np.stack(np.meshgrid(*[np.arange(_CELLS) + 0.5] * 2), axis=-1).reshape(-1, 2) * cell[index] - 0.5
+        flat = camera.undistort(grid)
+        _, by_flat, by_lens = projection.by_lens(camera, np.where(np.isfinite(flat), flat, 0.0))
+        x, y = flat.T
+        by_turn = np.stack([-x * y, 1.0 + x * x, -y, -1.0 - y * y, x * y, x], axis=-1).reshape(-1, 2, 3)
+        added = np.linalg.solve(by_flat, by_lens @ lens) + by_turn @ turn
+        flat_factor[index] = np.nan_to_num(added).reshape(_CELLS, _CELLS, 2, count)
+    return RigRays(
+        {camera.frame_id: index for index, camera in enumerate(cameras)},
+        np.array([camera.matrix[[0, 1], [0, 1]] for camera in cameras]),
+        np.array([camera.matrix[:2, 2] for camera in cameras]),
+        coefficients,
+        rig.rotations,
+        rig.translations,
+        -np.einsum("cji,cj->ci", rig.rotations, rig.translations),
+        translation_factor,
+        flat_factor,
+        cell,
+    )
+
+
+def _square_root(covariance: FloatArray) -> FloatArray:
+    """(p, r) with ``root @ root.T`` the covariance, without what has no variance."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    kept = values > 1e-12
+    root: FloatArray = scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return root
+
+
+def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
+    """The balls of one time.
+
+    Raises:
+        TriangulationError: an unknown camera, one twice, other shapes, numbers that are not finite or no covariance.
+    """
+    sorted_images: list[ImageBalls | None] = [None] * len(geometry.index)
+    for image in images:
+        index = geometry.index.get(image.camera)
+        if index is None or sorted_images[index] is not None:
+            raise TriangulationError(
+                f"balls of camera {image.camera}: {'not in the rig' if index is None else 'given twice'}"
+            )
+        count = len(image.pixels)
+        if image.pixels.shape != (count, 2) or image.covariance.shape != (count, 2, 2):
+            raise TriangulationError(
+                f"balls of camera {image.camera}: pixels {image.pixels.shape}, covariance {image.covariance.shape}, "
+                "expected (n, 2) and (n, 2, 2)"
+            )
+        sorted_images[index] = image
+    present = [image for image in sorted_images if image is not None]
+    counts = [0 if image is None else len(image.pixels) for image in sorted_images]
+    first = [0, *np.cumsum(counts).tolist()]
+    pixels = np.concatenate([image.pixels for image in present]) if present else np.zeros((0, 2))
+    covariance = np.concatenate([image.covariance for image in present]) if present else np.zeros((0, 2, 2))
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    if not (np.isfinite(pixels).all() and np.isfinite(covariance).all() and ((xx > 0.0) & (xx * yy > xy * xy)).all()):
+        bad = np.flatnonzero(
+            ~(np.isfinite(pixels).all(axis=-1) & np.isfinite(covariance).all(axis=(1, 2)) & (xx > 0.0))
+            | ~(xx * yy > xy * xy)
+        )[0]
+        camera = int(np.searchsorted(first, bad, side="right")) - 1
+        raise TriangulationError(
+            f"ball {bad - first[camera]} of camera {list(geometry.index)[camera]}: pixels {pixels[bad].tolist()}, "
+            f"covariance {covariance[bad].tolist()}; expected finite numbers and a positive definite covariance"
+        )
+    cameras = np.repeat(np.arange(len(counts)), counts)
+    balls = np.arange(len(pixels)) - np.asarray(first)[cameras]
+    focal = geometry.focal[cameras]
+    flat, jxx, jxy, jyy = _undistort(
+        (pixels - geometry.centre[cameras]) / focal, geometry.distortion[:, cameras], bool(geometry.distortion.any())
+    )
+    # Cholesky's root of the centroid's covariance, brought into image coordinates
+    root = np.zeros((len(pixels), 2, 2))
+    root[:, 0, 0] = np.sqrt(xx)
+    root[:, 1, 0] = xy / root[:, 0, 0]
+    root[:, 1, 1] = np.sqrt(yy - root[:, 1, 0] ** 2)
+    root /= focal[:, :, None]
+    inverse = np.stack([jyy, -jxy, -jxy, jxx], axis=-1).reshape(-1, 2, 2) / (jxx * jyy - jxy * jxy)[:, None, None]
+    spread = inverse @ root
+    a, b, c, d = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 0], spread[:, 1, 1]
+    unspread = np.stack([d, -b, -c, a], axis=-1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
+    directions = flat[:, None, :] @ geometry.rotations[cameras, :2]
+    directions = directions[:, 0] + geometry.rotations[cameras, 2]
+    column = np.clip(((pixels + 0.5) / geometry.cell[cameras]).astype(np.intp), 0, _CELLS - 1)
+    return Rays(
+        cameras,
+        balls,
+        flat,
+        spread,
+        unspread.transpose(0, 2, 1) @ unspread,
+        directions,
+        geometry.flat_factor[cameras, column[:, 1], column[:, 0]],
+        first,
+    )
+
+
+def _undistort(
+    seen: FloatArray, distortion: FloatArray, distorted: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Ideal image coordinates of distorted ones, and the derivative of distortion there (it is symmetric).
+
+    As :meth:`Camera.undistort`, whose conventions it follows, for points of several cameras at once.
+    """
+    one = np.ones(len(seen))
+    if not distorted:
+        return seen, one, np.zeros(len(seen)), one
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    rational, tangential = bool(distortion[5:].any()), bool(distortion[2:4].any())
+    u, v = seen.T
+    x, y = u, v
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON):
+            r2 = x * x + y * y
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3)  # twice the derivative by r2
+            if rational:
+                below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+                radial = radial / below
+                slope = (slope - radial * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * r2 * k6))) / below
+            xs = x * slope
+            jxx, jxy, jyy = radial + x * xs, y * xs, radial + y * y * slope
+            du, dv = u - x * radial, v - y * radial
+            if tangential:
+                cross = 2.0 * x * y
+                du, dv = du - p1 * cross - p2 * (r2 + 2.0 * x * x), dv - p1 * (r2 + 2.0 * y * y) - p2 * cross
+                jxx, jyy = jxx + 2.0 * p1 * y + 6.0 * p2 * x, jyy + 6.0 * p1 * y + 2.0 * p2 * x
+                jxy = jxy + 2.0 * (p1 * x + p2 * y)
+            determinant = jxx * jyy - jxy * jxy
+            dx, dy = (jyy * du - jxy * dv) / determinant, (jxx * dv - jxy * du) / determinant
+            x, y = x + dx, y + dy
+            moved = np.abs(dx) + np.abs(dy)
+            if not (moved > 1e3 * _CONVERGED).any():  # the next step would be the square of this one
+                break
+        # determinant and sign: within the range where the polynomials are monotonic
+        known = (moved < 1e4 * _CONVERGED) & (determinant > 0.0) & (x * u + y * v >= 0.0)
+    flat = np.stack([x, y], axis=-1)
+    flat[~known] = np.nan
+    return flat, jxx, jxy, jyy

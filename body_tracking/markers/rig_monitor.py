@@ -1,0 +1,377 @@
+"""Watches a calibrated rig: tells a camera that was turned from cameras that are out of step.
+
+Both leave balls beside the epipolar lines of their other images. A turned camera shows a constant pattern over the
+image, also for balls at rest; cameras out of step show distances that are proportional to the velocity in the image.
+The signed epipolar distances of one second are explained by either, or by what the calibration leaves open (with its
+covariance as a prior), in a robust fit that bears balls matched with the wrong partner.
+
+Two cameras cannot tell which of them turned about the line that joins them: the finding names both then.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.markers.observations import ImageBalls
+from body_tracking.markers.rays import Rays, TriangulationError, make_rays, rig_rays
+from body_tracking.markers.rig import Rig
+
+_SCALES: Final = (4.0, 2.0, 1.0, 0.5)
+"""Pixels beyond which a distance is an outlier, from the first fit to the last."""
+_PLACE: Final = 5.0
+"""Pixels after which a ball's distance is another, independent one."""
+_RATE: Final = 60.0
+"""Images per second, about."""
+_CUT: Final = 9.0
+"""Squared standard deviations at which the cost of an outlier ends."""
+
+
+class Fault(Enum):
+    """What is wrong with a rig."""
+
+    MOVED_CAMERA = "moved camera"
+    OUT_OF_STEP = "cameras out of step"
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorSettings:
+    """When a fault is told.
+
+    Attributes:
+        window: seconds of images that are looked at.
+        reach: pixels from an epipolar line within which a ball may be the partner when nothing moves.
+        max_delay: longest delay that is looked for, seconds; balls that move are in reach farther away.
+        partners: most balls within reach; a ball with more is left out.
+        noise: standard deviation of an epipolar distance, pixels.
+        jitter: standard deviation of the cameras' capture times, seconds.
+        min_seconds: that the window must hold before anything is told.
+        min_distances: fewest distances in the window.
+        min_turn: least turn that is told, radians.
+        min_delay: least delay that is told, seconds.
+        significance: standard deviations that a turn or delay must exceed.
+        complete: share of the balls that it must bring to a partner's epipolar line.
+        ahead: by which the log likelihood must be better than another cause's.
+    """
+
+    window: float = 0.9
+    reach: float = 6.0
+    max_delay: float = 0.02
+    partners: int = 5
+    noise: float = 0.15
+    jitter: float = 3e-4
+    min_seconds: float = 0.4
+    min_distances: int = 60
+    min_turn: float = 1e-3
+    min_delay: float = 4e-3
+    significance: float = 7.0
+    complete: float = 0.7
+    ahead: float = 6.0
+
+
+_DEFAULT: Final = MonitorSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A fault of a rig.
+
+    Attributes:
+        fault: its kind.
+        cameras: frames of the camera whose fault it is, or of two between which the images do not decide. Of two
+            cameras out of step it is the one that is late.
+        amount: of the turn in radians, or of the delay in seconds.
+        deviation: its standard deviation.
+    """
+
+    fault: Fault
+    cameras: tuple[str, ...]
+    amount: float
+    deviation: float
+
+    def __str__(self) -> str:
+        size = (
+            f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+        )
+        return f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Distances:
+    """Epipolar distances of one time: (n,) pixels, their variance, their share in a place that is new, and derivatives.
+
+    A ball with several partners in reach has several; how many balls there are of the camera that sees fewer.
+    """
+
+    stamp_ns: int
+    distance: FloatArray
+    variance: FloatArray
+    share: FloatArray
+    by_turn: FloatArray
+    by_delay: FloatArray
+    by_calibration: FloatArray
+    balls: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explanation:
+    """A cause fitted to distances: its cost, how many it puts on their lines, the cause (k,), its covariance."""
+
+    cost: float
+    on_line: int
+    cause: FloatArray
+    covariance: FloatArray
+
+    @property
+    def size(self) -> float:
+        """Of a turn its angle, of a delay itself."""
+        return float(np.linalg.norm(self.cause)) if len(self.cause) > 1 else float(self.cause[0])
+
+    @property
+    def significance(self) -> float:
+        """Standard deviations."""
+        return float(np.sqrt(self.cause @ np.linalg.solve(self.covariance, self.cause)))
+
+    @property
+    def deviation(self) -> float:
+        """Of the size."""
+        direction = self.cause / max(float(np.linalg.norm(self.cause)), 1e-12)
+        return float(np.sqrt(direction @ self.covariance @ direction))
+
+
+class RigMonitor:
+    """Collects epipolar distances, and answers what is wrong."""
+
+    def __init__(self, rig: Rig, settings: MonitorSettings = _DEFAULT) -> None:
+        """Watch a rig of two cameras or more."""
+        self._rig, self._settings = rig, settings
+        self._geometry = rig_rays(rig)
+        self._window: deque[_Distances] = deque()
+        self._last: dict[str, ImageBalls] = {}
+
+    def reset(self) -> None:
+        """Forget all images."""
+        self._window.clear()
+        self._last.clear()
+
+    def take(self, balls: Sequence[ImageBalls]) -> None:
+        """Take the balls of one time; velocities come from the images before.
+
+        Raises:
+            TriangulationError: as :func:`body_tracking.markers.triangulation.triangulate`.
+        """
+        rays = make_rays(self._geometry, balls)
+        velocities = np.full((len(rays.balls), 2), np.nan)
+        for image in balls:
+            index = self._geometry.index[image.camera]
+            last = self._last.get(image.camera)
+            if last is not None:
+                velocities[rays.first[index] : rays.first[index + 1]] = _velocities(last, image)
+            self._last[image.camera] = image
+        pixels = np.concatenate([np.zeros((0, 2)), *(b.pixels for b in self._in_order(balls))])
+        count = len(self._rig.cameras)
+        for a in range(count):
+            for b in range(a + 1, count):
+                first, second = self._pairs_in_reach(rays, velocities, a, b)
+                self.add(
+                    balls[0].stamp_ns,
+                    (a, b),
+                    (pixels[first], pixels[second]),
+                    (velocities[first], velocities[second]),
+                )
+
+    def add(
+        self,
+        stamp_ns: int,
+        cameras: tuple[int, int],
+        pixels: tuple[FloatArray, FloatArray],
+        velocities: tuple[FloatArray, FloatArray],
+    ) -> None:
+        """Add corresponding balls of two cameras.
+
+        Args:
+            stamp_ns: capture time; one before the last forgets all images.
+            cameras: their indices in the rig.
+            pixels: (n, 2) in each.
+            velocities: (n, 2) in each, pixels per second; rows with NaN are left out.
+        """
+        if self._window and stamp_ns < self._window[-1].stamp_ns:
+            self._window.clear()
+        known = np.isfinite(velocities[0]).all(axis=-1) & np.isfinite(velocities[1]).all(axis=-1)
+        made = self._distances(
+            stamp_ns, cameras, [each[known] for each in pixels], [each[known] for each in velocities]
+        )
+        self._window.append(made)
+        while stamp_ns - self._window[0].stamp_ns > self._settings.window * NANOSECONDS:
+            self._window.popleft()
+
+    def finding(self) -> Finding | None:
+        """What is wrong, or None: nothing, or nothing that is sure yet."""
+        settings, count = self._settings, len(self._rig.cameras)
+        distance = np.concatenate([np.zeros(0), *(each.distance for each in self._window)])
+        if len(distance) < settings.min_distances:
+            return None
+        passed = self._window[-1].stamp_ns - self._window[0].stamp_ns
+        if passed < settings.min_seconds * NANOSECONDS:
+            return None
+        balls = sum(each.balls for each in self._window)
+        variance = np.concatenate([each.variance for each in self._window])
+        share = np.concatenate([each.share for each in self._window])
+        by_turn = np.concatenate([each.by_turn for each in self._window])
+        by_delay = np.concatenate([each.by_delay for each in self._window])
+        by_calibration = np.concatenate([each.by_calibration for each in self._window])
+        limits = settings.reach / float(self._geometry.focal.mean()), settings.max_delay
+        nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
+        fits: list[tuple[float, Fault, str, _Explanation]] = []
+        for camera in range(count):
+            frame = self._rig.cameras[camera].frame_id
+            turn = by_turn[:, 3 * camera : 3 * camera + 3]
+            turn_fit = _explain(distance, variance, share, by_calibration, turn, limits[0])
+            fits.append((turn_fit.cost, Fault.MOVED_CAMERA, frame, turn_fit))
+            delay_fit = _explain(distance, variance, share, by_calibration, by_delay[:, camera : camera + 1], limits[1])
+            if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, that one is late is that the other is early
+                fits.append((delay_fit.cost, Fault.OUT_OF_STEP, frame, delay_fit))
+        fits.sort(key=lambda fit: fit[0])
+        cost, fault, frame, best = fits[0]
+        least = settings.min_turn if fault is Fault.MOVED_CAMERA else settings.min_delay
+        if best.on_line < settings.complete * balls or best.size < least:
+            return None
+        if nothing.cost - cost < settings.significance**2 or best.significance < settings.significance:
+            return None
+        rivals = [fit for fit in fits[1:] if fit[0] - cost < 2.0 * settings.ahead]
+        if any(rival[1] is not fault for rival in rivals):
+            return None  # not sure yet
+        return Finding(fault, (frame, *(rival[2] for rival in rivals)), best.size, best.deviation)
+
+    def _in_order(self, balls: Sequence[ImageBalls]) -> list[ImageBalls]:
+        return sorted(balls, key=lambda image: self._geometry.index[image.camera])
+
+    def _pairs_in_reach(self, rays: Rays, velocities: FloatArray, a: int, b: int) -> tuple[IntArray, IntArray]:
+        """Balls of two cameras that are within reach of each other's epipolar lines, and of few others'."""
+        geometry = self._geometry
+        of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
+        cross = so3.skew(geometry.positions[b] - geometry.positions[a])
+        by_b = -rays.directions[of_a] @ cross
+        by_a = rays.directions[of_b] @ cross
+        volume = by_b @ rays.directions[of_b].T
+        # a pixel's width in image coordinates, without distortion: this is a coarse gate
+        a_size = np.linalg.norm(by_a @ geometry.rotations[a, :2].T / geometry.focal[a], axis=-1)
+        b_size = np.linalg.norm(by_b @ geometry.rotations[b, :2].T / geometry.focal[b], axis=-1)
+        speed = np.nan_to_num(np.linalg.norm(velocities, axis=-1))
+        reach = self._settings.reach + self._settings.max_delay * np.maximum(speed[of_a, None], speed[None, of_b])
+        near: BoolArray = np.abs(volume) < reach * np.hypot(a_size[None, :], b_size[:, None])
+        most = self._settings.partners
+        near &= (near.sum(axis=0) <= most)[None, :] & (near.sum(axis=1) <= most)[:, None]
+        first, second = np.nonzero(near)
+        return first + of_a.start, second + of_b.start
+
+    def _distances(
+        self, stamp_ns: int, cameras: tuple[int, int], pixels: list[FloatArray], velocities: list[FloatArray]
+    ) -> _Distances:
+        geometry, settings, count = self._geometry, self._settings, len(self._rig.cameras)
+        n = len(pixels[0])
+        if n and pixels[0].shape != pixels[1].shape:
+            raise TriangulationError(f"{pixels[0].shape} and {pixels[1].shape} corresponding pixels")
+        rays = make_rays(
+            geometry,
+            [
+                ImageBalls(
+                    stamp_ns, self._rig.cameras[c].frame_id, p, np.zeros(n), np.broadcast_to(np.eye(2), (n, 2, 2))
+                )
+                for c, p in sorted(zip(cameras, pixels, strict=True))
+            ],
+        )
+        order = (slice(0, n), slice(n, 2 * n)) if cameras[0] < cameras[1] else (slice(n, 2 * n), slice(0, n))
+        baseline = geometry.positions[cameras[1]] - geometry.positions[cameras[0]]
+        cross = so3.skew(baseline)
+        first, second = rays.directions[order[0]], rays.directions[order[1]]
+        by_direction = (second @ cross, -first @ cross)
+        volume = (by_direction[1] * second).sum(axis=-1)
+        by_turn, by_delay = np.zeros((n, 3 * count)), np.zeros((n, count))
+        by_calibration = np.zeros((n, geometry.translation_factor.shape[2]))
+        square, blur = np.zeros(n), np.zeros(n)
+        for side, camera in enumerate(cameras):
+            rotation = geometry.rotations[camera]
+            flat = rays.flat[order[side]]
+            inside = np.concatenate([flat, np.ones((n, 1))], axis=-1)
+            in_camera = by_direction[side] @ rotation.T
+            # a camera turned by w about itself sees a ball elsewhere: its pixel's ray is off by -w x ray, seen as +w
+            by_turn[:, 3 * camera : 3 * camera + 3] = np.cross(inside, in_camera)
+            by_pixel = (in_camera[:, None, :2] @ rays.spread[order[side]])[:, 0]
+            square += (by_pixel**2).sum(axis=-1)
+            moved = (by_pixel * velocities[side]).sum(axis=-1)
+            by_delay[:, camera] = moved
+            blur += moved**2
+            by_calibration -= (in_camera[:, None, :2] @ rays.flat_factor[order[side]])[:, 0]
+        shift = geometry.rotations[cameras[0]].T @ geometry.translation_factor[cameras[0]]
+        shift = shift - geometry.rotations[cameras[1]].T @ geometry.translation_factor[cameras[1]]
+        by_calibration += np.cross(first, second) @ shift
+        scale = 1.0 / np.sqrt(square)
+        good = np.isfinite(volume * scale)
+        # the same ball at the same place says nothing new: its centroid's bias and a wrong partner stay
+        speed = np.minimum(*(np.linalg.norm(each, axis=-1) for each in velocities))
+        repeats = 1.0 + _RATE * np.minimum(settings.window, _PLACE / np.maximum(speed, 1e-3))
+        return _Distances(
+            stamp_ns,
+            (volume * scale)[good],
+            (settings.noise**2 + settings.jitter**2 * blur * scale**2)[good],
+            1.0 / repeats[good],
+            (by_turn * scale[:, None])[good],
+            (by_delay * scale[:, None])[good],
+            (by_calibration * scale[:, None])[good],
+            min((len(np.unique(each[:, 0])) for each in pixels), default=0),
+        )
+
+
+def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
+    """(n, 2) pixels per second of balls whose nearest ball in the image before has none nearer; NaN for others."""
+    velocities = np.full((len(image.pixels), 2), np.nan)
+    passed = (image.stamp_ns - last.stamp_ns) / NANOSECONDS
+    if not len(last.pixels) or not len(image.pixels) or passed <= 0.0:
+        return velocities
+    apart = np.linalg.norm(image.pixels[:, None] - last.pixels[None], axis=-1)
+    nearest, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    rows = np.arange(len(image.pixels))
+    mutual = back[nearest] == rows
+    velocities[mutual] = (image.pixels[mutual] - last.pixels[nearest[mutual]]) / passed
+    return velocities
+
+
+def _explain(
+    distance: FloatArray,
+    variance: FloatArray,
+    share: FloatArray,
+    by_calibration: FloatArray,
+    by_cause: FloatArray,
+    limit: float,
+) -> _Explanation:
+    """Distances (n,) explained by a cause with derivative (n, k) beside what the calibration leaves open.
+
+    The cause has a prior of this deviation about zero: what is larger is out of reach.
+
+    Iteratively reweighted least squares with the weights of Geman and McClure (1987), its scale from wide to narrow.
+    """
+    r, k = by_calibration.shape[1], by_cause.shape[1]
+    derivative = np.concatenate([by_calibration, by_cause], axis=1)
+    prior = np.diag(np.concatenate([np.ones(r), np.full(k, limit**-2)]))
+    unknown, information = np.zeros(r + k), prior
+    for scale in _SCALES:
+        for _ in range(3):
+            left = distance - derivative @ unknown
+            # of balls that move fast, more is no outlier yet
+            width = scale**2 * variance / variance.min() + _CUT * variance
+            weight = share / variance / (1.0 + left**2 / width) ** 2
+            weighted = derivative * weight[:, None]
+            information = prior + weighted.T @ derivative
+            unknown = np.linalg.solve(information, weighted.T @ distance)
+    left = distance - derivative @ unknown
+    cost = float(share @ np.minimum(left**2 / variance, _CUT) + unknown[:r] @ unknown[:r])
+    on_line = int((left**2 < _CUT * variance).sum())
+    return _Explanation(cost, on_line, unknown[r:], np.linalg.inv(information)[r:, r:])

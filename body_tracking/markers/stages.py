@@ -1,0 +1,251 @@
+"""From images to joint angles: the stages of the marker nodes (Gaschler 2011, figure 2.1)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.core.qos import RELIABLE, Qos
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.markers import setup
+from body_tracking.markers.angles import AngleEstimator, ChainAngles
+from body_tracking.markers.chain_files import load_chain
+from body_tracking.markers.codecs import Balls, CameraImage, PoseOfTarget, SpacePoints
+from body_tracking.markers.corrections import centred, pose_sensitivity, well_placed
+from body_tracking.markers.detection import DetectionSettings, detect
+from body_tracking.markers.observations import ImageBalls, Points, TargetPose
+from body_tracking.markers.pairing import FrameSets
+from body_tracking.markers.rig_monitor import RigMonitor
+from body_tracking.markers.rig_storage import load_rig
+from body_tracking.markers.targets_file import load_targets
+from body_tracking.markers.tracking import TargetTracker
+from body_tracking.markers.triangulation import TriangulationSettings, triangulate
+from body_tracking.messages.codecs import Angles
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
+from body_tracking.pipeline.shared import names_in
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+
+_LONGEST_NS: Final = NANOSECONDS // 5
+"""Between two frames whose difference is a rate."""
+CONVENTION: Final = "markers"
+"""What the frame of the angles' headers says."""
+SETUP = Parameter("setup", "", "folder with rig.yaml, targets.yaml and chain.yaml (body_tracking markers)")
+CAMERAS = Parameter(
+    "cameras", (), "names of the cameras, whose /<camera>/image_raw the node takes; empty for those of the setup's rig"
+)
+_IMAGES: Final = Qos(reliability="reliable", depth=10)
+_DETECTION: Final = ("lower", "noise", "least_area", "most_area", "most_balls")
+_TRIANGULATION: Final = ("gate", "nearest", "farthest")
+
+
+def with_rates(found: ChainAngles, last: JointAngles | None) -> JointAngles:
+    """The angles with their rates since the last ones, by the noise of both; unknown at the first."""
+    rates, deviations = np.full_like(found.angles, np.nan), np.full_like(found.angles, np.inf)
+    if last is not None and 0 < found.stamp_ns - last.stamp_ns < _LONGEST_NS:
+        elapsed = (found.stamp_ns - last.stamp_ns) / NANOSECONDS
+        rates = (found.angles - last.position) / elapsed
+        deviations = np.where(np.isfinite(rates), np.sqrt(2.0) * found.noise / elapsed, np.inf)
+    return JointAngles(found.stamp_ns, found.names, found.angles, rates, found.stddev, deviations)
+
+
+class DetectorStage(Stage):
+    """Finds the balls in the images of cameras, the first stage of figure 2.1 of Gaschler (2011)."""
+
+    NAME = "marker_detector"
+    PARAMETERS = (SETUP, CAMERAS, *parameters_from(DetectionSettings, only=_DETECTION, live=True), TRANSPORT)
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self._settings = DetectionSettings(**fields_of(DetectionSettings, values))
+        cameras = names_in(values["cameras"]) or setup.camera_names(Path(str(values["setup"])))
+        self._topics = {setup.image_topic(camera): setup.balls_topic(camera) for camera in cameras}
+        self._counters: Counter[str] = Counter()
+        self.inputs = tuple(Port(topic, CameraImage(), _IMAGES, perishable=True) for topic in self._topics)
+        self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
+
+    def change(self, values: Mapping[str, Value]) -> None:
+        """From the next image on."""
+        self._settings = DetectionSettings(**fields_of(DetectionSettings, values))
+        self.values = values
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        stamp_ns, frame_id, pixels = payload
+        balls = detect(pixels, stamp_ns=stamp_ns, camera=frame_id, settings=self._settings)
+        self._counters["images"] += 1
+        self._counters["images without balls"] += not len(balls.pixels)
+        yield Output(self._topics[topic], balls, stamp_ns)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return self._counters
+
+
+class TriangulationStage(Stage):
+    """Finds the points in space from the balls in the images of a rig."""
+
+    NAME = "marker_triangulation"
+    PARAMETERS = (
+        SETUP,
+        Parameter(
+            "diameter", 0.0, "of the balls; 0: the centroid of a ball's image is taken for its centre", "m", 0.0, 0.2
+        ),
+        Parameter("tolerance", 0.002, "by which the stamps of one set of images may differ", "s", 0.0, 0.1),
+        Parameter("max_wait", 0.03, "how long a set of images waits for a missing one", "s", 0.0, 1.0),
+        *parameters_from(TriangulationSettings, only=_TRIANGULATION, live=True),
+        TRANSPORT,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self.rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
+        self._settings = TriangulationSettings(**fields_of(TriangulationSettings, values))
+        self._monitor = RigMonitor(self.rig)
+        self._diameter = float(str(values["diameter"]))
+        frames = [camera.frame_id for camera in self.rig.cameras]
+        tolerance, wait = float(str(values["tolerance"])), float(str(values["max_wait"]))
+        self._sets: FrameSets[ImageBalls] = FrameSets(frames, round(tolerance * NANOSECONDS), round(wait * NANOSECONDS))
+        self._frames = {setup.balls_topic(frame): frame for frame in frames}
+        self._counters: Counter[str] = Counter()
+        self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True) for topic in self._frames)
+        self.outputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, measured=True),)
+
+    def change(self, values: Mapping[str, Value]) -> None:
+        """From the next images on."""
+        self._settings = TriangulationSettings(**fields_of(TriangulationSettings, values))
+        self.values = values
+
+    def take(self, topic: str, payload: ImageBalls, now: Now) -> Iterable[Output]:
+        return self._points(self._sets.push(self._frames[topic], payload.stamp_ns, payload, now.steady_ns))
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        return self._points(self._sets.poll(steady_ns))
+
+    @property
+    def deadline_ns(self) -> int | None:
+        return self._sets.deadline_ns
+
+    def reset(self, topic: str) -> None:
+        self._sets.reset()
+        self._monitor.reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """A camera that was moved, or one out of step with the others, is named."""
+        finding = self._monitor.finding()
+        return (0, "", {}) if finding is None else (1, str(finding), {})
+
+    def _points(self, sets: Iterable[Mapping[str, ImageBalls]]) -> Iterator[Output]:
+        for frames in sets:
+            balls = tuple(frames.values())
+            self._monitor.take(balls)
+            points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
+            if self._diameter and len(points.positions):
+                balls = centred(self.rig, balls, points, self._diameter)
+                points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
+            yield Output(setup.POINTS, points, points.stamp_ns)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return {**self._counters, "incomplete sets": self._sets.incomplete, "late images": self._sets.late}
+
+
+class TrackerStage(Stage):
+    """Recognises and tracks targets among points."""
+
+    NAME = "rigid_body_tracker"
+    PARAMETERS = (
+        SETUP,
+        Parameter(
+            "deadline", 0.02, "time for one frame, after which the search for targets is given up", "s", 0.001, 1.0
+        ),
+        TRANSPORT,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self.targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
+        self.tracker = TargetTracker(self.targets, deadline=float(str(values["deadline"])))
+        self.inputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, perishable=True),)
+        self.outputs = tuple(
+            Port(setup.pose_topic(target.name), PoseOfTarget(target.name), RELIABLE, measured=True)
+            for target in self.targets
+        )
+
+    def take(self, topic: str, payload: Points, now: Now) -> Iterable[Output]:
+        for pose in self.tracker.update(payload):
+            yield Output(setup.pose_topic(pose.name), pose, pose.stamp_ns)
+
+    def reset(self, topic: str) -> None:
+        self.tracker.reset()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return asdict(self.tracker.counters)
+
+
+class AnglesOfTargetsStage(Stage):
+    """Computes the joint angles of a chain of targets."""
+
+    NAME = "marker_joint_angles"
+    PARAMETERS = (
+        SETUP,
+        Parameter("max_wait", 0.02, "how long the poses of one time wait for that of another target", "s", 0.0, 1.0),
+        TRANSPORT,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        chain = load_chain(setup.file_of(values["setup"], setup.CHAIN, "fit"))
+        self._rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
+        targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
+        self._shapes = {target.name: target for target in targets}
+        self._angles = AngleEstimator(chain)
+        self._sets: FrameSets[TargetPose] = FrameSets(
+            chain.targets, 0, round(float(str(values["max_wait"])) * NANOSECONDS)
+        )
+        self._targets = {setup.pose_topic(target): target for target in chain.targets}
+        self._last: JointAngles | None = None
+        self.inputs = tuple(
+            Port(topic, PoseOfTarget(target), RELIABLE, perishable=True) for topic, target in self._targets.items()
+        )
+        topic = graph.joint_states_topic(setup.BODY)
+        self.outputs = tuple(
+            Port(f"{topic}{suffix}", Angles(setup.BODY, part, lambda: CONVENTION), RELIABLE, measured=not part)
+            for part, suffix in enumerate(("", "_stddev"))
+        )
+
+    def take(self, topic: str, payload: TargetPose, now: Now) -> Iterable[Output]:
+        return self._found(self._sets.push(self._targets[topic], payload.stamp_ns, payload, now.steady_ns))
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        return self._found(self._sets.poll(steady_ns))
+
+    @property
+    def deadline_ns(self) -> int | None:
+        return self._sets.deadline_ns
+
+    def reset(self, topic: str) -> None:
+        self._sets.reset()
+        self._last = None
+
+    def _found(self, sets: Iterable[Mapping[str, TargetPose]]) -> Iterator[Output]:
+        for poses in sets:
+            sensitivities = {
+                name: pose_sensitivity(self._rig, self._shapes[name], pose) for name, pose in poses.items()
+            }
+            found = self._angles.estimate(tuple(poses.values()), sensitivities, self._rig.covariance)
+            angles = with_rates(found, self._last)
+            self._last = angles
+            for port in self.outputs:
+                yield Output(port.topic, angles, angles.stamp_ns)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return {"poses without a partner": self._sets.incomplete}

@@ -1,0 +1,95 @@
+"""The marker system: infrared cameras that see retro-reflective balls on rigid targets."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.core.qos import RELIABLE
+from body_tracking.markers import setup
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.system import (
+    Command,
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    System,
+    TopicSpec,
+    transport,
+)
+
+_STAGES = "body_tracking.markers.stages"
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    if options["marker_setup"]:
+        given = {"setup": options["marker_setup"], **transport(options)}
+        yield NodeSpec("marker_detector", "marker_detector", parameters=given)
+        yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
+        yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
+        yield NodeSpec("marker_joint_angles", "marker_joint_angles", parameters=given)
+
+
+def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
+    if not options["marker_setup"]:
+        return ()
+    cameras = setup.camera_names(Path(str(options["marker_setup"])))
+    for source in setup.sources(cameras):
+        if all(topic in topics for topic in source):
+            return source
+    raise graph.GraphError(f"no topic {' or '.join(source[0] for source in setup.sources(cameras))}")
+
+
+SYSTEM = System(
+    "markers",
+    order=1,
+    nodes=(
+        NodeType("marker_detector", Place.SENSING, f"{_STAGES}:DetectorStage"),
+        NodeType("marker_triangulation", Place.SENSING, f"{_STAGES}:TriangulationStage"),
+        NodeType("rigid_body_tracker", Place.SENSING, f"{_STAGES}:TrackerStage"),
+        NodeType("marker_joint_angles", Place.ANGLES, f"{_STAGES}:AnglesOfTargetsStage"),
+    ),
+    specs=_specs,
+    played=_played,
+    options=(
+        Option(
+            "marker_setup",
+            "",
+            "track infrared markers, with the rig.yaml, targets.yaml and chain.yaml in this folder",
+            "FOLDER",
+            path=True,
+            example="setup",
+        ),
+    ),
+    topics=(
+        TopicSpec(
+            setup.balls_topic("<camera>"),
+            POINT_CLOUD,
+            RELIABLE,
+            "marker_detector",
+            "the balls in an image of `/<camera>/image_raw` (`mono8` or `mono16`): `u v` in pixels, `area`, and "
+            "`uu uv vv`, their covariance",
+        ),
+        TopicSpec(
+            setup.POINTS,
+            POINT_CLOUD,
+            RELIABLE,
+            "marker_triangulation",
+            "the balls in space, in the frame of the rig's first camera, with covariance, and `ball0`, `ball1`, ...: "
+            "which ball of each camera it is",
+        ),
+        TopicSpec(
+            setup.pose_topic("<target>"),
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+            RELIABLE,
+            "rigid_body_tracker",
+            "the pose of a target, in the same frame",
+        ),
+    ),
+    commands=(
+        Command("markers", "body_tracking.recording.marker_commands", "calibrate and use infrared cameras and markers"),
+    ),
+)

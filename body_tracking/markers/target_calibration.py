@@ -1,0 +1,377 @@
+"""The geometry of a target from many views of it (Gaschler 2011, section 4.2), or from a drawing.
+
+The frame of a target has its origin at the centroid of its balls. From views, x points from ball 0 to ball 1, and y
+from that line towards the first further ball that is not near it; from a drawing, the axes are the drawing's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
+from body_tracking.markers.observations import Points
+from body_tracking.markers.pose import FEWEST, chi_square_gate, umeyama
+from body_tracking.markers.recognition import Recogniser
+from body_tracking.markers.targets import Target
+
+_MISSED: Final = 1e-4
+"""Share of right views that are dropped as outliers."""
+_ITERATIONS: Final = 30
+_CONVERGED: Final = 1e-8
+"""Metres."""
+_RIGID: Final = 0.1
+"""Noise of a coordinate, as a part of a target's size, above which its balls do not keep their places."""
+_BENT: Final = 3.0
+"""How much more than its median a flexible target may bend in a view; a person's skin does so in each step."""
+_PROCRUSTES: Final = 10
+"""Iterations of the start."""
+_ON_LINE: Final = 0.1
+"""A ball is near a line when its distance from it is less than this part of the target's size."""
+
+
+class TargetCalibrationError(BodyTrackingError):
+    """The views do not determine the target."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetCalibration:
+    """A target as calibrated.
+
+    Attributes:
+        target: with the covariance of its points; the frame's six degrees of freedom have none.
+        used: (f,) which views were used; the others have too few balls or are outliers.
+        noise: standard deviation of a coordinate, metres: that of the residuals.
+        reduced_chi_square: of the residuals by the covariances that were given, 1 when these are true, or
+            when none were.
+    """
+
+    target: Target
+    used: BoolArray
+    noise: float
+    reduced_chi_square: float
+
+
+def calibrate_target(
+    name: str,
+    views: FloatArray,
+    covariance: FloatArray | None = None,
+    diameter: float = 0.0,
+    flexible: bool = False,
+) -> TargetCalibration:
+    """The most likely points of a target, over its points and its poses in all views (Gaschler 2011, eq. 4.13, 4.19).
+
+    A generalised Procrustes analysis gives the start, Gauss-Newton the maximum; in each step the poses are eliminated
+    (Schur complement), so that the time grows with the number of views only. Views that do not fit are dropped.
+
+    Args:
+        name: of the target.
+        views: (f, k, 3) metres, balls in the same order in all views, NaN for a ball that is not seen.
+        covariance: (f, k, 3, 3) of them; when None, all coordinates have the same noise, which is estimated.
+        diameter: of the balls, metres.
+        flexible: add to the target's covariance how much each ball moves within the target, which is what its
+            residuals have more than the noise; without covariances, all that is more than the stiffest ball has.
+
+    Raises:
+        TargetCalibrationError: wrong shapes, fewer than 3 balls or than 2 views with 3 of them, balls that are hardly
+            seen, balls on one line, or views most of which contradict each other.
+    """
+    views, seen, weights = _checked(name, views, covariance)
+    count, balls = seen.shape
+    enough = seen.sum(axis=1) >= FEWEST
+    shape = _start(name, views, seen, enough)
+    degrees = 3 * seen.sum(axis=1) - 6
+    gates = np.array([chi_square_gate(int(degree), _MISSED) if degree > 0 else 0.0 for degree in degrees])
+    costs, used = np.full(count, np.inf), np.zeros(count, dtype=bool)
+    for _ in range(_ITERATIONS):
+        costs[enough] = _costs(shape, views[enough], seen[enough], weights[enough])
+        # a target that is not quite rigid, or noise that is larger than stated, makes no outliers
+        unit: float = _robust_unit(costs[enough], degrees[enough])
+        unit = unit if covariance is None else max(unit, 1.0)
+        fits = enough & (costs <= (_BENT**2 if flexible else 1.0) * unit * gates)
+        if np.array_equal(fits, used):
+            break
+        used = fits
+        if 2 * used.sum() < enough.sum() or (seen[used].sum(axis=0) < 2).any():
+            raise TargetCalibrationError(
+                f"target {name}: {int(used.sum())} of {int(enough.sum())} views agree; are the balls in the same order?"
+            )
+        fit = _maximise(name, shape, views[used], seen[used], weights[used])
+        shape = fit.shape
+    total = float(costs[used].sum())
+    freedom = int((3 * seen[used].sum(axis=1) - 6).sum()) - (3 * balls - 6)
+    if freedom <= 0:
+        raise TargetCalibrationError(f"target {name}: {int(used.sum())} views are too few")
+    reduced = total / freedom
+    residuals = _residuals(shape, views[used], seen[used], weights[used])
+    noise = float(np.sqrt((residuals**2).sum() / freedom))
+    size = float(np.linalg.norm(shape[:, None] - shape, axis=2).max())
+    if noise > _RIGID * size:
+        raise TargetCalibrationError(
+            f"target {name}: no views agree, balls are off by {1e3 * noise:.1f} mm in a target of {1e3 * size:.0f} mm; "
+            "are they in the same order?"
+        )
+    covariance_of_shape = fit.covariance * (reduced if covariance is None else 1.0)
+    if flexible:
+        flex = _flexibility(residuals, seen[used], None if covariance is None else covariance[used])
+        covariance_of_shape = covariance_of_shape + np.diag(np.repeat(flex, 3))
+    axes = _axes(name, shape)
+    turn = np.kron(np.eye(balls), axes)
+    target = Target(name, shape @ axes.T, turn @ covariance_of_shape @ turn.T, diameter)
+    return TargetCalibration(target, used, noise, 1.0 if covariance is None else reduced)
+
+
+def known_target(name: str, points: FloatArray, stddev: float = 0.0, diameter: float = 0.0) -> Target:
+    """A target whose geometry is known, as from a drawing; its origin moves to the centroid of the balls.
+
+    Args:
+        name: of the target.
+        points: (k, 3) centres of the balls, metres; three or more, not on one line.
+        stddev: of each coordinate as built, metres.
+        diameter: of the balls, metres.
+
+    Raises:
+        TargetCalibrationError: wrong shapes, numbers that are not finite, balls on one line.
+    """
+    points = np.array(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST or not np.isfinite(points).all():
+        raise TargetCalibrationError(f"target {name}: points {points.shape}, expected (k, 3), k 3 or more, all finite")
+    if not (np.isfinite(stddev) and stddev >= 0.0 and np.isfinite(diameter) and diameter >= 0.0):
+        raise TargetCalibrationError(f"target {name}: deviation {stddev:g} m and diameter {diameter:g} m")
+    _check_spread(name, points - points.mean(axis=0))
+    return Target(name, points - points.mean(axis=0), stddev**2 * np.eye(3 * len(points)), diameter)
+
+
+def ordered_views(frames: Sequence[Points], balls: IntArray, first: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Views of one target from unlabelled points: those of the first frame are searched for in all others.
+
+    Gaschler 2011, section 4.2.1: a frame in which they are not found is left out.
+
+    Args:
+        frames: with the target, whose other points may be anything.
+        balls: (k,) index of the target's balls among the points of the first frame.
+        first: index of the first frame.
+
+    Returns:
+        views (f, k, 3) and covariances (f, k, 3, 3) as :func:`calibrate_target` takes them; NaN and zero for balls that
+        are not seen.
+
+    Raises:
+        TargetCalibrationError: fewer than 3 balls, or a point that there is not.
+    """
+    start, chosen = frames[first], np.asarray(balls)
+    if len(set(chosen.tolist())) < FEWEST or chosen.min() < 0 or chosen.max() >= len(start.positions):
+        raise TargetCalibrationError(f"balls {chosen.tolist()} among the {len(start.positions)} points of the frame")
+    size = len(chosen)
+    covariance = np.zeros((size, 3, size, 3))
+    covariance[np.arange(size), :, np.arange(size)] = start.covariance[chosen]
+    points = start.positions[chosen]
+    draft = Target("draft", points - points.mean(axis=0), covariance.reshape(3 * size, 3 * size))
+    recogniser = Recogniser([draft])
+    views, noise = np.full((len(frames), size, 3), np.nan), np.zeros((len(frames), size, 3, 3))
+    for index, frame in enumerate(frames):
+        if index == first:
+            assignment = chosen
+        else:
+            poses = recogniser.recognise(frame).poses
+            if not poses:
+                continue
+            assignment = poses[0].points
+        seen = assignment >= 0
+        views[index, seen] = frame.positions[assignment[seen]]
+        noise[index, seen] = frame.covariance[assignment[seen]]
+    return views, noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    shape: FloatArray
+    covariance: FloatArray
+
+
+def _checked(name: str, views: FloatArray, covariance: FloatArray | None) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Views with zeros for what is not seen, what is seen (f, k), and weights (f, k, 3, 3), zeros for the others."""
+    views = np.array(views, dtype=np.float64)
+    if views.ndim != 3 or views.shape[1] < FEWEST or views.shape[2] != 3 or np.isinf(views).any():
+        raise TargetCalibrationError(
+            f"target {name}: views {views.shape}, expected (f, k, 3), k 3 or more, not infinite"
+        )
+    seen: BoolArray = np.asarray(np.isfinite(views).all(axis=2))
+    usable = seen.sum(axis=1) >= FEWEST
+    if usable.sum() < 2:
+        raise TargetCalibrationError(f"target {name}: {int(usable.sum())} views with 3 balls or more, 2 are needed")
+    rare = np.flatnonzero(seen[usable].sum(axis=0) < 2)
+    if len(rare):
+        raise TargetCalibrationError(f"target {name}: ball {rare[0]} is seen in fewer than 2 views")
+    weights = np.zeros((*seen.shape, 3, 3))
+    if covariance is None:
+        weights[seen] = np.eye(3)
+    else:
+        if covariance.shape != weights.shape:
+            raise TargetCalibrationError(f"target {name}: covariances {covariance.shape}, expected {weights.shape}")
+        noise = covariance[seen]
+        if not np.isfinite(noise).all() or np.linalg.eigvalsh(noise)[:, 0].min() <= 0.0:
+            raise TargetCalibrationError(f"target {name}: a covariance is not positive definite")
+        weights[seen] = np.linalg.inv(noise)
+    views[~seen] = 0.0
+    return views, seen, weights
+
+
+def _start(name: str, views: FloatArray, seen: BoolArray, enough: BoolArray) -> FloatArray:
+    """Points by generalised Procrustes analysis, from the view nearest to the median distances."""
+    balls = seen.shape[1]
+    distances = np.linalg.norm(views[:, :, None] - views[:, None], axis=3)
+    distances[~(seen[:, :, None] & seen[:, None])] = np.nan
+    rows = np.flatnonzero(enough)
+    with np.errstate(all="ignore"):
+        middle = np.nanmedian(distances[rows], axis=0)
+        off = np.nanmean(np.abs(distances[rows] - middle), axis=(1, 2))
+    # the more balls the better, then the more usual
+    first = rows[np.lexsort((off, -seen[rows].sum(axis=1)))[0]]
+    shape, known = np.where(seen[first][:, None], views[first], 0.0), seen[first].copy()
+    for _ in range(_PROCRUSTES):
+        common = seen & known
+        aligned = np.full(views.shape, np.nan)
+        for index in rows[(common[rows].sum(axis=1) >= FEWEST)]:
+            both = common[index]
+            rotation, translation = umeyama(views[index, both][None], shape[both][None], np.ones((1, both.sum())))
+            aligned[index, seen[index]] = views[index, seen[index]] @ rotation[0].T + translation[0]
+        found = np.isfinite(aligned[..., 0]).any(axis=0)
+        shape[found] = np.nanmedian(aligned[:, found], axis=0)
+        known |= found
+    if not known.all():
+        raise TargetCalibrationError(
+            f"target {name}: ball {int(np.flatnonzero(~known)[0])} of {balls} is never seen with three of the others"
+        )
+    _check_spread(name, shape - shape.mean(axis=0))
+    centred: FloatArray = shape - shape.mean(axis=0)
+    return centred
+
+
+def _poses(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The most likely poses of all views."""
+    count = len(views)
+    scalar = np.trace(weights, axis1=2, axis2=3)
+    translation: FloatArray
+    rotation, translation = umeyama(np.broadcast_to(shape, views.shape), views, scalar)
+    jacobian = np.zeros((*seen.shape, 3, 6))
+    jacobian[..., :3] = np.eye(3)
+    for _ in range(_ITERATIONS):
+        turned: FloatArray = shape @ rotation.swapaxes(1, 2)
+        jacobian[..., 3:] = -so3.skew(turned)
+        missing = (views - turned - translation[:, None])[..., None]
+        weighted = (weights @ jacobian).reshape(count, -1, 6).swapaxes(1, 2)
+        information = weighted @ jacobian.reshape(count, -1, 6)
+        step = np.asarray(np.linalg.solve(information, weighted @ missing.reshape(count, -1, 1)))[..., 0]
+        translation += step[:, :3]
+        rotation = so3.quat_to_matrix(so3.exp(step[:, 3:])) @ rotation
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return rotation, translation
+
+
+def _maximise(name: str, shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> _Fit:
+    """The most likely points and their covariance, both without the six degrees of freedom of the frame."""
+    count, balls = seen.shape
+    for _ in range(_ITERATIONS):
+        rotation, translation = _poses(shape, views, seen, weights)
+        turned = shape @ rotation.swapaxes(1, 2)
+        missing = views - turned - translation[:, None]
+        # all in the target's frame: R^T r = R^T y - R^T t - x, so the weights are R^T W R
+        own = rotation[:, None].swapaxes(2, 3) @ weights @ rotation[:, None]
+        residual = missing @ rotation
+        motion = np.zeros((count, balls, 3, 6))
+        motion[..., :3] = np.eye(3)
+        motion[..., 3:] = -so3.skew(np.broadcast_to(shape, views.shape))
+        mixed = (own @ motion).reshape(count, 3 * balls, 6)
+        of_pose = mixed.swapaxes(1, 2) @ motion.reshape(count, 3 * balls, 6)
+        gradient = (own @ residual[..., None]).reshape(count, 3 * balls, 1)
+        of_gradient = motion.reshape(count, 3 * balls, 6).swapaxes(1, 2) @ gradient
+        eliminated = mixed @ np.linalg.inv(of_pose)
+        information = -(eliminated @ mixed.swapaxes(1, 2)).sum(axis=0)
+        diagonal = own.sum(axis=0)
+        for ball in range(balls):
+            information[3 * ball : 3 * ball + 3, 3 * ball : 3 * ball + 3] += diagonal[ball]
+        right = (gradient - eliminated @ of_gradient).sum(axis=0)[:, 0]
+        free = _without_frame(shape)
+        reduced = free.T @ information @ free
+        if np.linalg.cond(reduced) > 1e12:
+            raise TargetCalibrationError(f"target {name}: the views do not determine the places of all balls")
+        covariance: FloatArray = free @ np.linalg.inv(reduced) @ free.T
+        step = (covariance @ right).reshape(balls, 3)
+        shape = shape + step - step.mean(axis=0)
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return _Fit(shape, covariance)
+
+
+def _without_frame(shape: FloatArray) -> FloatArray:
+    """(3k, 3k - 6) an orthonormal basis of the changes of points that neither move nor turn them as a whole."""
+    balls = len(shape)
+    motion = np.zeros((balls, 3, 6))
+    motion[..., :3] = np.eye(3)
+    motion[..., 3:] = -so3.skew(shape)
+    basis: FloatArray = np.linalg.svd(motion.reshape(3 * balls, 6))[0][:, 6:]
+    return basis
+
+
+def _residuals(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> FloatArray:
+    """(f, k, 3) metres in the target's frame, zeros for what is not seen."""
+    rotation, translation = _poses(shape, views, seen, weights)
+    missing = (views - shape @ rotation.swapaxes(1, 2) - translation[:, None]) @ rotation
+    result: FloatArray = np.asarray(np.where(seen[..., None], missing, 0.0))
+    return result
+
+
+def _costs(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> FloatArray:
+    """(f,) squared Mahalanobis distance of each view from the target."""
+    rotation, translation = _poses(shape, views, seen, weights)
+    missing = views - shape @ rotation.swapaxes(1, 2) - translation[:, None]
+    costs: FloatArray = (missing[..., None, :] @ weights @ missing[..., None]).sum(axis=(1, 2, 3))
+    return costs
+
+
+def _robust_unit(costs: FloatArray, degrees: IntArray) -> float:
+    """The variance of a coordinate, by the median of the views' costs."""
+    medians = np.array([chi_square_gate(int(degree), 0.5) for degree in degrees])
+    return float(np.median(costs / medians))
+
+
+def _flexibility(residuals: FloatArray, seen: BoolArray, covariance: FloatArray | None) -> FloatArray:
+    """(k,) variance of a coordinate of each ball beyond its noise.
+
+    The pose takes six of the degrees of freedom of a view, evenly from all its balls.
+    """
+    share = 1.0 - 2.0 / seen.sum(axis=1)
+    squares = ((residuals**2).sum(axis=2)).sum(axis=0) / (3.0 * (share[:, None] * seen).sum(axis=0))
+    if covariance is None:
+        noise = np.full(len(squares), squares.min())
+    else:
+        noise = np.trace(covariance, axis1=2, axis2=3).sum(axis=0) / (3.0 * seen.sum(axis=0))
+    extra: FloatArray = np.maximum(squares - noise, 0.0)
+    return extra
+
+
+def _axes(name: str, shape: FloatArray) -> FloatArray:
+    """(3, 3) the rows are the axes of the target's frame."""
+    x = shape[1] - shape[0]
+    x = x / np.linalg.norm(x)
+    across = shape[2:] - shape[0]
+    across = across - (across @ x)[:, None] * x
+    widths = np.linalg.norm(across, axis=1)
+    size = np.linalg.norm(shape[:, None] - shape, axis=2).max()
+    wide = np.flatnonzero(widths > _ON_LINE * size)
+    third = int(wide[0]) if len(wide) else int(widths.argmax())
+    y = across[third] / widths[third]
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def _check_spread(name: str, points: FloatArray) -> None:
+    widths = np.linalg.svd(points, compute_uv=False)
+    if not widths[1] > 1e-3 * widths[0]:
+        raise TargetCalibrationError(f"target {name}: the balls lie on one line")

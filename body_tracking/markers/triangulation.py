@@ -1,0 +1,348 @@
+"""From balls in images to points in space (Gaschler 3.2): matching along epipolar lines, and triangulation.
+
+Two cameras: the optimal correction of Hartley and Sturm (1997), then one Gauss-Newton step that gives each centroid
+the weight of its covariance. More cameras: weighted least squares over all of a point's rays. The covariance of a
+point is that of the centroids' noise; what the calibration is wrong by is :func:`sensitivity`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
+from body_tracking.markers import hartley_sturm, projection
+from body_tracking.markers.observations import ImageBalls, Points
+from body_tracking.markers.rays import Rays, RigRays, TriangulationError, make_rays, rig_rays
+from body_tracking.markers.rig import Rig
+
+_STEPS: Final = 3
+"""Gauss-Newton steps for three cameras or more: from where two rays meet, each leaves about a thousandth."""
+
+
+@dataclass(frozen=True, slots=True)
+class TriangulationSettings:
+    """What is taken for a ball seen by several cameras.
+
+    Attributes:
+        gate: how far a ball may be from another's epipolar line, or from where other cameras say it is, in standard
+            deviations of noise and calibration.
+        alternatives: most partners of a ball in another camera, the nearest first.
+        nearest: metres before each camera.
+        farthest: metres before each camera.
+    """
+
+    gate: float = 4.0
+    alternatives: int = 3
+    nearest: float = 0.1
+    farthest: float = 20.0
+
+    def __post_init__(self) -> None:
+        if not (self.gate > 0.0 and self.alternatives > 0 and 0.0 < self.nearest < self.farthest):
+            raise TriangulationError(f"{self}: expected positive numbers, nearest before farthest")
+
+
+_DEFAULT: Final = TriangulationSettings()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Balls of two cameras that may be the same: indices among all balls, and their epipolar distances.
+
+    Attributes:
+        first: (n,) and
+        second: (n,) indices.
+        distance: (n,) signed, in standard deviations.
+    """
+
+    first: IntArray
+    second: IntArray
+    distance: FloatArray
+
+
+def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSettings = _DEFAULT) -> Points:
+    """The points that the cameras of a rig see at one time.
+
+    A ball on several others' epipolar lines belongs to several points: where three cameras or more agree on a point,
+    it takes its balls; otherwise all alternatives are given, and share indices in :attr:`Points.balls`.
+
+    Args:
+        rig: the cameras.
+        balls: of the cameras, at the same time; cameras may be missing.
+        settings: what is taken for a ball.
+
+    Returns:
+        Points in the frame of the rig's first camera, with the stamp of the first image.
+
+    Raises:
+        TriangulationError: no images, an unknown camera, one twice, other shapes, or numbers that are not finite.
+    """
+    if not balls:
+        raise TriangulationError("no images to triangulate from")
+    geometry = rig_rays(rig)
+    rays = make_rays(geometry, balls)
+    count = len(rig.cameras)
+    found = [(a, b, epipolar_pairs(geometry, rays, a, b, settings)) for a in range(count) for b in range(a + 1, count)]
+    members = np.full((sum(len(pairs.first) for _, _, pairs in found), count), -1, dtype=np.intp)
+    positions, row = np.zeros((len(members), 3)), 0
+    for a, b, pairs in found:
+        rows = slice(row, row + len(pairs.first))
+        members[rows, a], members[rows, b] = pairs.first, pairs.second
+        positions[rows] = _two_rays(geometry, rays, a, b, pairs, optimal=count == 2)
+        row = rows.stop
+    near = _in_range(geometry, positions, members >= 0, settings)
+    members, positions = members[near], positions[near]
+    if count == 2:
+        positions, covariance = _refined(geometry, rays, members, positions, 1)
+    else:
+        members, positions, covariance = _agreed(geometry, rays, members, positions, settings)
+    indices = np.where(members >= 0, rays.balls[members] if len(rays.balls) else -1, -1)
+    return Points(balls[0].stamp_ns, rig.cameras[0].frame_id, positions, covariance, indices)
+
+
+def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: TriangulationSettings) -> Pairs:
+    """Balls of cameras a and b within the gate of each other's epipolar lines, few enough for each ball of both."""
+    of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
+    baseline = geometry.positions[b] - geometry.positions[a]
+    # the volume that two rays span with the baseline b, d_b . (b x d_a), and its derivative by either direction
+    cross = so3.skew(baseline)
+    by_b = -rays.directions[of_a] @ cross
+    by_a = rays.directions[of_b] @ cross
+    volume = by_b @ rays.directions[of_b].T
+    a_plane, b_plane = geometry.rotations[a, :2].T, geometry.rotations[b, :2].T  # (3, 2) of image coordinates
+    by_a_flat, by_b_flat = by_a @ a_plane, by_b @ b_plane  # (width, 2), (height, 2)
+    a_noise = (by_a_flat @ rays.spread[of_a]).transpose(1, 0, 2)  # (n_b, 2) x (n_a, 2, 2)
+    b_noise = by_b_flat @ rays.spread[of_b]  # (n_b, n_a, 2)
+    variance = (a_noise**2).sum(axis=-1).T + (b_noise**2).sum(axis=-1).T
+    if geometry.translation_factor.shape[2]:
+        # a pixel that stays moves its ray against what moves a point's image
+        a_moves = by_a_flat @ rays.flat_factor[of_a]  # (n_a, n_b, r)
+        b_moves = (by_b_flat @ rays.flat_factor[of_b]).transpose(1, 0, 2)
+        shift = geometry.rotations[a].T @ geometry.translation_factor[a]
+        shift = shift - geometry.rotations[b].T @ geometry.translation_factor[b]  # (3, r) of the baseline
+        across = (rays.directions[of_a] @ (so3.skew(rays.directions[of_b]) @ shift)).transpose(1, 0, 2)
+        moves = across - a_moves - b_moves
+        variance += (moves**2).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        distance = volume / np.sqrt(variance)
+    size = np.where(np.isfinite(distance), np.abs(distance), np.inf)
+    good = size < settings.gate
+    if max(good.sum(axis=0).max(initial=0), good.sum(axis=1).max(initial=0)) > settings.alternatives:
+        # the nearest few of each ball of both
+        by_row = np.argsort(np.argsort(size, axis=1), axis=1) < settings.alternatives
+        by_column = np.argsort(np.argsort(size, axis=0), axis=0) < settings.alternatives
+        good &= by_row & by_column
+    first, second = np.nonzero(good)
+    return Pairs(first + of_a.start, second + of_b.start, distance[first, second])
+
+
+def _two_rays(geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optimal: bool) -> FloatArray:
+    """(n, 3) where two rays meet: after their optimal correction, or where they pass each other."""
+    if not len(pairs.first):
+        return np.zeros((0, 3))
+    flat_a, flat_b = rays.flat[pairs.first], rays.flat[pairs.second]
+    first, second = rays.directions[pairs.first], rays.directions[pairs.second]
+    if optimal:
+        both = [a, b]
+        focal, centre = geometry.focal[both], geometry.centre[both]
+        matrix, *epipoles = hartley_sturm.fundamental(
+            geometry.rotations[both], geometry.translations[both], focal, centre
+        )
+        one, other = hartley_sturm.correct(
+            matrix, (epipoles[0], epipoles[1]), flat_a * focal[0] + centre[0], flat_b * focal[1] + centre[1]
+        )
+        first = _directions(geometry, a, (one - centre[0]) / focal[0])
+        second = _directions(geometry, b, (other - centre[1]) / focal[1])
+    # least squares over the two lengths: rays that meet meet there, others are nearest there
+    baseline = geometry.positions[b] - geometry.positions[a]
+    ff, fs, ss = (first * first).sum(axis=-1), (first * second).sum(axis=-1), (second * second).sum(axis=-1)
+    fb, sb = first @ baseline, second @ baseline
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = ff * ss - fs * fs
+        along, other_along = (ss * fb - fs * sb) / determinant, (fs * fb - ff * sb) / determinant
+    middle = geometry.positions[a] + along[:, None] * first
+    middle = 0.5 * (middle + geometry.positions[b] + other_along[:, None] * second)
+    # behind the cameras, parallel rays: NaN, which no range contains
+    good = (along > 0.0) & (other_along > 0.0)
+    return np.where(good[:, None], middle, np.nan)
+
+
+def _directions(geometry: RigRays, camera: int, flat: FloatArray) -> FloatArray:
+    turn = geometry.rotations[camera]
+    directions: FloatArray = flat @ turn[:2] + turn[2]
+    return directions
+
+
+def _in_range(geometry: RigRays, positions: FloatArray, seen: BoolArray, settings: TriangulationSettings) -> BoolArray:
+    """(n,) which points are in the range of all cameras that see them."""
+    depth = positions @ geometry.rotations[:, 2].T + geometry.translations[:, 2]
+    return np.asarray((~seen | ((depth > settings.nearest) & (depth < settings.farthest))).all(axis=1))
+
+
+def _refined(
+    geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray, steps: int
+) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) after Gauss-Newton on reprojection errors with the centroids' weights, and covariance (n, 3, 3)."""
+    if not len(members):
+        return np.zeros((0, 3)), np.zeros((0, 3, 3))
+    weight = np.where((members >= 0)[:, :, None, None], rays.weight[members], 0.0)
+    flat = np.where((members >= 0)[:, :, None], rays.flat[members], 0.0)
+    for _ in range(steps):
+        made, by_point = _projected(geometry, positions)
+        weighted = by_point.transpose(0, 1, 3, 2) @ weight  # (n, c, 3, 2)
+        information = (weighted @ by_point).sum(axis=1)
+        gradient = (weighted @ (flat - made)[..., None]).sum(axis=1)
+        covariance = np.linalg.inv(information)
+        positions = positions + (covariance @ gradient)[:, :, 0]
+    return positions, covariance
+
+
+def _projected(geometry: RigRays, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Image coordinates (n, c, 2) of points in all cameras, and their derivative (n, c, 2, 3) by the points."""
+    inside = (geometry.rotations @ positions[:, None, :, None])[..., 0] + geometry.translations
+    depth = inside[..., 2:]
+    flat = inside[..., :2] / depth
+    by_point = (geometry.rotations[:, :2] - flat[..., None] * geometry.rotations[:, 2:]) / depth[..., None]
+    return flat, by_point
+
+
+def _agreed(
+    geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray, settings: TriangulationSettings
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Points of three cameras or more: pairs of balls, completed by where the other cameras should see the point.
+
+    What three cameras agree on takes its balls, those that most cameras agree on and then the most likely first.
+    """
+    positions, covariance = _refined(geometry, rays, members, positions, 1)
+    members = _completed(geometry, rays, members, positions, covariance, settings)
+    if len(members):
+        members, kept = np.unique(members, axis=0, return_index=True)
+        positions = positions[kept]
+    positions, covariance = _refined(geometry, rays, members, positions, _STEPS)
+    near = _in_range(geometry, positions, members >= 0, settings)
+    members, positions, covariance = members[near], positions[near], covariance[near]
+    views = (members >= 0).sum(axis=1)
+    errors = _errors(geometry, rays, members, positions)
+    free = np.ones(len(rays.balls) + 1, dtype=np.bool_)  # the last for balls that are not there
+    chosen = []
+    for row in np.lexsort((errors / np.maximum(views, 1), -views)):
+        mine = members[row]
+        if free[mine].all():
+            chosen.append(row)
+            if views[row] > 2:
+                free[mine[mine >= 0]] = False
+    order = np.array(sorted(chosen), dtype=np.intp)
+    return members[order], positions[order], covariance[order]
+
+
+def _completed(
+    geometry: RigRays,
+    rays: Rays,
+    members: IntArray,
+    positions: FloatArray,
+    covariance: FloatArray,
+    settings: TriangulationSettings,
+) -> IntArray:
+    """Members (n, c) with the most likely ball of each other camera, where one is within the gate."""
+    members = np.array(members)
+    if not len(members):
+        return members
+    made, by_point = _projected(geometry, positions)
+    depth = positions @ geometry.rotations[:, 2].T + geometry.translations[:, 2]  # (n, c)
+    # derivative of the point by the calibration's unknowns, through the balls that it comes from
+    pulls = np.zeros((len(members), 3, geometry.translation_factor.shape[2]))
+    for camera in range(members.shape[1]):
+        rows = np.flatnonzero(members[:, camera] >= 0)
+        mine = members[rows, camera]
+        moves = _moves(geometry, rays, mine, camera, made[rows, camera], depth[rows, camera])
+        pulls[rows] -= by_point[rows, camera].transpose(0, 2, 1) @ rays.weight[mine] @ moves
+    pulls = covariance @ pulls
+    completed = np.array(members)
+    for camera in range(members.shape[1]):
+        rows = np.flatnonzero((members[:, camera] < 0) & (depth[:, camera] > settings.nearest))
+        balls = np.arange(rays.first[camera], rays.first[camera + 1])
+        if not len(rows) or not len(balls):
+            continue
+        derivative = by_point[rows, camera]
+        root = derivative @ np.linalg.cholesky(covariance[rows])
+        spread = rays.spread[balls]
+        variance = (root @ root.transpose(0, 2, 1))[:, None] + spread @ spread.transpose(0, 2, 1)
+        if pulls.shape[2]:
+            moves = _moves(
+                geometry,
+                rays,
+                np.tile(balls, len(rows)),
+                camera,
+                np.repeat(made[rows, camera], len(balls), axis=0),
+                np.repeat(depth[rows, camera], len(balls)),
+            ).reshape(len(rows), len(balls), 2, -1)
+            moves = moves + (derivative @ pulls[rows])[:, None]
+            variance = variance + moves @ moves.transpose(0, 1, 3, 2)
+        missed = rays.flat[balls] - made[rows, camera][:, None]
+        likely = (missed[:, :, None] @ np.linalg.solve(variance, missed[..., None]))[..., 0, 0]
+        likely = np.where(np.isfinite(likely), likely, np.inf)
+        best = likely.argmin(axis=1)
+        good = likely[np.arange(len(rows)), best] < settings.gate**2
+        completed[rows[good], camera] = balls[best[good]]
+    return completed
+
+
+def _moves(
+    geometry: RigRays, rays: Rays, balls: IntArray, camera: int, flat: FloatArray, depth: FloatArray
+) -> FloatArray:
+    """(n, 2, r) what the calibration's unknowns add to a point's image in a camera, against the ball's pixel."""
+    shift = geometry.translation_factor[camera]
+    result: FloatArray = (
+        rays.flat_factor[balls] + (shift[None, :2] - flat[:, :, None] * shift[None, 2:]) / depth[:, None, None]
+    )
+    return result
+
+
+def _errors(geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray) -> FloatArray:
+    """(n,) sums of squared reprojection errors, in standard deviations."""
+    if not len(members):
+        return np.zeros(0)
+    made, _ = _projected(geometry, positions)
+    missed = np.where((members >= 0)[:, :, None], rays.flat[members] - made, 0.0)
+    errors: FloatArray = (missed[:, :, None] @ rays.weight[members] @ missed[..., None])[..., 0, 0].sum(axis=1)
+    return errors
+
+
+def sensitivity(rig: Rig, positions: FloatArray, seen: BoolArray | None = None) -> FloatArray:
+    """How triangulated points move when the calibration's parameters are larger and the pixels stay.
+
+    By the implicit function of the least squares problem at residuals of zero: with J the derivative of the pixels by
+    the point, and D by the parameters, it is ``-inv(J' J) J' D``. The calibration's part of the covariance of all
+    points together is ``S @ rig.covariance @ S.T`` for S of shape (3 n, p).
+
+    Args:
+        rig: the cameras.
+        positions: (n, 3) in the rig's frame, metres, in front of the cameras that see them.
+        seen: (n, c) which cameras see which point, ``points.balls >= 0``; all of them unless given.
+
+    Returns:
+        (n, 3, p) metres per unit of each parameter of :class:`Rig`.
+
+    Raises:
+        TriangulationError: other shapes, a point that fewer than two cameras see or that is not in front of them.
+    """
+    count = len(rig.cameras)
+    seen = np.ones((len(positions), count), dtype=np.bool_) if seen is None else seen
+    if positions.shape != (len(positions), 3) or seen.shape != (len(positions), count):
+        raise TriangulationError(f"positions {positions.shape}, seen {seen.shape}; expected (n, 3), (n, {count})")
+    starts = projection.offsets(rig)
+    information, pulls = np.zeros((len(positions), 3, 3)), np.zeros((len(positions), 3, rig.size))
+    for index, camera in enumerate(rig.cameras):
+        made = projection.project(camera, rig.rotations[index], rig.translations[index], positions)
+        if not np.isfinite(made.pixels[seen[:, index]]).all():
+            raise TriangulationError(f"a point behind camera {camera.frame_id}, which is to see it, or not finite")
+        turned = np.where(seen[:, index, None, None], made.by_point, 0.0).transpose(0, 2, 1)
+        information += turned @ np.where(np.isfinite(made.by_point), made.by_point, 0.0)
+        pulls[:, :, starts[index] : starts[index + 1]] = turned @ np.nan_to_num(made.by_parameters)
+    if (seen.sum(axis=1) < 2).any():
+        raise TriangulationError("a point that fewer than two cameras see has no position")
+    return -np.asarray(np.linalg.solve(information, pulls), dtype=np.float64)

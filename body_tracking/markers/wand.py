@@ -1,0 +1,279 @@
+"""Calibration of the poses of many cameras by a wand that is waved: balls in a row, at known distances.
+
+The essential matrix of two cameras gives their poses to each other but for the scale, which the wand's length gives
+(Hartley and Zisserman 2004, section 9.6); a bundle adjustment over the cameras and the places of the balls fits
+everything together. The cameras' lenses are known, from boards, and may be refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
+from body_tracking.markers import bundle, projection
+from body_tracking.markers.bundle_points import AdjustedPoints, Lengths, Sightings, adjust_points
+from body_tracking.markers.rig import Rig
+
+MIN_SHARED: Final = 20
+"""Balls that two cameras see at the same time; eight determine the essential matrix."""
+_OUTLIER: Final = (5.0, 0.5)
+"""A sighting is left out whose residual exceeds so many times the median and so many pixels."""
+_ROUNDS: Final = 3
+_RANSAC: Final = (0.9999, 2.0)
+"""Probability of success, and pixels from an epipolar line."""
+_CV: Any = cv2
+
+
+class WandError(BodyTrackingError):
+    """A wand that is none, or cameras that did not see enough of it together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wand:
+    """Balls in a row.
+
+    Attributes:
+        places: of the balls along the wand, metres, rising from 0; two balls or more.
+        deviation: standard deviation of its length; the scale of the rig inherits it.
+
+    Raises:
+        WandError: places that do not rise from 0, or no deviation.
+    """
+
+    places: tuple[float, ...]
+    deviation: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if len(self.places) < 2 or self.places[0] != 0.0 or not (np.diff(self.places) > 0.0).all():
+            raise WandError(f"balls at {self.places} m along the wand; expected two or more that rise from 0")
+        if not 0.0 < self.deviation < np.inf:
+            raise WandError(f"deviation {self.deviation} m of the wand's length, expected a positive one")
+
+    def lengths(self) -> Lengths:
+        """The distances of all pairs of balls."""
+        first, second = np.triu_indices(len(self.places), 1)
+        places = np.asarray(self.places)
+        return Lengths(np.stack([first, second], axis=-1), places[second] - places[first], self.deviation)
+
+    def order(self, pixels: FloatArray) -> IntArray | None:
+        """Which of three balls in an image is which of the wand's; None where they are in no row.
+
+        The two distances must differ by more than the depth varies along the wand in the image.
+
+        Args:
+            pixels: (3, 2) in any order.
+
+        Returns:
+            (3,) indices: ``pixels[order]`` are the balls in the order of the wand.
+
+        Raises:
+            WandError: the wand has not three balls, or they are spaced evenly; or other shapes.
+        """
+        if len(self.places) != 3 or pixels.shape != (3, 2):
+            raise WandError(f"{len(self.places)} balls of the wand, pixels {pixels.shape}; expected 3 and (3, 2)")
+        first, second = np.diff(self.places)
+        if 0.8 < first / second < 1.25:
+            raise WandError("balls of the wand at even distances have no order")
+        apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
+        middle = int(apart.sum(axis=0).argmin())
+        ends = [index for index in range(3) if index != middle]
+        along, aside = pixels[ends] - pixels[middle]
+        area = abs(along[0] * aside[1] - along[1] * aside[0])
+        if area > 0.05 * np.linalg.norm(along) * np.linalg.norm(aside) or along @ aside >= 0.0:
+            return None
+        if (np.linalg.norm(along) < np.linalg.norm(aside)) != bool(first < second):
+            ends.reverse()
+        return np.array([ends[0], middle, ends[1]], dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WandCalibration:
+    """A rig calibrated by a wand.
+
+    Attributes:
+        rig: with its covariance, that of the wand's length included.
+        adjusted: the bundle adjustment.
+        used: (m,) which sightings it used.
+    """
+
+    rig: Rig
+    adjusted: AdjustedPoints
+    used: BoolArray
+
+
+def calibrate_wand(
+    cameras: Sequence[Camera],
+    seen: Sightings,
+    wand: Wand,
+    coefficients: tuple[int, ...] | None = None,
+    noise: float = 0.1,
+) -> WandCalibration:
+    """Calibrate the poses of cameras to each other.
+
+    Args:
+        cameras: two or more, with known lenses; the first one's frame is the rig's.
+        seen: balls of the wand, whose points are numbered along it.
+        wand: the wand.
+        coefficients: of the distortion that are fitted again with the cameras' matrices; None keeps the lenses.
+        noise: expected standard deviation of a ball's coordinate in an image, pixels.
+
+    Raises:
+        WandError: numbers that are not finite, unknown cameras or balls, cameras that share too few sightings.
+    """
+    _check(cameras, seen, wand)
+    flat, lengths = _flat(cameras, seen), wand.lengths()
+    rotations, translations = _camera_poses(cameras, seen, flat, lengths)
+    size = sum(projection.size(camera) for camera in cameras)
+    rig = Rig(tuple(cameras), rotations, translations, np.zeros((size, size)))
+    free = bundle.free_parameters(rig, coefficients)
+    used: BoolArray = np.asarray(np.isfinite(flat).all(axis=-1))
+    for last in (index == _ROUNDS - 1 for index in range(_ROUNDS)):
+        used = used & (_counts(seen, used) >= 2)
+        points = intersect(rig, seen.where(used), len(wand.places), flat[used])
+        in_front = np.isfinite(_pixels(rig, seen, points)).all(axis=-1)
+        used &= in_front
+        used &= _counts(seen, used) >= 2
+        adjusted = adjust_points(rig, points, seen.where(used), lengths, free, noise)
+        rig = adjusted.rig
+        errors = np.linalg.norm(adjusted.residuals, axis=-1)
+        wrong = errors > max(_OUTLIER[0] * float(np.median(errors)), _OUTLIER[1])
+        if not wrong.any() or last:
+            break
+        used[np.flatnonzero(used)[wrong]] = False
+    # what the wand's length is wrong by is the same in all images, and scales the rig
+    scaled = np.zeros(rig.size)
+    for index, end in enumerate(projection.offsets(rig)[1:]):
+        scaled[end - 3 : end] = rig.translations[index] * wand.deviation / wand.places[-1]
+    rig = replace(rig, covariance=rig.covariance + np.outer(scaled, scaled))
+    return WandCalibration(rig, adjusted, used)
+
+
+def intersect(rig: Rig, seen: Sightings, points: int, flat: FloatArray | None = None) -> FloatArray:
+    """Points nearest to their rays, for the start of an adjustment.
+
+    Args:
+        rig: the cameras.
+        seen: (m) sightings.
+        points: number of points of the object.
+        flat: (m, 2) image coordinates without distortion, where they are known already.
+
+    Returns:
+        (v, points, 3) metres; zeros for a point that fewer than two rays go through.
+    """
+    flat = _flat(rig.cameras, seen) if flat is None else flat
+    rays = np.concatenate([flat, np.ones_like(flat[:, :1])], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    turns = rig.rotations[seen.cameras].transpose(0, 2, 1)
+    rays = (turns @ rays[:, :, None])[:, :, 0]
+    centres = -(turns @ rig.translations[seen.cameras][:, :, None])
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    views = int(seen.views.max(initial=-1)) + 1
+    information, right = np.zeros((views, points, 3, 3)), np.zeros((views, points, 3))
+    np.add.at(information, (seen.views, seen.points), across)
+    np.add.at(right, (seen.views, seen.points), (across @ centres)[:, :, 0])
+    known = np.linalg.eigvalsh(information)[..., 0] > 1e-6
+    result = np.zeros((views, points, 3))
+    result[known] = np.linalg.solve(information[known], right[known][:, :, None])[:, :, 0]
+    return result
+
+
+def _check(cameras: Sequence[Camera], seen: Sightings, wand: Wand) -> None:
+    if len(cameras) < 2 or not len(seen.pixels):
+        raise WandError(f"{len(cameras)} cameras, {len(seen.pixels)} sightings; a wand needs two cameras that see it")
+    if not np.isfinite(seen.pixels).all() or min(seen.cameras.min(), seen.points.min(), seen.views.min()) < 0:
+        raise WandError("a pixel is not finite, or an index negative")
+    if seen.cameras.max() >= len(cameras) or seen.points.max() >= len(wand.places):
+        raise WandError(
+            f"camera {seen.cameras.max()} of {len(cameras)}, ball {seen.points.max()} of {len(wand.places)}"
+        )
+
+
+def _counts(seen: Sightings, used: BoolArray) -> IntArray:
+    """(m,) how many cameras see the ball of each sighting, by the sightings that are used."""
+    key = seen.views * (int(seen.points.max()) + 1) + seen.points
+    counts: IntArray = np.bincount(key[used], minlength=int(key.max()) + 1)[key]
+    return counts
+
+
+def _flat(cameras: Sequence[Camera], seen: Sightings) -> FloatArray:
+    flat = np.empty_like(seen.pixels)
+    for index, camera in enumerate(cameras):
+        rows = seen.cameras == index
+        flat[rows] = camera.undistort(seen.pixels[rows])
+    return flat
+
+
+def _pixels(rig: Rig, seen: Sightings, points: FloatArray) -> FloatArray:
+    """(m, 2) where each sighting's ball should be; NaN behind the camera, and for balls beyond the points."""
+    inside = seen.views < len(points)
+    places = np.where(inside[:, None], points[np.where(inside, seen.views, 0), seen.points], np.nan)
+    pixels: FloatArray = rig.project(places)[seen.cameras, np.arange(len(places))]
+    return pixels
+
+
+def _camera_poses(
+    cameras: Sequence[Camera], seen: Sightings, flat: FloatArray, lengths: Lengths
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (c, 3, 3), (c, 3) from the first camera on, along pairs that share most sightings."""
+    keys = (seen.views * (int(seen.points.max()) + 1) + seen.points).tolist()
+    rows: list[dict[int, int]] = [{} for _ in cameras]
+    for row, (camera, key) in enumerate(zip(seen.cameras.tolist(), keys, strict=True)):
+        if np.isfinite(flat[row]).all():
+            rows[camera][key] = row
+    rotations, translations = np.tile(np.eye(3), (len(cameras), 1, 1)), np.zeros((len(cameras), 3))
+    known, rest = [0], set(range(1, len(cameras)))
+    while rest:
+        shared, a, b = max((len(rows[a].keys() & rows[b].keys()), a, b) for a in known for b in rest)
+        if shared < MIN_SHARED:
+            names = ", ".join(cameras[index].frame_id for index in sorted(rest))
+            raise WandError(f"cameras {names} share at most {shared} balls with the others, expected {MIN_SHARED}")
+        both = sorted(rows[a].keys() & rows[b].keys())
+        first, second = np.array([rows[a][key] for key in both]), np.array([rows[b][key] for key in both])
+        turn, shift = _relative_pose((cameras[a], cameras[b]), seen, flat, (first, second), lengths)
+        rotations[b], translations[b] = turn @ rotations[a], turn @ translations[a] + shift
+        known.append(b)
+        rest.remove(b)
+    return rotations, translations
+
+
+def _relative_pose(
+    cameras: tuple[Camera, Camera],
+    seen: Sightings,
+    flat: FloatArray,
+    rows: tuple[IntArray, IntArray],
+    lengths: Lengths,
+) -> tuple[FloatArray, FloatArray]:
+    """Pose of the second camera in the first: the essential matrix, and the scale that the wand's lengths give."""
+    names = f"cameras {cameras[0].frame_id} and {cameras[1].frame_id}"
+    first, second = (np.ascontiguousarray(flat[each]) for each in rows)
+    width = _RANSAC[1] / float(np.mean([camera.matrix[[0, 1], [0, 1]] for camera in cameras]))
+    try:
+        essential, good = _CV.findEssentialMat(first, second, np.eye(3), _CV.RANSAC, _RANSAC[0], width)
+        if essential is None or essential.shape != (3, 3):
+            raise WandError(f"{names}: their sightings of the wand give no essential matrix")
+        count, turn, shift, _ = _CV.recoverPose(essential, first, second, np.eye(3), mask=good)
+    except cv2.error as error:
+        raise WandError(f"{names}: OpenCV finds no pose ({error.err})") from error
+    if count < MIN_SHARED:
+        raise WandError(f"{names}: {count} of {len(first)} balls before both, expected {MIN_SHARED}")
+    turn, shift = np.asarray(turn, dtype=np.float64), np.asarray(shift, dtype=np.float64).ravel()
+    size = sum(projection.size(camera) for camera in cameras)
+    pair = Rig(cameras, np.stack([np.eye(3), turn]), np.stack([np.zeros(3), shift]), np.zeros((size, size)))
+    both = np.concatenate(rows)
+    side = np.repeat(np.array([0, 1], dtype=np.intp), len(first))
+    shared = Sightings(side, seen.views[both], seen.points[both], seen.pixels[both])
+    points = intersect(pair, shared, int(lengths.pairs.max()) + 1, flat[both])
+    start, end = points[:, lengths.pairs[:, 0]], points[:, lengths.pairs[:, 1]]
+    seen_pairs = start.any(axis=-1) & end.any(axis=-1)
+    made = np.linalg.norm(end - start, axis=-1)[seen_pairs]
+    if not len(made):
+        raise WandError(f"{names}: never two balls of the wand at once, which would give the scale")
+    scale = float(np.median(np.broadcast_to(lengths.metres, seen_pairs.shape)[seen_pairs] / made))
+    return turn, scale * shift

@@ -1,0 +1,365 @@
+"""``body_tracking markers``: the cameras, the targets and the chain of the marker system, and its angles offline.
+
+A folder holds what the nodes need: ``calibrate`` writes its ``rig.yaml``, ``target`` its ``targets.yaml``, ``fit`` its
+``chain.yaml``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import Value, check_all
+from body_tracking.markers import setup
+from body_tracking.markers.boards import Chessboard
+from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
+from body_tracking.markers.chain import JointDescription, fit_chain
+from body_tracking.markers.chain_files import save_chain, to_urdf
+from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
+from body_tracking.markers.corrections import pose_sensitivity
+from body_tracking.markers.distinct import check_distinct
+from body_tracking.markers.joint_model import JointKind
+from body_tracking.markers.observations import Points, TargetPose
+from body_tracking.markers.rig_storage import load_rig, save_rig
+from body_tracking.markers.stages import AnglesOfTargetsStage, DetectorStage, TrackerStage, TriangulationStage
+from body_tracking.markers.target_calibration import calibrate_target, ordered_views
+from body_tracking.markers.targets_file import load_targets, save_targets
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.pipeline.stage import Port, Stage
+from body_tracking.pipeline.system import load
+from body_tracking.recording.replay import Progress
+from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
+
+_RENDER = "body_tracking.simulation.marker_bags"
+
+
+class MarkerCommandError(BodyTrackingError):
+    """A recording, an image or an option does not serve its purpose."""
+
+
+# --- recordings
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """What the stages made of a recording: messages by topic, and what they counted."""
+
+    messages: Mapping[str, list[bytes]]
+    counters: Mapping[str, int]
+
+
+def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
+    """The topics of a recording from which everything else follows: of images, of balls, or of points.
+
+    Raises:
+        MarkerCommandError: none of them is there.
+    """
+    cameras = setup.camera_names(folder)
+    for topics in setup.sources(cameras):
+        if all(topic in bag.topics for topic in topics):
+            return topics
+    wanted = " or ".join(topics[0] for topics in setup.sources(cameras))
+    raise MarkerCommandError(f"{bag.path}: no topic {wanted}; it has {', '.join(sorted(bag.topics))}")
+
+
+def track(
+    bag_path: Path,
+    folder: Path,
+    stages: Sequence[type[Stage]],
+    values: Mapping[str, Value],
+    sink: Callable[[str, bytes, int], None] = lambda topic, cdr, at_ns: None,
+) -> Tracked:
+    """Run stages over a recording.
+
+    Args:
+        bag_path: with images, balls or points.
+        folder: the setup.
+        stages: in their order.
+        values: parameters of those that have them.
+        sink: gets topic, message and log time of everything that is taken from the recording or published.
+
+    Raises:
+        BodyTrackingError: the recording or the setup cannot be used.
+    """
+    made = []
+    for stage in stages:
+        known = {item.name for item in stage.PARAMETERS}
+        given = {"setup": str(folder), **{name: value for name, value in values.items() if name in known}}
+        made.append(stage(check_all(stage.PARAMETERS, given)))
+    found: dict[str, list[bytes]] = {}
+
+    def keep(topic: str, cdr: bytes, at_ns: int) -> None:
+        found.setdefault(topic, []).append(cdr)
+        sink(topic, cdr, at_ns)
+
+    runner = OfflineRunner(made, BAG_WIRE, keep)
+    with RigReader(bag_path) as bag:
+        topics = sources_of(bag, folder)
+        progress = Progress(bag.start_ns, bag.end_ns)
+        runner.start(bag.start_ns)
+        for raw in bag.messages(topics):
+            sink(raw.topic, raw.cdr, raw.log_time_ns)
+            if raw.topic == setup.POINTS:
+                found.setdefault(raw.topic, []).append(raw.cdr)
+            runner.push(raw.topic, raw.cdr, raw.log_time_ns)
+            progress.at(raw.log_time_ns)
+        runner.finish(bag.end_ns)
+        progress.end()
+    counters = Counter(runner.counters)
+    for each in made:
+        counters.update(each.counters)
+    return Tracked(found, {name: count for name, count in sorted(counters.items()) if count})
+
+
+def points_of(bag_path: Path, folder: Path) -> list[Points]:
+    """The points in a recording, frame by frame."""
+    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage), {})
+    return [SpacePoints().decode(cdr, BAG_WIRE) for cdr in tracked.messages.get(setup.POINTS, ())]
+
+
+def poses_of(bag_path: Path, folder: Path) -> list[list[TargetPose]]:
+    """The poses of the targets in a recording, frame by frame."""
+    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage, TrackerStage), {"deadline": 1.0})
+    frames: dict[int, list[TargetPose]] = {}
+    for target in load_targets(setup.file_of(folder, setup.TARGETS, "target")):
+        for cdr in tracked.messages.get(setup.pose_topic(target.name), ()):
+            pose = PoseOfTarget(target.name).decode(cdr, BAG_WIRE)
+            frames.setdefault(pose.stamp_ns, []).append(pose)
+    return [frames[stamp_ns] for stamp_ns in sorted(frames)]
+
+
+# --- commands
+
+
+def _image(path: Path) -> NDArray[np.uint8]:
+    found = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if found is None:
+        raise MarkerCommandError(f"{path}: no image")
+    return np.asarray(found, dtype=np.uint8)
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """``markers calibrate``."""
+    names, series = [], []
+    for entry in args.camera:
+        name, _, folder = entry.partition("=")
+        files = sorted(path for path in Path(folder).glob("*") if path.is_file()) if folder else []
+        if not name or not files:
+            raise MarkerCommandError(f"camera {entry!r}: expected NAME=FOLDER, a folder with its images")
+        names.append(name)
+        series.append([_image(path) for path in files])
+    board = Chessboard(args.columns, args.rows, args.square)
+    corners = find_boards(board, series)
+    sizes = [(images[0].shape[1], images[0].shape[0]) for images in series]
+    found = calibrate_cameras([f"{name}_optical_frame" for name in names], sizes, corners)
+    args.setup.mkdir(parents=True, exist_ok=True)
+    save_rig(args.setup / setup.RIG, found.rig)
+    rms, axes = found.rms(), found.rms_by_axis()
+    report = {
+        "rig": str(args.setup / setup.RIG),
+        "cameras": {
+            name: {"rms_px": float(rms[k]), "rms_x_px": float(axes[k, 0]), "rms_y_px": float(axes[k, 1])}
+            for k, name in enumerate(names)
+        },
+        "left_out": [f"view {each.view}, {each.camera or 'all cameras'}: {each.reason}" for each in found.rejected],
+    }
+    lines = [
+        f"{name}: RMS {rms[k]:.3f} px (of the distance, as OpenCV has it; {axes[k, 0]:.3f} in x, {axes[k, 1]:.3f} in y)"
+        for k, name in enumerate(names)
+    ]
+    lines += [f"left out: {line}" for line in report["left_out"]]
+    return _say(args, report, [*lines, f"written to {report['rig']}"])
+
+
+def target(args: argparse.Namespace) -> int:
+    """``markers target``."""
+    frames = points_of(args.bag, args.setup)
+    first = next((k for k, points in enumerate(frames) if len(points.positions) == args.balls), None)
+    if first is None:
+        counts = Counter(len(points.positions) for points in frames)
+        seen = ", ".join(f"{count} in {number} frames" for count, number in sorted(counts.items())) or "no frame at all"
+        raise MarkerCommandError(f"{args.bag}: no frame with {args.balls} points; {seen}")
+    views, covariance = ordered_views(frames, np.arange(args.balls), first)
+    found = calibrate_target(args.name, views, covariance, args.diameter)
+    path = args.setup / setup.TARGETS
+    others = [each for each in (load_targets(path) if path.exists() else []) if each.name != args.name]
+    check_distinct([*others, found.target], max(found.noise, 2e-4))
+    save_targets([*others, found.target], path)
+    stddev = float(np.sqrt(np.trace(found.target.covariance) / args.balls))
+    report = {
+        "targets": str(path),
+        "name": args.name,
+        "views": int(found.used.sum()),
+        "noise_mm": 1e3 * found.noise,
+        "stddev_mm": 1e3 * stddev,
+        "reduced_chi_square": found.reduced_chi_square,
+    }
+    lines = [
+        f"{args.name}: {args.balls} balls from {report['views']} of {len(frames)} frames, noise "
+        f"{report['noise_mm']:.3f} mm, each ball known to {report['stddev_mm']:.3f} mm",
+        f"written to {path}",
+    ]
+    return _say(args, report, lines)
+
+
+def fit(args: argparse.Namespace) -> int:
+    """``markers fit``."""
+    joints = []
+    for entry in args.joint:
+        parts = entry.split(":")
+        if len(parts) != 4 or parts[1] not in tuple(JointKind):
+            raise MarkerCommandError(f"joint {entry!r}: expected NAME:KIND:PARENT:CHILD, KIND {', '.join(JointKind)}")
+        joints.append(JointDescription(parts[0], parts[2], parts[3], JointKind(parts[1])))
+    rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
+    targets = {each.name: each for each in load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))}
+    frames = poses_of(args.bag, args.setup)
+    sensitivities = [{each.name: pose_sensitivity(rig, targets[each.name], each) for each in poses} for poses in frames]
+    found = fit_chain(frames, joints, sensitivities)
+    path = args.setup / setup.CHAIN
+    save_chain(found.chain, path)
+    path.with_suffix(".urdf").write_text(to_urdf(found.chain, "markers"), encoding="utf-8")
+    report = {
+        "chain": str(path),
+        "scale": found.chain.scale,
+        "joints": {
+            each.joint.name: {
+                "frames": each.frames,
+                "motion_deg": np.degrees(each.motion).tolist(),
+                "gap_mm": 1e3 * each.gap,
+                "verdict": str(each.verdict),
+            }
+            for each in found.joints
+        },
+        "warnings": list(found.warnings),
+    }
+    lines = [
+        f"{each.joint.name}: {each.frames} frames, turned by {np.degrees(each.motion[0]):.0f} deg RMS about its main "
+        f"axis, centres {1e3 * each.gap:.2f} mm apart, {each.verdict.replace('_', ' ')}"
+        for each in found.joints
+    ]
+    lines += [f"warning: {warning}" for warning in found.warnings]
+    return _say(args, report, [*lines, f"written to {path} and {path.with_suffix('.urdf')}"])
+
+
+def angles(args: argparse.Namespace) -> int:
+    """``markers angles``."""
+    stages = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
+    types = _types(args.setup)  # raises before anything is written
+    with BagWriter(args.output, overwrite=args.overwrite, flush_interval_s=float("inf")) as writer:
+        with RigReader(args.bag) as bag:
+            for topic in (*sources_of(bag, args.setup), *(t for t in bag.topics if t.startswith("/ground_truth/"))):
+                writer.add_topic(topic, bag.topics[topic].type_name, bag.topics[topic].offered)
+            for raw in bag.messages([topic for topic in bag.topics if topic.startswith("/ground_truth/")]):
+                writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+        known: set[str] = set()
+
+        def write(topic: str, cdr: bytes, at_ns: int) -> None:
+            if topic not in known and topic in types:
+                writer.add_topic(topic, types[topic])
+            known.add(topic)
+            writer.write(topic, cdr, at_ns)
+
+        tracked = track(args.bag, args.setup, stages, {"diameter": args.diameter, "deadline": 1.0}, write)
+    count = len(tracked.messages.get(graph.joint_states_topic(setup.BODY), ()))
+    if not count:
+        raise MarkerCommandError(f"{args.bag}: no angles ({_listed(tracked.counters)})")
+    report = {"output": str(args.output), "frames": count, "counters": dict(tracked.counters)}
+    lines = [f"{count} frames of joint angles", f"on the way: {_listed(tracked.counters)}", f"written to {args.output}"]
+    return _say(args, report, lines)
+
+
+def check(args: argparse.Namespace) -> int:
+    """``markers check``."""
+    rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
+    targets = load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))
+    check_distinct(targets, args.noise)
+    report = {
+        "cameras": [camera.frame_id for camera in rig.cameras],
+        "targets": {each.name: len(each.points) for each in targets},
+    }
+    lines = [
+        f"cameras: {', '.join(report['cameras'])}",
+        f"targets: {', '.join(f'{each.name} ({len(each.points)} balls)' for each in targets)}; no two are alike",
+    ]
+    return _say(args, report, lines)
+
+
+def _types(folder: Path) -> dict[str, str]:
+    """Type names of what the stages publish."""
+    outputs: list[Port] = []
+    for stage in (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage):
+        outputs += stage(check_all(stage.PARAMETERS, {"setup": str(folder)})).outputs
+    return {port.topic: port.codec.type_name for port in outputs}
+
+
+def _listed(counters: Mapping[str, int]) -> str:
+    return ", ".join(f"{name}: {count}" for name, count in counters.items()) or "nothing at all"
+
+
+def _say(args: argparse.Namespace, report: Mapping[str, Any], lines: Iterable[str]) -> int:
+    print(json.dumps(report, indent=2) if args.json else "\n".join(lines))
+    return 0
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """``body_tracking markers``."""
+    top = subparsers.add_parser("markers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+        parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+        parser.add_argument("--setup", type=Path, required=True, metavar="FOLDER", help="the folder of the setup")
+        parser.add_argument("--json", action="store_true", help="print the report as JSON")
+        parser.set_defaults(run=run)
+        return parser
+
+    parser = command("calibrate", calibrate, "Calibrate the cameras from images of a chessboard; writes rig.yaml.")
+    parser.add_argument(
+        "--camera",
+        action="append",
+        required=True,
+        metavar="NAME=FOLDER",
+        help="a camera and its images, in the order of those of the others; the first is the rig's frame",
+    )
+    parser.add_argument("--columns", type=int, required=True, metavar="N", help="inner corners in a row")
+    parser.add_argument("--rows", type=int, required=True, metavar="N", help="rows of inner corners")
+    parser.add_argument("--square", type=float, required=True, metavar="METRES", help="width of a square")
+
+    parser = command("target", target, "Measure a target that is turned before the cameras alone; into targets.yaml.")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of the target")
+    parser.add_argument("--name", required=True, metavar="NAME", help="of the target")
+    parser.add_argument("--balls", type=int, required=True, metavar="N", help="number of its balls")
+    parser.add_argument("--diameter", type=float, default=0.0, metavar="METRES", help="of its balls")
+
+    parser = command("fit", fit, "Estimate the joints between targets from their motion; writes chain.yaml and a URDF.")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="a recording in which every joint moves")
+    parser.add_argument(
+        "--joint",
+        action="append",
+        required=True,
+        metavar="NAME:KIND:PARENT:CHILD",
+        help=f"a joint between two targets; KIND is {', '.join(JointKind)}",
+    )
+
+    parser = command("angles", angles, "Compute the joint angles in a recording; writes them into a new one.")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of images, balls or points")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
+    parser.add_argument("--diameter", type=float, default=0.0, metavar="METRES", help="of the balls")
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
+
+    parser = command("check", check, "Read a setup, and say whether its targets can be told apart.")
+    parser.add_argument("--noise", type=float, default=3e-4, metavar="METRES", help="of a point (default %(default)s)")
+
+    load(f"{_RENDER}:add_parser")(commands)

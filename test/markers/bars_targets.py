@@ -1,0 +1,114 @@
+"""The figures of poses, recognition and tracking against their bars; run with the name of a bar, or all."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from scenes import TARGET_POINTS, measure, moving, random_rotation, rotation_error, scene, target_set
+
+from body_tracking.markers.pose import fit_pose
+from body_tracking.markers.recognition import Recogniser
+from body_tracking.markers.targets import Target
+from body_tracking.markers.tracking import TargetTracker
+
+
+def pose(count: int = 3000) -> None:
+    """Errors of a target at 1 m, 3D RMS, its stated covariance and the time of a fit."""
+    rng = np.random.default_rng(1)
+    target = Target("target", TARGET_POINTS, np.zeros((15, 15)))
+    errors, nees, spent, plain = [], [], [], []
+    for _ in range(count):
+        rotation, centre = random_rotation(rng), np.array([0.0, 0.0, 1.0])
+        points = measure(target.points @ rotation.T + centre, rng)
+        begin = time.perf_counter()
+        fit = fit_pose(target, points, np.arange(5))
+        spent.append(time.perf_counter() - begin)
+        error = np.r_[centre - fit.translation, rotation_error(rotation, fit.rotation)]
+        errors.append(error)
+        nees.append(error @ np.linalg.solve(fit.covariance, error))
+        plain.append(np.trace(fit.covariance[:3, :3]))
+    rms = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    print(
+        f"pose at 1 m: {1e3 * np.linalg.norm(rms[:3]):.4f} mm, {np.rad2deg(np.linalg.norm(rms[3:])):.4f} deg 3D RMS; "
+        f"stated {1e3 * np.sqrt(np.mean(plain)):.4f} mm; NEES {np.mean(nees):.3f} of 6; "
+        f"median {1e3 * np.median(spent):.3f} ms"
+    )
+
+
+def recognition(count: int = 1000) -> None:
+    """Five targets of five balls from scratch, one ball of each hidden, 80 spurious points; then 300."""
+    for distance, spurious, deadline in ((1.0, 80, None), (2.0, 80, None), (3.0, 80, None), (1.0, 300, 0.01)):
+        found = complete = wrong = extra = ambiguous = frames = 0
+        spent = []
+        for seed in range(count if distance < 3.0 and spurious == 80 else count // 10):
+            rng = np.random.default_rng([seed, 7])
+            targets = target_set(seed % 100)
+            true, _, poses, assignments = scene(targets, distance, rng, spurious)
+            points = measure(true, rng)
+            recogniser = Recogniser(targets)
+            frames += 1
+            begin, begin_cpu = time.perf_counter(), time.thread_time()
+            result = recogniser.recognise(points, deadline)
+            spent.append((time.perf_counter() - begin, time.thread_time() - begin_cpu))
+            found += len(result.poses) == 5
+            complete += result.complete
+            ambiguous += len(result.ambiguous)
+            for fit in result.poses:
+                index = [target.name for target in targets].index(fit.name)
+                rotation, _ = poses[index]
+                seen = fit.points >= 0
+                if np.linalg.norm(rotation_error(rotation, fit.rotation)) > 0.2:
+                    wrong += 1
+                elif (fit.points[seen] != assignments[index][seen]).any():
+                    extra += 1
+        ms = 1e3 * np.array(spent)
+        print(
+            f"recognition at {distance:g} m, {spurious} spurious: all {100 * found / frames:.2f} % of {frames} frames\n"
+            f"    {wrong} wrong poses, {extra} with a spurious ball, {ambiguous} ambiguous, "
+            f"{100 * complete / frames:.1f} % complete; CPU median {np.median(ms[:, 1]):.2f} ms, 99 % "
+            f"{np.quantile(ms[:, 1], 0.99):.1f}, max {ms[:, 1].max():.1f}, wall median {np.median(ms[:, 0]):.2f} ms"
+        )
+
+
+def tracking(count: int = 10, frames: int = 120) -> None:
+    """Five moving targets at 60 Hz, a ball of each hidden in turn (another each 20 frames), 80 spurious points."""
+    for distance, spurious in ((1.0, 80), (2.0, 80), (3.0, 80)):
+        found = wrong = extra = full = kept = held = 0
+        spent = []
+        for seed in range(count):
+            met: set[str] = set()
+            rng = np.random.default_rng([seed, 11])
+            targets = target_set(seed % 100)
+            tracker = TargetTracker(
+                targets,
+            )
+            for stamp, true, poses, assignments in moving(targets, distance, rng, frames, spurious):
+                points = measure(true, rng, stamp)
+                begin = time.thread_time()
+                result = tracker.update(points)
+                spent.append(time.thread_time() - begin)
+                names = {fit.name for fit in result}
+                kept += len(met)
+                held += len(met & names)
+                met |= names
+                found += len(result)
+                full += len(result) == 5
+                for fit in result:
+                    index = [target.name for target in targets].index(fit.name)
+                    seen = fit.points >= 0
+                    wrong += np.linalg.norm(rotation_error(poses[index][0], fit.rotation)) > 0.2
+                    extra += (fit.points[seen] != assignments[index][seen]).any()
+        ms = 1e3 * np.array(spent)
+        total = count * frames
+        print(
+            f"tracking at {distance:g} m, {spurious} spurious: all five in {100 * full / total:.2f} % of {total} "
+            f"frames, targets once met {100 * held / kept:.3f} %, {wrong} wrong poses, {extra} with a spurious ball; "
+            f"CPU of five: median {np.median(ms):.2f} ms, 99 % {np.quantile(ms, 0.99):.2f}"
+        )
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or ["pose", "recognition", "tracking"]:
+        globals()[name]()
