@@ -84,6 +84,7 @@ def test_angles_of_a_single_joint_reach_the_bars(kind: JointKind, bar: float) ->
     assert 0.92 < share < 0.98 and 0.92 < named < 0.98
 
 
+@pytest.mark.slow
 def test_all_angles_of_an_arm_are_as_exact_as_stated_and_continuous() -> None:
     inside = []
     for seed in range(draws(1, 15)):

@@ -142,6 +142,7 @@ def errors(truth: Rig, made: Rig) -> FloatArray:
     return np.concatenate(parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", some([2, 3]))
 def test_errors_of_parameters_are_within_their_stated_deviations(count: int) -> None:
     truth, standard = rig(count), []

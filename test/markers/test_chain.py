@@ -33,6 +33,7 @@ def upper_body(seed: int) -> tuple[np.random.Generator, Tree]:
     return rng, tree_of([random_joint(rng, kind, name, parent, child) for name, parent, child, kind in UPPER_BODY])
 
 
+@pytest.mark.slow
 def test_errors_of_a_chain_are_as_large_as_stated_where_poses_are_missing() -> None:
     count, total, parameters, inside = draws(3, 40), 0.0, 6 + 9 + 10, 0
     for seed in range(count):
@@ -49,6 +50,7 @@ def test_errors_of_a_chain_are_as_large_as_stated_where_poses_are_missing() -> N
     assert inside >= 0.97 * 36 * count
 
 
+@pytest.mark.slow
 def test_the_whole_is_not_less_exact_than_its_joints() -> None:
     rng, tree = upper_body(10)
     fit = fit_chain(measured(rng, tree, random_posture(rng, tree, 300)), DESCRIPTION)
@@ -106,6 +108,7 @@ def wrong(frames: list[list[TargetPose]], step: FloatArray) -> list[list[TargetP
     return result
 
 
+@pytest.mark.slow
 def test_what_the_calibration_of_the_cameras_does_to_a_chain_and_to_its_angles_is_known() -> None:
     rng, tree = upper_body(15)
     frames = measured(rng, tree, random_posture(rng, tree, 150), scale=0.1)

@@ -90,6 +90,7 @@ def test_what_the_motion_leaves_open_is_as_the_thesis_fixes_it(kind: JointKind) 
     assert np.abs(conventional(turned)[0].difference(joint)).max() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", JointKind)
 def test_errors_are_as_large_as_stated(kind: JointKind) -> None:
     """The squared errors in units of their covariance have a chi squared distribution."""
@@ -129,6 +130,7 @@ def test_a_recording_of_2000_frames_reaches_the_bars(kind: JointKind) -> None:
         assert value < 1.5 * stated[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", JointKind)
 def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None:
     errors, variances = [], []
@@ -158,6 +160,7 @@ def test_targets_that_stand_still_say_nothing_of_a_joint(kind: JointKind, noise:
     assert np.linalg.norm(fit.joint.parent_centre - tree.joints[0].parent_centre) < 3.0 * np.linalg.norm(deviation[:3])
 
 
+@pytest.mark.slow
 def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
     for seed in range(draws(2, 20)):
         truth, poses = drawn(seed, JointKind.BALL, 200, 40.0, about=1)

@@ -67,6 +67,7 @@ def calibrated(recording: Recording, name: str, every: int) -> Target:
     return calibrate_target(name, views, noise, flexible=True).target
 
 
+@pytest.mark.slow
 def test_walking_targets_are_tracked_without_labels(shared_data: Path) -> None:
     """None is wrong, and 98 % of the frames with four or more visible balls of a target give its pose."""
     recording = read(shared_data / "marker_unlabelled" / "walkingOptiTrack.c3d")

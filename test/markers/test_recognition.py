@@ -35,6 +35,7 @@ def test_five_targets_among_spurious_points(distance: float) -> None:
     assert missing <= 0.005 * count + 2.5 * np.sqrt(0.005 * count)
 
 
+@pytest.mark.slow
 def test_absent_targets_are_not_recognised() -> None:
     """No more than the number of false alarms that is allowed, 1e-3 for each target and frame."""
     count, found = draws(3, 200), 0
@@ -69,6 +70,7 @@ def test_two_of_the_same_target_are_ambiguous() -> None:
     assert result.ambiguous == (target.name,)
 
 
+@pytest.mark.slow
 def test_mirror_image_is_not_recognised() -> None:
     rng = np.random.default_rng(25)
     for target in random_targets(rng, 10, noise=1e-5):

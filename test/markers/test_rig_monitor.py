@@ -74,12 +74,14 @@ def outcomes(fault: Fault, count: int, speed: float, **kind: float) -> Counter[s
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", some([1.0, 0.0, 3.0]))
 def test_of_three_cameras_the_turned_one_is_named_within_a_second(speed: float) -> None:
     result = outcomes(Fault.MOVED_CAMERA, 3, speed, turn=np.radians(0.2))
     assert result["wrong"] == 0 and result["named"] >= 0.8 * result.total()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", some([1.0, 0.0]))
 def test_of_two_cameras_a_turned_one_is_among_the_named(speed: float) -> None:
     # turns about the line that joins them look alike, turns in the epipolar planes hardly show
@@ -87,6 +89,7 @@ def test_of_two_cameras_a_turned_one_is_among_the_named(speed: float) -> None:
     assert result["wrong"] <= 0.05 * result.total() and result["none"] <= 0.4 * result.total()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", some([2, 3]))
 def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
     result = outcomes(Fault.OUT_OF_STEP, count, 1.0, delay=1.0 / RATE)

@@ -175,6 +175,7 @@ def _least_squares(cameras: Rig, pixels: FloatArray, start: FloatArray) -> Float
     return points
 
 
+@pytest.mark.slow
 def test_errors_of_points_are_within_what_noise_and_calibration_state() -> None:
     truth, inside = rig(), []
     for seed in range(draws(8, 40)):

@@ -30,6 +30,7 @@ def waved(truth: Rig, rng: np.random.Generator, views: int = 80, wrong: float = 
     return Sightings(cameras, numbers, points, pixels[seen])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_errors_of_poses_are_within_their_stated_deviations(count: int) -> None:
     truth, standard = rig(count), []

@@ -39,6 +39,7 @@ def test_centroids_of_balls_that_nothing_hides(low: float, high: float, sensor: 
     assert 0.88 < inside(errors, deviations) < 0.998
 
 
+@pytest.mark.slow
 def test_half_overlapping_balls_are_two() -> None:
     pooled = []
     for depth, behind in ((0.6, 0.1), (1.0, 0.02), (1.5, 0.2), (2.2, 0.05), (2.9, 0.1)):
