@@ -54,6 +54,7 @@ def cardan(turns: FloatArray, near: FloatArray) -> FloatArray:
     return np.where((distance[0] < distance[1])[:, None], first, second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "bar"), [(JointKind.BALL, 0.17), (JointKind.HINGE, 0.125)])
 def test_angles_of_a_single_joint_reach_the_bars(kind: JointKind, bar: float) -> None:
     """With a joint that was fitted to another recording."""
@@ -159,6 +160,7 @@ def test_a_hinge_turns_on_past_half_a_turn() -> None:
     assert abs(estimator.estimate(measured(rng, tree, posture)[-1]).angles[0]) < np.radians(1.0)
 
 
+@pytest.mark.slow
 def test_the_calibration_of_the_cameras_is_in_the_deviation() -> None:
     """Errors that all poses share by a few parameters; the stated deviations are theirs."""
     rng, tree = arm(70)
@@ -194,6 +196,7 @@ def test_the_calibration_of_the_cameras_is_in_the_deviation() -> None:
     assert (ratio > 0.85).all() and (ratio < 1.15).all()
 
 
+@pytest.mark.slow
 def test_the_chain_is_in_the_deviation() -> None:
     """Chains drawn from a covariance give angles that differ by what is stated."""
     rng, tree = arm(80, ARM[:2])

@@ -182,6 +182,7 @@ def charuco(folder: Path) -> tuple[tuple[Camera, ...], Corners, Rig]:
     return cameras, corners, theirs
 
 
+@pytest.mark.slow
 def test_four_real_cameras_fit_a_charuco_board_better_than_in_the_calibration_that_came_with_them(
     shared_data: Path,
 ) -> None:

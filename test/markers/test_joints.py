@@ -173,6 +173,7 @@ def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
         assert np.linalg.norm(along[:-1]) < 4.0 * np.sqrt(values[:-1].sum()) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_pronating_elbow_is_no_hinge_but_a_universal_joint() -> None:
     _, poses = drawn(7, JointKind.UNIVERSAL, 150, 30.0)
     hinge, universal = fit_hinge_joint(*poses), fit_universal_joint(*poses)
@@ -258,6 +259,7 @@ def test_a_real_knee_is_the_same_hinge_in_both_halves_of_a_trial(shared_data: Pa
     assert axis_angle(first.joint.child_axis, second.joint.child_axis) < 3.5
 
 
+@pytest.mark.slow
 def test_a_real_hip_tells_of_soft_tissue_and_of_a_cluster_that_is_not_rigid(shared_data: Path) -> None:
     found = real(shared_data, "right_hip.c3d", PELVIS, THIGH, THIGH + EPICONDYLES)
     pelvis, thigh, wrong = (poses[::4] for poses in found)

@@ -98,6 +98,7 @@ def mislabelled(recording: Recording, columns: list[int], number: int) -> bool:
     return bool(np.nanmax(np.abs(distances - usual)) > 0.02)
 
 
+@pytest.mark.slow
 def test_equilateral_arm_targets_are_refused(shared_data: Path) -> None:
     recording = read(shared_data / "marker_unlabelled" / "racing_full.c3d")
     targets = [

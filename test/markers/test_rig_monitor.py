@@ -99,6 +99,7 @@ def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
     assert "cameras out of step" in str(found) and "ms" in str(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", some([1.0, 0.0, 4.0]))
 def test_nothing_is_told_of_a_rig_that_is_well(speed: float) -> None:
     for seed in range(draws(5, 30)):
