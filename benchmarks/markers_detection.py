@@ -9,83 +9,19 @@ two balls of which one hides half of the other; the errors of both, or of the hi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import common
 import cv2
 import numpy as np
 
-from body_tracking.core.camera import Camera
-from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.detection import detect
-from body_tracking.markers.rendering import Capsule, Rendered, Sensor, render
-
-CAMERA = Camera(
-    "camera",
-    640,
-    480,
-    np.array([[834.0, 0.0, 319.5], [0.0, 834.0, 239.5], [0.0, 0.0, 1.0]]),
-    np.array([-0.2, 0.1, 1e-3, -1e-3, 0.0]),
-)
-DIAMETER = 0.014
-HERE = np.eye(3), np.zeros(3)
-_GRID = np.stack(np.meshgrid(np.arange(40, 620, 58), np.arange(40, 450, 58)), axis=-1).reshape(-1, 2)
-_FOUND = 2.0
-
-
-def at(pixels: FloatArray, depths: FloatArray) -> FloatArray:
-    """Points (n, 3) that are seen at pixels (n, 2)."""
-    rays = CAMERA.rays(pixels)
-    return rays / rays[:, 2:] * depths[:, None]
-
-
-def apart(seed: int, low: float, high: float, sensor: Sensor, glints: int = 0) -> Rendered:
-    """15 balls that do not touch."""
-    random = np.random.default_rng(seed)
-    pixels = random.permutation(_GRID)[:15] + random.uniform(-8.0, 8.0, (15, 2))
-    points = at(pixels, random.uniform(low, high, 15))
-    return render(CAMERA, *HERE, points, DIAMETER, sensor, seed, glints=glints)
-
-
-def overlapping(seed: int, depth: float, behind: float, sensor: Sensor, offset: float = 0.81) -> Rendered:
-    """Two balls, the second behind the first; the offset of their centres in radii."""
-    random = np.random.default_rng(seed)
-    angle = random.uniform(0.0, 2.0 * np.pi)
-    step = offset * 834.0 * 0.5 * DIAMETER / depth * np.array([np.cos(angle), np.sin(angle)])
-    pixels = np.array([300.0, 200.0]) + random.uniform(-0.5, 0.5, 2) + np.array([[0.0], [1.0]]) * step
-    return render(CAMERA, *HERE, at(pixels, depth + np.array([0.0, behind])), DIAMETER, sensor, seed)
-
-
-def cut(seed: int, depth: float, sensor: Sensor) -> Rendered:
-    """A ball of which a limb in front of it hides half."""
-    random = np.random.default_rng(seed)
-    angle = random.uniform(0.0, 2.0 * np.pi)
-    ball = at(np.array([[300.0, 200.0]]) + random.uniform(-0.5, 0.5, 2), np.array([depth]))
-    towards, along = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
-    middle = ball[0] * (depth - 0.1) / depth + 0.04 * towards
-    limb = Capsule(middle - 0.3 * along, middle + 0.3 * along, 0.04)
-    return render(CAMERA, *HERE, ball, DIAMETER, sensor, seed, limbs=[limb])
-
-
-def errors(scenes: Sequence[Rendered], which: slice = slice(None)) -> tuple[FloatArray, FloatArray, int, int]:
-    """Errors (n, 2) and standard deviations (n, 2) of the balls that are found, and how many are missed and extra."""
-    wrong, stated, missed, extra = [], [], 0, 0
-    for scene in scenes:
-        balls = detect(scene.image)
-        distance = np.linalg.norm(balls.pixels[:, None] - scene.centroids, axis=2)
-        extra += int((distance.min(axis=1) > _FOUND).sum())
-        for index in range(len(scene.centroids))[which]:
-            if not len(balls.pixels) or distance[:, index].min() > _FOUND:
-                missed += 1
-                continue
-            nearest = distance[:, index].argmin()
-            wrong.append(balls.pixels[nearest] - scene.centroids[index])
-            stated.append(np.sqrt(np.diagonal(balls.covariance[nearest])))
-    return np.array(wrong).reshape(-1, 2), np.array(stated).reshape(-1, 2), missed, extra
+from body_tracking.markers.rendering import Rendered, Sensor
+from body_tracking.simulation.ball_images import apart, found, half_hidden, overlapping
 
 
 def _row(name: str, make: Callable[[int], Rendered], count: int, which: slice = slice(None)) -> None:
-    wrong, stated, missed, extra = errors([make(seed) for seed in range(count)], which)
+    wrong, stated, missed, extra = found([make(seed) for seed in range(count)], which)
     rms, sd = np.sqrt((wrong**2).mean()), np.sqrt((stated**2).mean())
     inside = (np.abs(wrong) < 1.96 * stated).mean()
     print(f"{name:34s} {rms:7.4f} {sd:7.4f} {100.0 * inside:6.1f} % {missed:6d} {extra:6d}")
@@ -113,7 +49,7 @@ def main() -> None:
     for depth in (0.5, 0.7, 1.0, 1.5, 2.0, 2.5, 3.0):
         _row(f"{depth} m", lambda seed, d=depth: apart(seed, d, d, usual), count)
     _row("0.5 to 3 m", lambda seed: apart(seed, 0.5, 3.0, usual), count)
-    _row("0.5 to 3 m, 10 glints", lambda seed: apart(seed, 0.5, 3.0, usual, 10), count)
+    _row("0.5 to 3 m, 10 glints", lambda seed: apart(seed, 0.5, 3.0, usual, glints=10), count)
     _row("0.5 to 3 m, 16 bits", lambda seed: apart(seed, 0.5, 3.0, Sensor(bits=16)), count)
     for blur in (0.3, 0.5, 1.0, 1.5):
         _row(f"0.5 to 2.5 m, blur {blur} px", lambda seed, b=blur: apart(seed, 0.5, 2.5, Sensor(blur=b)), count)
@@ -126,7 +62,7 @@ def main() -> None:
             _row(f"half overlap {depth} m, {behind} m behind", make, 2 * count)
             _row("  the hidden one", make, 2 * count, slice(1, None))
     for depth in (0.7, 1.0, 1.5, 2.0, 2.5):
-        _row(f"half hidden by a limb, {depth} m", lambda seed, d=depth: cut(seed, d, usual), 2 * count)
+        _row(f"half hidden by a limb, {depth} m", lambda seed, d=depth: half_hidden(seed, d, usual), 2 * count)
     print(f"CPU of an image of 15 balls apart: {_milliseconds(apart(1, 0.5, 3.0, usual).image):.2f} ms")
     print(f"CPU of two that overlap by half: {_milliseconds(overlapping(1, 1.5, 0.05, usual).image):.2f} ms")
 

@@ -128,6 +128,7 @@ BENCHMARKS = (
     Benchmark(
         "markers_detection", "centroids of rendered balls, by distance, overlap, saturation and blur", NOTHING, 2
     ),
+    Benchmark("markers_targets", "poses, recognition and tracking of targets among simulated points", NOTHING, 3),
     Benchmark(
         "markers_functional",
         "joints of real marker clusters on skin, beside biobuddy where it is installed",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +60,10 @@ def save(result: CalibrationResult, path: Path) -> None:
         CalibrationError: the file cannot be written.
     """
     text = _HEADER + yaml.safe_dump(to_dict(result), sort_keys=False)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        files.write_text(path, text)
+    except files.FileError as error:
+        raise CalibrationError(f"{path}: {error}") from error
 
 
 def _numbers(entry: dict[str, Any], key: str, count: int) -> np.ndarray:

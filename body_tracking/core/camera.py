@@ -121,6 +121,8 @@ class Camera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Ideal image coordinates (..., 2), x/z and y/z, of pixels (..., 2), by Newton's method.
 
+        Gaschler (2011): eq. 3.3, 4.7.
+
         NaN where it does not converge: far outside the image the polynomials are not monotonic.
         """
         seen = (pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]

@@ -1,4 +1,4 @@
-"""Reading untrusted files: only regular ones, and YAML only within limits of size, nesting and aliases."""
+"""Files: untrusted ones are read only if regular, YAML only within limits of size, nesting and aliases; writing."""
 
 from __future__ import annotations
 
@@ -73,6 +73,21 @@ def read_text(path: Path, limit: int = MAX_BYTES) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise FileError(f"cannot be read ({error})") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, as a whole or not at all; its folder is made.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise FileError(f"cannot be written ({error.strerror})") from error
 
 
 def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> Any:

@@ -103,6 +103,8 @@ class AngleEstimator:
     ) -> ChainAngles:
         """The angles at one instant.
 
+        Gaschler (2011): eq. 5.6; eq. 5.7; eq. 5.18.
+
         Args:
             poses: of the targets that were found; those of targets of no joint are left out.
             sensitivities: of each target (6, p) derivative of its pose (as in :attr:`TargetPose.covariance`) by p

@@ -203,6 +203,8 @@ _Boards = tuple[Rig, FloatArray, FloatArray]
 def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: Corners, free: BoolArray) -> Adjusted:
     """Fit cameras and boards to corners.
 
+    Gaschler (2011): eq. 4.9.
+
     Args:
         rig: where to begin.
         rotations: (v, 3, 3) and

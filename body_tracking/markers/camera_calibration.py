@@ -142,6 +142,8 @@ def calibrate_cameras(
 ) -> CameraCalibration:
     """Calibrate one camera or more, and their poses to each other.
 
+    Gaschler (2011): eq. 4.8.
+
     Args:
         frames: of the cameras; the first is the rig's.
         sizes: width and height of each camera's images, pixels.

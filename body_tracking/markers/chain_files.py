@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -56,13 +55,10 @@ def save_chain(chain: Chain, path: Path) -> None:
         "covariance": [row[: index + 1].tolist() for index, row in enumerate(chain.covariance)],
     }
     text = _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise ChainFileError(f"{path}: cannot be written ({error.strerror})") from error
+        files.write_text(path, text)
+    except files.FileError as error:
+        raise ChainFileError(f"{path}: {error}") from error
 
 
 def load_chain(path: Path) -> Chain:

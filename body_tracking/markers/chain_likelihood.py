@@ -90,6 +90,8 @@ class _Normal:
 def maximise(tree: Tree, poses: PoseTable, misfit: float, shared: FloatArray | None = None) -> Likelihood:
     """Adjust the joints of a tree to measured poses.
 
+    Gaschler (2011): eq. 5.5; figure 5.7; eq. 5.19-5.20.
+
     Args:
         tree: with joints near the solution.
         poses: of the tree's targets.

@@ -4,35 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import MAX_RANGE, FloatArray
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import projection
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.spheres import sphere_centre_correction
 from body_tracking.markers.targets import Target
-
-_WORST: Final = 0.1
-_NEAREST: Final = 0.05
-"""Metres before a camera."""
-
-
-def well_placed(rig: Rig, points: Points) -> Points:
-    """Without points behind a camera that sees them, or that are not known to a tenth of a metre: chance intersections.
-
-    Their covariances would not survive single precision either.
-    """
-    kept = np.trace(points.covariance, axis1=1, axis2=2) < _WORST**2
-    kept &= (np.abs(points.positions) < MAX_RANGE).all(axis=1)
-    for index, (rotation, translation) in enumerate(zip(rig.rotations, rig.translations, strict=True)):
-        kept &= (points.positions @ rotation[2] + translation[2] > _NEAREST) | (points.balls[:, index] < 0)
-    return replace(
-        points, positions=points.positions[kept], covariance=points.covariance[kept], balls=points.balls[kept]
-    )
 
 
 def centred(rig: Rig, balls: Sequence[ImageBalls], points: Points, diameter: float) -> tuple[ImageBalls, ...]:

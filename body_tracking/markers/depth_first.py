@@ -47,6 +47,8 @@ def gaschler_depth_first(
 ) -> Matching | None:
     """The matching of least cost (eq. 3.13) that the search finds.
 
+    Gaschler (2011): eq. 3.13-3.14; figure 3.5; section 3.3.2.
+
     Args:
         target: (k, 3) metres.
         points: (n, 3) metres, in no order.

@@ -161,6 +161,8 @@ def detect(
 ) -> ImageBalls:
     """The balls in an image.
 
+    Gaschler (2011): section 3.1.3.
+
     Args:
         image: (h, w) uint8 or uint16.
         stamp_ns: capture time, nanoseconds.
@@ -227,6 +229,7 @@ class _Histogram:
 
     @classmethod
     def of(cls, image: NDArray[Any], settings: DetectionSettings) -> _Histogram:
+        """The threshold between two quantiles of the brightness (Gaschler 2011, figure 3.1, eq. 3.1)."""
         counts = np.bincount(image[::_ROWS].ravel())
         total = np.cumsum(counts)
         quantiles = np.array([settings.dark, settings.bright]) * total[-1]
@@ -302,6 +305,7 @@ class _Measured:
 
 
 def _centroids(regions: _Regions, settings: DetectionSettings) -> _Measured:
+    """Centres weighted by brightness (Gaschler 2011, eq. 3.2), and their covariances."""
     label, x, y, value = regions.label, regions.x, regions.y, regions.value
     peak = np.full(regions.count, 1e-9)
     np.maximum.at(peak, label, value)

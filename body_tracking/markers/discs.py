@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -62,6 +62,16 @@ class Discs:
     misfit: float
     squares: float
     criterion: float
+
+
+class _Pixels(NamedTuple):
+    """The pixels of a region: places (n,), brightness (n,) in that of the region, its variance (n,), saturation."""
+
+    x: FloatArray
+    y: FloatArray
+    values: FloatArray
+    variance: FloatArray
+    ceiling: float
 
 
 def _inside(x: FloatArray, y: FloatArray, p: FloatArray, edge: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -144,30 +154,30 @@ def explain(
     """
     bright = max(float(np.percentile(values, 95)), 1e-9)
     values, variance, ceiling = values / bright, variance / bright**2 + _MISFIT**2, ceiling / bright
+    pixels = _Pixels(x, y, values, variance, ceiling)
     weights = np.clip(values, 0.0, 1.0)
     area = max(float(weights.sum()), 1.0)
     if len(starts) > 1:
         radius = np.sqrt(area / np.pi / len(starts))
-        return _several(starts, radius, x, y, values, variance, ceiling)
+        return _several(starts, radius, pixels)
     middle, (along, across), lengths, lopsided = _shape(x, y, weights)
-    data = x, y, values, variance, ceiling
-    overlap = [_several(_cluster(x, y, weights, 2, along), np.sqrt(0.75 * area / np.pi), *data)]
+    overlap = [_several(_cluster(x, y, weights, 2, along), np.sqrt(0.75 * area / np.pi), pixels)]
     if overlap[0].squares < _CONVINCING:
         return overlap[0]
     way = np.sqrt(12.0 * (lengths[0] ** 2 - lengths[1] ** 2)) * along
-    single = [_single(moving, [*middle, 2.0 * lengths[1], 1.0, *way], *data)]
+    single = [_single(moving, [*middle, 2.0 * lengths[1], 1.0, *way], pixels)]
     # the flat side of a disc that is cut is opposite to its tail; where it is small noise decides
     for hidden in (-np.copysign(1.0, lopsided) * across, np.copysign(1.0, lopsided) * across):
         whole = 2.0 * lengths[0]
         centre = middle + 0.3 * whole * hidden
-        single.append(_single(cut, [*centre, whole, 1.0, np.arctan2(hidden[1], hidden[0]), 0.0], *data))
+        single.append(_single(cut, [*centre, whole, 1.0, np.arctan2(hidden[1], hidden[0]), 0.0], pixels))
         if single[-1].squares < _CONVINCING:
             break
     for count in range(3, MOST_DISCS + 1):
         if min(discs.misfit for discs in overlap + single) < _EXPLAINED:
             break
         # discs that share a part of their area
-        overlap.append(_several(_cluster(x, y, weights, count, along), np.sqrt(1.5 * area / np.pi / count), *data))
+        overlap.append(_several(_cluster(x, y, weights, count, along), np.sqrt(1.5 * area / np.pi / count), pixels))
     best = min(overlap + single, key=lambda discs: discs.criterion)
     if best not in single:
         return best
@@ -205,21 +215,17 @@ def _cluster(x: FloatArray, y: FloatArray, weights: FloatArray, count: int, alon
 def _several(
     starts: FloatArray,
     radius: float,
-    x: FloatArray,
-    y: FloatArray,
-    values: FloatArray,
-    variance: FloatArray,
-    ceiling: float,
+    pixels: _Pixels,
 ) -> Discs:
     """Discs that overlap or are near to each other, from centres (k, 2) and a common radius."""
     count = len(starts)
     start = [number for place in starts for number in (*place, radius, 1.0)]
-    found, covariance, *quality = _fit(overlapping, start, x, y, values, variance, ceiling)
+    found, covariance, *quality = _fit(overlapping, start, pixels)
     discs = found[:-1].reshape(count, 4)
     blocks = np.stack([covariance[4 * i : 4 * i + 2, 4 * i : 4 * i + 2] for i in range(count)])
     centres, radii = discs[:, :2], discs[:, 2]
     gaps = np.linalg.norm(centres[:, None] - centres, axis=2)[np.triu_indices(count, 1)]
-    inside = (centres > [x.min(), y.min()]) & (centres < [x.max(), y.max()])
+    inside = (centres > [pixels.x.min(), pixels.y.min()]) & (centres < [pixels.x.max(), pixels.y.max()])
     if not inside.all() or gaps.min() < _LEAST_GAP * radii.max():
         return Discs(centres, radii, blocks, np.inf, np.inf, np.inf)
     return Discs(centres, radii, blocks, *quality)
@@ -228,27 +234,20 @@ def _several(
 def _single(
     model: Model,
     start: list[float],
-    x: FloatArray,
-    y: FloatArray,
-    values: FloatArray,
-    variance: FloatArray,
-    ceiling: float,
+    pixels: _Pixels,
 ) -> Discs:
     """One disc, whose centre and radius are the first three parameters of the model."""
-    found, covariance, *quality = _fit(model, start, x, y, values, variance, ceiling)
+    found, covariance, *quality = _fit(model, start, pixels)
     return Discs(found[None, :2], found[2:3], covariance[None, :2, :2], *quality)
 
 
 def _fit(
     model: Model,
     start: list[float],
-    x: FloatArray,
-    y: FloatArray,
-    values: FloatArray,
-    variance: FloatArray,
-    ceiling: float,
+    pixels: _Pixels,
 ) -> tuple[FloatArray, FloatArray, float, float, float]:
     """Parameters (p,), their covariance (p, p), and the qualities of :class:`Discs`."""
+    x, y, values, variance, ceiling = pixels
     size, weight = len(start) + 1, 1.0 / np.sqrt(variance)
     steps = np.concatenate([np.zeros((1, size)), _STEP * np.eye(size)])
     expected, tightness = np.log(_EDGE[0]), _EDGE[0] / _EDGE[1]

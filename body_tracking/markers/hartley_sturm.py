@@ -54,6 +54,8 @@ def correct(
 ) -> tuple[FloatArray, FloatArray]:
     """Move pairs of pixels least so that they correspond exactly.
 
+    Gaschler (2011): figures 3.3-3.4; eq. 3.6-3.12.
+
     Args:
         matrix: (3, 3) the fundamental matrix.
         epipoles: (3,) homogeneous, in the first and in the second image.

@@ -89,6 +89,8 @@ class JointFit:
 def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
     """A ball joint (Gaschler section 5.1).
 
+    Gaschler (2011): figures 5.1-5.2; eq. 5.1.
+
     Args:
         parent: n poses of the target before the joint.
         child: n poses of the target behind it, each with the stamp and the frame of the parent's.
@@ -102,7 +104,10 @@ def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], na
 
 
 def fit_hinge_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """A hinge (Gaschler section 5.2); see :func:`fit_ball_joint`."""
+    """A hinge (Gaschler section 5.2); see :func:`fit_ball_joint`.
+
+    Gaschler (2011): figure 5.5; eq. 5.8-5.9.
+    """
     return _fit(JointKind.HINGE, parent, child, name)
 
 

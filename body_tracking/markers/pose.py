@@ -83,6 +83,8 @@ def maximum_likelihood(
 ) -> Fits:
     """The most likely poses of targets, for many sets of m points at once; the arguments are not checked.
 
+    Gaschler (2011): eq. 6.1-6.3.
+
     Args:
         model: (b, m, 3) points of targets, metres, not on one line.
         measured: (b, m, 3) the same points as measured, metres.

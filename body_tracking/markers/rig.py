@@ -62,7 +62,10 @@ class Rig:
         return sum(LENS + len(camera.distortion) + POSE for camera in self.cameras)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Pixels (n, ..., 2) in each camera of points (..., 3) in the rig's frame; NaN for points behind a camera."""
+        """Pixels (n, ..., 2) in each camera of points (..., 3) in the rig's frame; NaN for points behind a camera.
+
+        Gaschler (2011): figure 4.1; eq. 4.1-4.6.
+        """
         return np.stack(
             [
                 camera.project(points @ rotation.T + translation)

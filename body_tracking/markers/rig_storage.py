@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +29,7 @@ class RigFileError(BodyTrackingError):
     """A rig's file cannot be read or written."""
 
 
-def save_rig(path: Path, rig: Rig) -> None:
+def save_rig(rig: Rig, path: Path) -> None:
     """Write a rig; the file is replaced as a whole or not at all.
 
     Raises:
@@ -53,13 +52,10 @@ def save_rig(path: Path, rig: Rig) -> None:
         ],
         "covariance": rig.covariance[np.tril_indices(rig.size)].tolist(),
     }
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(_HEADER + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise RigFileError(f"{path}: cannot be written ({error.strerror})") from error
+        files.write_text(path, _HEADER + yaml.safe_dump(content, sort_keys=False, width=120))
+    except files.FileError as error:
+        raise RigFileError(f"{path}: {error}") from error
 
 
 def load_rig(path: Path) -> Rig:

@@ -18,7 +18,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import centred, pose_sensitivity, well_placed
+from body_tracking.markers.corrections import centred, pose_sensitivity
 from body_tracking.markers.detection import DetectionSettings, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
@@ -113,7 +113,6 @@ class TriangulationStage(Stage):
         tolerance, wait = float(str(values["tolerance"])), float(str(values["max_wait"]))
         self._sets: FrameSets[ImageBalls] = FrameSets(frames, round(tolerance * NANOSECONDS), round(wait * NANOSECONDS))
         self._frames = {setup.balls_topic(frame): frame for frame in frames}
-        self._counters: Counter[str] = Counter()
         self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True) for topic in self._frames)
         self.outputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, measured=True),)
 
@@ -145,15 +144,14 @@ class TriangulationStage(Stage):
         for frames in sets:
             balls = tuple(frames.values())
             self._monitor.take(balls)
-            points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
+            points = triangulate(self.rig, balls, self._settings)
             if self._diameter and len(points.positions):
-                balls = centred(self.rig, balls, points, self._diameter)
-                points = well_placed(self.rig, triangulate(self.rig, balls, self._settings))
+                points = triangulate(self.rig, centred(self.rig, balls, points, self._diameter), self._settings)
             yield Output(setup.POINTS, points, points.stamp_ns)
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return {**self._counters, "incomplete sets": self._sets.incomplete, "late images": self._sets.late}
+        return {"incomplete sets": self._sets.incomplete, "late images": self._sets.late}
 
 
 class TrackerStage(Stage):
@@ -233,6 +231,7 @@ class AnglesOfTargetsStage(Stage):
 
     def reset(self, topic: str) -> None:
         self._sets.reset()
+        self._angles.reset()
         self._last = None
 
     def _found(self, sets: Iterable[Mapping[str, TargetPose]]) -> Iterator[Output]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -45,13 +44,10 @@ def save_targets(targets: Sequence[Target], path: Path) -> None:
         entries[target.name] = {"points": target.points.tolist(), "diameter": float(target.diameter)}
         if target.covariance.any():
             entries[target.name]["covariance"] = target.covariance.tolist()
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(_HEADER + yaml.safe_dump({"targets": entries}, sort_keys=False), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise TargetsFileError(f"{path}: cannot be written ({error.strerror})") from error
+        files.write_text(path, _HEADER + yaml.safe_dump({"targets": entries}, sort_keys=False))
+    except files.FileError as error:
+        raise TargetsFileError(f"{path}: {error}") from error
 
 
 def load_targets(path: Path) -> list[Target]:

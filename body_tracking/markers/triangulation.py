@@ -105,7 +105,10 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
 
 
 def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: TriangulationSettings) -> Pairs:
-    """Balls of cameras a and b within the gate of each other's epipolar lines, few enough for each ball of both."""
+    """Balls of cameras a and b within the gate of each other's epipolar lines, few enough for each ball of both.
+
+    Gaschler (2011): figure 3.2.
+    """
     of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
     baseline = geometry.positions[b] - geometry.positions[a]
     # the volume that two rays span with the baseline b, d_b . (b x d_a), and its derivative by either direction

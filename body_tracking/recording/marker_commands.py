@@ -123,15 +123,16 @@ def track(
     return Tracked(found, {name: count for name, count in sorted(counters.items()) if count})
 
 
-def points_of(bag_path: Path, folder: Path) -> list[Points]:
-    """The points in a recording, frame by frame."""
-    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage), {})
+def points_of(bag_path: Path, folder: Path, diameter: float) -> list[Points]:
+    """The points in a recording, frame by frame; diameter of the balls, metres, or 0."""
+    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage), {"diameter": diameter})
     return [SpacePoints().decode(cdr, BAG_WIRE) for cdr in tracked.messages.get(setup.POINTS, ())]
 
 
-def poses_of(bag_path: Path, folder: Path) -> list[list[TargetPose]]:
-    """The poses of the targets in a recording, frame by frame."""
-    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage, TrackerStage), {"deadline": 1.0})
+def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetPose]]:
+    """The poses of the targets in a recording, frame by frame; diameter of the balls, metres, or 0."""
+    stages = (DetectorStage, TriangulationStage, TrackerStage)
+    tracked = track(bag_path, folder, stages, {"deadline": 1.0, "diameter": diameter})
     frames: dict[int, list[TargetPose]] = {}
     for target in load_targets(setup.file_of(folder, setup.TARGETS, "target")):
         for cdr in tracked.messages.get(setup.pose_topic(target.name), ()):
@@ -165,7 +166,7 @@ def calibrate(args: argparse.Namespace) -> int:
     sizes = [(images[0].shape[1], images[0].shape[0]) for images in series]
     found = calibrate_cameras([f"{name}_optical_frame" for name in names], sizes, corners)
     args.setup.mkdir(parents=True, exist_ok=True)
-    save_rig(args.setup / setup.RIG, found.rig)
+    save_rig(found.rig, args.setup / setup.RIG)
     rms, axes = found.rms(), found.rms_by_axis()
     report = {
         "rig": str(args.setup / setup.RIG),
@@ -185,7 +186,7 @@ def calibrate(args: argparse.Namespace) -> int:
 
 def target(args: argparse.Namespace) -> int:
     """``markers target``."""
-    frames = points_of(args.bag, args.setup)
+    frames = points_of(args.bag, args.setup, args.diameter)
     first = next((k for k, points in enumerate(frames) if len(points.positions) == args.balls), None)
     if first is None:
         counts = Counter(len(points.positions) for points in frames)
@@ -224,7 +225,7 @@ def fit(args: argparse.Namespace) -> int:
         joints.append(JointDescription(parts[0], parts[2], parts[3], JointKind(parts[1])))
     rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
     targets = {each.name: each for each in load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))}
-    frames = poses_of(args.bag, args.setup)
+    frames = poses_of(args.bag, args.setup, args.diameter)
     sensitivities = [{each.name: pose_sensitivity(rig, targets[each.name], each) for each in poses} for poses in frames]
     found = fit_chain(frames, joints, sensitivities)
     path = args.setup / setup.CHAIN
@@ -318,9 +319,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     top = subparsers.add_parser("markers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
-        parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+    def command(name: str, run: Callable[[argparse.Namespace], int], does: str) -> argparse.ArgumentParser:
+        parser: argparse.ArgumentParser = commands.add_parser(name, help=does, description=does)
         parser.add_argument("--setup", type=Path, required=True, metavar="FOLDER", help="the folder of the setup")
+        if run in (target, fit, angles):
+            text = "of the balls; without it the centroid of a ball's image is taken for its centre"
+            parser.add_argument("--diameter", type=float, default=0.0, metavar="METRES", help=text)
         parser.add_argument("--json", action="store_true", help="print the report as JSON")
         parser.set_defaults(run=run)
         return parser
@@ -341,7 +345,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of the target")
     parser.add_argument("--name", required=True, metavar="NAME", help="of the target")
     parser.add_argument("--balls", type=int, required=True, metavar="N", help="number of its balls")
-    parser.add_argument("--diameter", type=float, default=0.0, metavar="METRES", help="of its balls")
 
     parser = command("fit", fit, "Estimate the joints between targets from their motion; writes chain.yaml and a URDF.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording in which every joint moves")
@@ -356,7 +359,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = command("angles", angles, "Compute the joint angles in a recording; writes them into a new one.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of images, balls or points")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
-    parser.add_argument("--diameter", type=float, default=0.0, metavar="METRES", help="of the balls")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
 
     parser = command("check", check, "Read a setup, and say whether its targets can be told apart.")

@@ -113,7 +113,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(args: argparse.Namespace) -> int:
     scene = marker_scene(args.motion, args.seed, args.rate, args.seconds)
     args.setup.mkdir(parents=True, exist_ok=True)
-    save_rig(args.setup / setup.RIG, scene.rig)
+    save_rig(scene.rig, args.setup / setup.RIG)
     save_targets(scene.targets, args.setup / setup.TARGETS)
     write_scene(scene, args.output, Sensor(), args.seed, overwrite=args.overwrite)
     if args.boards:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from image_scenes import CAMERA, DIAMETER, HERE, apart, at, found, half_hidden, overlapping
 
 from body_tracking.markers.detection import DetectionSettings, ImageError, detect
 from body_tracking.markers.rendering import Sensor, render
+from body_tracking.simulation.ball_images import CAMERA, DIAMETER, HERE, apart, at, found, half_hidden, overlapping
 from draws import draws
 
 

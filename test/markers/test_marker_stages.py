@@ -72,7 +72,7 @@ def scene() -> MarkerScene:
 def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
     """All messages of the stages from two seconds of images, by topic."""
     folder = tmp_path_factory.mktemp("lab")
-    save_rig(folder / setup.RIG, scene.rig)
+    save_rig(scene.rig, folder / setup.RIG)
     save_targets(scene.targets, folder / setup.TARGETS)
     save_chain(fit_chain(true_poses(scene, 4), JOINTS).chain, folder / setup.CHAIN)
     stages = [

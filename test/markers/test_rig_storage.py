@@ -17,7 +17,7 @@ def test_a_rig_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     root = rng.normal(size=(truth.size, truth.size)) * 10.0 ** rng.uniform(-5.0, 0.0, (truth.size, 1))
     root[:5] = 0.0
     truth.covariance[...] = root @ root.T
-    save_rig(path, truth)
+    save_rig(truth, path)
     loaded = load_rig(path)
     assert [each.frame_id for each in loaded.cameras] == ["a", "b", "c"]
     for mine, theirs in zip(loaded.cameras, truth.cameras, strict=True):
@@ -43,7 +43,7 @@ def test_a_rig_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 )
 def test_what_is_wrong_with_a_file_is_named(tmp_path: Path, old: str, new: str, text: str) -> None:
     path = tmp_path / "rig.yaml"
-    save_rig(path, rig())
+    save_rig(rig(), path)
     content = path.read_text()
     assert old in content
     path.write_text(content.replace(old, new, 1))
@@ -63,6 +63,6 @@ def test_no_rig_and_no_file(tmp_path: Path) -> None:
 def test_a_negative_variance_is_refused(tmp_path: Path) -> None:
     truth = rig()
     truth.covariance[0, 0] = -1.0
-    save_rig(tmp_path / "rig.yaml", truth)
+    save_rig(truth, tmp_path / "rig.yaml")
     with pytest.raises(RigFileError, match="variance is negative"):
         load_rig(tmp_path / "rig.yaml")

@@ -1,4 +1,4 @@
-"""A small simulator of what a stereo rig measures of targets: noisy pixels, triangulated linearly, with covariance.
+"""What a stereo rig measures of targets: noisy pixels, triangulated linearly, with covariance.
 
 The rig of Gaschler 2011, section 6.1: f 834 pixels, 0.48 m apart, toed in by 13 degrees, 0.1 pixel noise. Its frame is
 in the middle between the cameras, z forward.
@@ -49,7 +49,7 @@ def triangulate(pixels: FloatArray) -> FloatArray:
     rows = flat[..., None] * poses[:, None, 2:] - poses[:, None, :2]
     rows = rows.transpose(1, 0, 2, 3).reshape(-1, 4, 4)
     homogeneous = np.linalg.svd(rows)[2][:, -1]
-    return homogeneous[:, :3] / homogeneous[:, 3:]
+    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], dtype=np.float64)
 
 
 def measure(true: FloatArray, rng: np.random.Generator, stamp_ns: int = 0, pixel_noise: float = PIXEL_NOISE) -> Points:
@@ -63,6 +63,7 @@ def measure(true: FloatArray, rng: np.random.Generator, stamp_ns: int = 0, pixel
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:
+    """(3, 3) any rotation, all as likely."""
     return np.asarray(Rotation.random(random_state=rng).as_matrix())
 
 
@@ -100,7 +101,9 @@ def scene(
     targets: list[Target], distance: float, rng: np.random.Generator, spurious: int = 80, hidden: int = 1
 ) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray]], list[FloatArray]]:
     """True points shuffled, owner (n, 2) target and ball (-1 for spurious), poses, and indices (k,) of each target."""
-    poses, rows, owners = [], [], []
+    poses: list[tuple[FloatArray, FloatArray]] = []
+    rows: list[FloatArray] = []
+    owners: list[tuple[int, int]] = []
     centres: list[FloatArray] = []
     while len(centres) < len(targets):
         centre = np.array([0.0, 0.0, distance]) + rng.uniform(-1.0, 1.0, 3) * np.array([0.25, 0.2, 0.1]) * distance
