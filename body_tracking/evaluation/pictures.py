@@ -29,15 +29,16 @@ def draw(tracked: Tracked, path: Path) -> None:
     """Draw the person and the angles of a recording, at least one frame, into a PNG file; raises as :func:`write`."""
     angles, known = tracked.angles, tracked.angles.known
     height = _height(angles.names)
-    figure = _figure(3.9 + height)
-    top, bottom = figure.subfigures(2, 1, height_ratios=(3.6, height))
+    person = 3.6 if tracked.skeletons else 0.0
+    figure = _figure(0.3 + person + height)
+    parts = figure.subfigures(2, 1, height_ratios=(person, height)) if person else (figure,)
     figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {_LEGEND}", fontsize=11)
     start_ns = int(angles.stamps_ns[0])
-    if tracked.skeletons:
-        _draw_person(top, tracked, start_ns)
+    if person:
+        _draw_person(parts[0], tracked, start_ns)
     times, true = (angles.stamps_ns - start_ns) / NANOSECONDS, true_at(angles, tracked.true_angles)
     errors = angle_errors(known, true, angles.stddev)
-    _draw_angles(bottom, AngleComparison(angles.names, times, known, true, angles.stddev, errors))
+    _draw_angles(parts[-1], AngleComparison(angles.names, times, known, true, angles.stddev, errors))
     write(path, _png(figure))
 
 
