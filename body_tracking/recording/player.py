@@ -125,6 +125,9 @@ class Playback:
 
     def pause(self, steady_ns: int) -> None:
         self._anchor(steady_ns)
+        if self._next is not None:
+            # Messages that are due but not yet returned keep their time: /clock would run back with them.
+            self._bag_ns = min(self._bag_ns, max(self._next.log_time_ns, self._start_ns))
         self._paused = True
 
     def resume(self, steady_ns: int) -> None:

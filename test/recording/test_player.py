@@ -126,6 +126,24 @@ def test_a_pause_delays_later_messages_by_its_length(reader, stored, begin, leng
     assert run.stored == stored
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, SECOND), st.integers(0, SECOND // 5), st.floats(0.2, 20.0))
+def test_the_clock_never_runs_ahead_of_messages_that_a_pause_finds_due(reader, stored, begin, late, rate):
+    """As where the process was busy: messages were due, but not sent, when somebody paused."""
+    run = Run(Playback(reader))
+    run.until(NOW + begin)
+    now = NOW + begin + late
+    run.playback.pause(now)
+    run.now_ns = now
+    run.until(now + SECOND // 10)
+    run.playback.set_rate(rate, run.now_ns)
+    run.playback.resume(run.now_ns)
+    run.to_the_end()
+    times = [clock_ns for _, clock_ns in run.clock]
+    assert times == sorted(times)
+    assert run.stored == stored
+
+
 def test_while_paused_the_clock_stands_still_and_ticks(reader, stored):
     run = Run(Playback(reader, paused=True))
     run.until(NOW + SECOND)
