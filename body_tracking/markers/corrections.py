@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,14 +46,24 @@ def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
     Returns:
         (6, p) in the order of :attr:`TargetPose.covariance`, per unit of each parameter of :class:`Rig`.
     """
-    turned = target.points @ pose.rotation.T
-    by_pose = np.concatenate([np.tile(np.eye(3), (len(turned), 1, 1)), -so3.skew(turned)], axis=-1)
-    information, pull, start = np.zeros((6, 6)), np.zeros((6, rig.size)), 0
+    return pose_sensitivities(rig, {target.name: target}, [pose])[target.name]
+
+
+def pose_sensitivities(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
+    """:func:`pose_sensitivity` of several targets at once, by their names."""
+    turned = [targets[pose.name].points @ pose.rotation.T for pose in poses]
+    starts = np.cumsum([0, *(len(each) for each in turned[:-1])])
+    arms = np.concatenate(turned)
+    points = arms + np.repeat([pose.translation for pose in poses], [len(each) for each in turned], axis=0)
+    by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -so3.skew(arms)], axis=-1)
+    information, pull, start = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6, rig.size)), 0
     for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
-        seen = projection.project(camera, rotation, translation, turned + pose.translation)
-        pixels_by_pose = (seen.by_point @ by_pose).reshape(-1, 6)
+        seen = projection.project(camera, rotation, translation, points)
+        by_ball = seen.by_point @ by_pose
+        turned_back = by_ball.swapaxes(1, 2)
         end = start + projection.size(camera)
-        information += pixels_by_pose.T @ pixels_by_pose
-        pull[:, start:end] = pixels_by_pose.T @ seen.by_parameters.reshape(-1, end - start)
+        information += np.add.reduceat(turned_back @ by_ball, starts)
+        pull[:, :, start:end] = np.add.reduceat(turned_back @ seen.by_parameters, starts)
         start = end
-    return np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)
+    moves = np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)
+    return {pose.name: each for pose, each in zip(poses, moves, strict=True)}
