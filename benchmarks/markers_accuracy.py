@@ -41,7 +41,7 @@ from body_tracking.markers.angles import AngleEstimator
 from body_tracking.markers.boards import Chessboard
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
-from body_tracking.markers.corrections import centred, pose_sensitivities
+from body_tracking.markers.corrections import centred, pose_sensitivities, shape_effects
 from body_tracking.markers.detection import detect
 from body_tracking.markers.joint_model import SIZE
 from body_tracking.markers.joint_tree import Posture, Tree, differentiate, place
@@ -302,7 +302,8 @@ def chain_of(room: lab.Lab, tree: Tree, posture: Posture, rng: np.random.Generat
     frames = room.measure(*place(tree, posture), rng)
     by_name = {target.name: target for target in room.targets}
     joints = [JointDescription(joint.name, joint.parent, joint.child, joint.kind) for joint in tree.joints]
-    return fit_chain(frames, joints, [pose_sensitivities(room.rig, by_name, poses) for poses in frames])
+    sensitivities = [pose_sensitivities(room.rig, by_name, poses) for poses in frames]
+    return fit_chain(frames, joints, sensitivities, [shape_effects(room.rig, by_name, poses) for poses in frames])
 
 
 def joint_errors(room: lab.Lab, tree: Tree, fit: ChainFit) -> dict[str, list[float]]:

@@ -26,7 +26,7 @@ from body_tracking.markers.camera_calibration import calibrate_cameras, find_boa
 from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
 from body_tracking.markers.chain_files import save_chain, to_urdf
 from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import pose_sensitivities
+from body_tracking.markers.corrections import pose_sensitivities, shape_effects
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
@@ -157,7 +157,8 @@ def fit_recording(bag_path: Path, folder: Path, joints: Sequence[JointDescriptio
     targets = {each.name: each for each in load_targets(setup.file_of(folder, setup.TARGETS, "target"))}
     frames = poses_of(bag_path, folder, diameter)
     sensitivities = [pose_sensitivities(rig, targets, poses) for poses in frames]
-    return fit_chain(frames, joints, sensitivities)
+    shapes = [shape_effects(rig, targets, poses) for poses in frames]
+    return fit_chain(frames, joints, sensitivities, shapes)
 
 
 # --- commands

@@ -38,6 +38,8 @@ JOINTS: Final = (
 _MOUNTS: Final = {"shoulder": (0.03, 0.10, 0.05), "upper_arm": (0.03, 0.06, -0.14), "forearm": (0.03, 0.05, -0.13)}
 """Where on its segment, metres: x forward, y to the left, z up, while the arm hangs."""
 _TRIALS: Final = 2000
+_APART: Final = 2.0 * DIAMETER
+"""Metres between the centres of two balls of a target, at least."""
 _AWAY: Final = 1.7
 """Metres from the rig to the middle of the arm."""
 _FLEXION, _PRONATION = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
@@ -134,11 +136,11 @@ def make_targets(seed: int = 0) -> tuple[Target, ...]:
             drawn = rng.uniform(-0.5, 0.5, (5, 3)) * np.array([1.0, 1.0, 0.45])
             drawn *= EXTENT / _distances(drawn).max()
             own = _distances(drawn)
+            if own.min() < _APART:
+                continue
             others = np.concatenate([own, *(_distances(each.points) for each in found)])
-            # balls well apart, distances within a target far from each other, those of different targets less so
-            worth = min(
-                own.min() / 2.5 / DIAMETER, np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4
-            )
+            # distances within a target far from each other, those of different targets less so
+            worth = min(np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4)
             if worth > best:
                 best, points = worth, drawn - drawn.mean(axis=0)
         found.append(Target(name, points, np.zeros((15, 15)), DIAMETER))
