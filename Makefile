@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO_BAG := bags/tpose_torso_twist
 DEMO := demo_output
+MARKERS_BAG := bags/markers_arm
+DEMO_MARKERS := demo_markers_output
 
 # Nothing of a sourced ROS install or of another virtual environment may leak into this one. The ROS wheels re-execute
 # Python once to find their libraries and mark that in the environment; with another environment's mark set they
@@ -26,7 +28,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint ros2-workspace bench docs clean
+.PHONY: help setup demo demo-markers test test-all lint ros2-workspace bench docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -54,6 +56,13 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording --log-dir $(DEMO)/log
 	$(BIN)/body_tracking show $(DEMO)/recording --truth $(DEMO_BAG) --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
+
+# At half the rate: on two cores, detection does not keep up with 30 pairs a second where balls touch in the images.
+demo-markers: $(STAMP) ## the same with images of infrared markers: from balls to joint angles, beside the truth
+	@rm -rf $(DEMO_MARKERS) && mkdir $(DEMO_MARKERS)
+	$(BIN)/body_tracking up --sensors none --bag $(MARKERS_BAG) --rate 0.5 --marker-setup config/marker_setup --record $(DEMO_MARKERS)/recording --log-dir $(DEMO_MARKERS)/log
+	$(BIN)/body_tracking show $(DEMO_MARKERS)/recording --truth $(MARKERS_BAG) --output $(DEMO_MARKERS)/joint_angles.png
+	@echo "recording: $(DEMO_MARKERS)/recording"
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes and mostly wait; the
 # latter run several at a time, and one at a time where they state how soon something happens. All of it runs, whatever
@@ -94,5 +103,5 @@ docs: $(STAMP) ## rewrite what the code defines: tables of docs/reference.md, co
 	$(BIN)/python docs/update.py
 
 clean: ## remove everything that make and colcon made
-	rm -rf $(VENV) $(DEMO) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) $(DEMO_MARKERS) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -244,9 +244,9 @@ class Bench(Ear):
         self.start_ns = 0
         self._outputs: dict[str, Any] = {}
 
-    def publisher(self, topic: str, kind: type) -> None:
-        """Prepare to send messages of a topic, best effort."""
-        self._outputs[topic] = self.node.create_publisher(kind, topic, to_profile(graph.SKELETON))
+    def publisher(self, topic: str, kind: type, qos: Any = graph.SKELETON) -> None:
+        """Prepare to send messages of a topic, best effort unless another quality is given."""
+        self._outputs[topic] = self.node.create_publisher(kind, topic, to_profile(qos))
 
     def connected(self, listeners: Mapping[str, int]) -> bool:
         """Whether each topic has so many of them."""

@@ -44,8 +44,8 @@ def commands(page: Path) -> list[str]:
 
 ALONE = {"troubleshooting": pytest.mark.alone}
 """doctor finds fault with a machine on which others work."""
-SLOW = dict.fromkeys(("first_ten_minutes", "reading_uncertainty", "choosing_a_filter"), pytest.mark.slow)
-"""Most of their commands are also those of the README."""
+SLOW = dict.fromkeys(("first_ten_minutes", "reading_uncertainty", "choosing_a_filter", "markers"), pytest.mark.slow)
+"""Most of their commands are also those of the README, or they compute on images for long."""
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,18 @@ import numpy as np
 
 from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evaluation
-from body_tracking.evaluation.metrics import angle_errors
-from body_tracking.evaluation.reading import Tracked, nearest, true_at
+from body_tracking.evaluation.metrics import angle_errors, wrapped
+from body_tracking.evaluation.reading import AngleSeries, Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
 
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
 _COLUMNS, _INSTANTS = 4, 6
 _POINTS = 1500
 """Points of a curve at most: no more than the picture has columns."""
+_STILL = 30.0
+"""Degrees that an axis of angles shows at least: a still angle should look still."""
+_FINE = 0.5
+"""Degrees of deviation below which errors have panels of their own."""
 _VIEW = np.radians(25.0)
 """Angle of the view from the person's front, so that depth is visible."""
 _LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
@@ -28,18 +32,29 @@ _LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed;
 def draw(tracked: Tracked, path: Path) -> None:
     """Draw the person and the angles of a recording, at least one frame, into a PNG file; raises as :func:`write`."""
     angles, known = tracked.angles, tracked.angles.known
-    height = _height(angles.names)
-    person = 3.6 if tracked.skeletons else 0.0
-    figure = _figure(0.3 + person + height)
-    parts = figure.subfigures(2, 1, height_ratios=(person, height)) if person else (figure,)
-    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {_LEGEND}", fontsize=11)
     start_ns = int(angles.stamps_ns[0])
-    if person:
-        _draw_person(parts[0], tracked, start_ns)
     times, true = (angles.stamps_ns - start_ns) / NANOSECONDS, true_at(angles, tracked.true_angles)
-    errors = angle_errors(known, true, angles.stddev)
-    _draw_angles(parts[-1], AngleComparison(angles.names, times, known, true, angles.stddev, errors))
+    shown = [AngleComparison(angles.names, times, known, true, angles.stddev, angle_errors(known, true, angles.stddev))]
+    if are_fine(angles) and np.isfinite(true).any():
+        names = tuple(f"error of {name}" for name in angles.names)
+        shown.append(
+            replace(shown[0], names=names, found=wrapped(known - true), true=np.where(np.isnan(true), true, 0))
+        )
+    heights = [3.6] * bool(tracked.skeletons) + [_height(each.names) for each in shown]
+    figure = _figure(0.3 + sum(heights))
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights) if len(heights) > 1 else (figure,)
+    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {_LEGEND}", fontsize=11)
+    if tracked.skeletons:
+        _draw_person(parts[0], tracked, start_ns)
+    for part, each in zip(parts[-len(shown) :], shown, strict=True):
+        _draw_angles(part, each, _STILL if each is shown[0] else 0.0)
     write(path, _png(figure))
+
+
+def are_fine(angles: AngleSeries) -> bool:
+    """Whether deviations are so small that neither a curve nor a tenth of a degree shows them."""
+    stated = angles.stddev[np.isfinite(angles.stddev)]
+    return bool(len(stated)) and float(np.degrees(np.median(stated))) < _FINE
 
 
 def pictures(result: Evaluation) -> list[tuple[str, str]]:
@@ -113,7 +128,7 @@ def _unbroken(degrees: FloatArray) -> FloatArray:
     return curve
 
 
-def _draw_angles(figure: Any, angles: AngleComparison) -> None:
+def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) -> None:
     panels, shown = _panels(angles.names), _thin(len(angles.times))
     axes = figure.subplots(-(-len(panels) // _COLUMNS), _COLUMNS, sharex=True, squeeze=False)
     times, stddev = angles.times[shown], angles.stddev[shown]
@@ -129,7 +144,7 @@ def _draw_angles(figure: Any, angles: AngleComparison) -> None:
         edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider ones would leave the curves flat
         edges = np.concatenate([found[:, columns] - edge, found[:, columns] + edge, true[:, columns]])
         least, most = (np.nanmin(edges), np.nanmax(edges)) if np.isfinite(edges).any() else (0.0, 0.0)
-        margin = max(0.05 * (most - least), 0.5 * (30.0 - (most - least)))  # a still angle should look still
+        margin = max(0.05 * (most - least), 0.5 * (still - (most - least)))
         axis.set_ylim(least - margin, most + margin)
         _label(axis, title)
     for axis in axes.flat[len(panels) :]:

@@ -158,11 +158,11 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
         body, angles = read_angles(bag, body)
         skeletons = read_skeletons(bag, graph.FILTERED)
     with RigReader(truth or path) as bag:
-        own, coordinates = (
-            read_joint_states(bag, topic, of) for topic, of in ((graph.TRUE_ANGLES, body), (graph.TRUE_MODEL_STATE, ""))
-        )
+        topic = graph.true_angles_topic(body)
+        own = read_joint_states(bag, topic if topic in bag.topics else graph.TRUE_ANGLES, body)
+        coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
         if truth is not None and own is None and coordinates is None:
-            raise EvaluationError(f"{truth}: holds no truth ({graph.TRUE_ANGLES}); recordings of simulate do")
+            raise EvaluationError(f"{truth}: holds no truth ({graph.TRUE_ANGLES}, {topic}); recordings of simulate do")
         return Tracked(
             bag=Path(path),
             body=body,

@@ -39,6 +39,7 @@ class Column(NamedTuple):
         unit: mm, deg, % or ms.
         values: (rows,) in the unit; NaN for no value.
         pool: combines rows into one.
+        digits: behind the point in text; None for those that are usual for the unit.
     """
 
     key: str
@@ -46,11 +47,12 @@ class Column(NamedTuple):
     unit: str
     values: FloatArray
     pool: Callable[[FloatArray], float] = np.mean
+    digits: int | None = None
 
     def text(self, row: int) -> str:
         """The formatted value of a row."""
         value = self.values[row]
-        return "-" if np.isnan(value) else f"{value:.{_DIGITS[self.unit]}f}"
+        return "-" if np.isnan(value) else f"{value:.{_DIGITS[self.unit] if self.digits is None else self.digits}f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

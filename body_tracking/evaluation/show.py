@@ -9,7 +9,7 @@ import numpy as np
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
-from body_tracking.evaluation.pictures import draw
+from body_tracking.evaluation.pictures import are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, read, true_at
 from body_tracking.evaluation.report import Column, Table
 
@@ -40,6 +40,8 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
             Column("max_error", "max err", "deg", np.degrees(errors.largest)),
             Column("within_2_stddev", "in 2 sd", "%", np.where(errors.frames > 0, 1e2 * share, np.nan)),
         ]
+    if are_fine(angles):
+        columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
     return Table("angles", "angle", angles.names, tuple(columns))
 
 

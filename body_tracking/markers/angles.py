@@ -26,7 +26,9 @@ from body_tracking.markers.pose_table import PoseTable, PoseTableError, pose_tab
 
 UNKNOWN: Final = 1.0
 """Radians: a coordinate with a larger standard deviation is not known: its target is not seen."""
-_LOOSE: Final = 1e-6
+_LOOSE: Final = 1e-2
+"""Information of a coordinate's step, 1/rad^2 and 1/m^2, beside that of the poses, 1e6 and more: the matrix can
+be inverted where the root target is not seen, and what is seen does not move."""
 _ITERATIONS: Final = 20
 _CONVERGED: Final = 1e-5
 """Radians and metres of a step after which there is none; the error left is about its square."""

@@ -203,7 +203,8 @@ _Boards = tuple[Rig, FloatArray, FloatArray]
 def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: Corners, free: BoolArray) -> Adjusted:
     """Fit cameras and boards to corners.
 
-    Gaschler (2011): eq. 4.9.
+    Gaschler (2011): eq. 4.9; figure 4.2; eq. 4.10-4.12: least squares are the most probable where the noise of all
+    corners is normal, independent and equal.
 
     Args:
         rig: where to begin.

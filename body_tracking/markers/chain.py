@@ -105,6 +105,7 @@ def fit_chain(
     frames: Sequence[Sequence[TargetPose]],
     description: Sequence[JointDescription],
     sensitivities: Sequence[Mapping[str, FloatArray]] | None = None,
+    shapes: Sequence[Mapping[str, FloatArray]] | None = None,
 ) -> ChainFit:
     """Fit all joints of a chain to a recording.
 
@@ -116,9 +117,11 @@ def fit_chain(
         description: of the joints, in any order.
         sensitivities: for each frame, of each of its targets, (6, q) derivative of its pose (as in
             :attr:`TargetPose.covariance`) by q parameters of the cameras' calibration. None where these are known.
+        shapes: for each frame, of each of its targets, (6, s) what the errors of its own geometry add to its pose
+            (:func:`body_tracking.markers.corrections.shape_effects`). None where the targets are known.
 
     Raises:
-        ChainError: sensitivities of another number of frames, not of all targets, or of other shapes.
+        ChainError: sensitivities or shapes of another number of frames, not of all targets, or of other shapes.
         JointFitError: too few frames in which both targets of a joint are seen.
         TreeError: the joints are no tree.
         JointError: an invalid name.
@@ -132,7 +135,13 @@ def fit_chain(
         ]
     )
     poses = pose_table(frames, tree.targets)
+    known = 0
     shared = None if sensitivities is None else _shared(poses, sensitivities)
+    if shared is not None:
+        known = shared.shape[-1]
+    if shapes is not None:
+        own = _own(poses, shapes)
+        shared = own if shared is None else np.concatenate([shared, own], axis=-1)
     rows: BoolArray = np.asarray(poses.seen.any(axis=1))
     poses, shared = poses.rows(rows), None if shared is None else shared[rows]
     fits = tuple(fit_joint(joint.name, joint.kind, poses, joint.parent, joint.child) for joint in tree.joints)
@@ -140,16 +149,30 @@ def fit_chain(
     found = maximise(tree.with_joints([fit.joint for fit in fits]), poses, MISFIT_WARNING, shared)
     if found.scale >= MISFIT_WARNING and not any(fit.scale >= MISFIT_WARNING for fit in fits):
         warnings.append(f"chain: errors are {found.scale:.2g} times the poses' noise, though each joint fits by itself")
-    return ChainFit(Chain(found.tree.joints, found.covariance, found.sensitivity, found.scale), fits, tuple(warnings))
+    # the targets' errors, which are the same in all frames, have no parameters that others share
+    of_shapes = found.sensitivity[:, known:]
+    covariance = found.covariance + of_shapes @ of_shapes.T
+    return ChainFit(
+        Chain(found.tree.joints, covariance, found.sensitivity[:, :known], found.scale), fits, tuple(warnings)
+    )
 
 
-def _shared(poses: PoseTable, sensitivities: Sequence[Mapping[str, FloatArray]]) -> FloatArray:
-    """(n, m, 6, q) sensitivities of the poses of a table, zeros of those that are not seen."""
+def _own(poses: PoseTable, shapes: Sequence[Mapping[str, FloatArray]]) -> FloatArray:
+    """(n, m, 6, s) the effects of all targets' errors, which are each target's own: zeros for those of others."""
+    parts = [_shared(poses, shapes, column) for column in range(len(poses.targets))]
+    return np.concatenate(parts, axis=-1)
+
+
+def _shared(poses: PoseTable, sensitivities: Sequence[Mapping[str, FloatArray]], only: int | None = None) -> FloatArray:
+    """(n, m, 6, q) sensitivities of the poses of a table, of one target or all; zeros of those that are not seen."""
     if len(sensitivities) != len(poses):
         raise ChainError(f"sensitivities of {len(sensitivities)} frames, expected {len(poses)}")
-    size = next((each.shape[-1] for frame in sensitivities for each in frame.values()), 0)
+    names = poses.targets if only is None else (poses.targets[only],)
+    size = next((frame[name].shape[-1] for frame in sensitivities for name in names if name in frame), 0)
     result = np.zeros((*poses.seen.shape, 6, size))
     for row, index in np.argwhere(poses.seen):
+        if only is not None and index != only:
+            continue
         given = sensitivities[row].get(poses.targets[index])
         if given is None or given.shape != (6, size) or not np.isfinite(given).all():
             shape = "none" if given is None else str(given.shape)

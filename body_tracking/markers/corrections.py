@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers import projection
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.rig import Rig
@@ -46,14 +46,55 @@ def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
     Returns:
         (6, p) in the order of :attr:`TargetPose.covariance`, per unit of each parameter of :class:`Rig`.
     """
-    turned = target.points @ pose.rotation.T
-    by_pose = np.concatenate([np.tile(np.eye(3), (len(turned), 1, 1)), -so3.skew(turned)], axis=-1)
-    information, pull, start = np.zeros((6, 6)), np.zeros((6, rig.size)), 0
+    return pose_sensitivities(rig, {target.name: target}, [pose])[target.name]
+
+
+def pose_sensitivities(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
+    """:func:`pose_sensitivity` of several targets at once, by their names."""
+    starts, by_pose, points = _balls(targets, poses)
+    information, pull, start = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6, rig.size)), 0
     for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
-        seen = projection.project(camera, rotation, translation, turned + pose.translation)
-        pixels_by_pose = (seen.by_point @ by_pose).reshape(-1, 6)
+        seen = projection.project(camera, rotation, translation, points)
+        by_ball = seen.by_point @ by_pose
+        turned_back = by_ball.swapaxes(1, 2)
         end = start + projection.size(camera)
-        information += pixels_by_pose.T @ pixels_by_pose
-        pull[:, start:end] = pixels_by_pose.T @ seen.by_parameters.reshape(-1, end - start)
+        information += np.add.reduceat(turned_back @ by_ball, starts)
+        pull[:, :, start:end] = np.add.reduceat(turned_back @ seen.by_parameters, starts)
         start = end
-    return np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)
+    moves = np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)
+    return {pose.name: each for pose, each in zip(poses, moves, strict=True)}
+
+
+def shape_effects(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
+    """What the errors of the targets' own geometry add to their poses, the same unknowns in all frames.
+
+    As :func:`pose_sensitivity`, for the pose that fits the pixels best.
+
+    Returns:
+        Of each target (6, 3k) in the order of :attr:`TargetPose.covariance`: what independent unknowns of variance 1,
+        that make up :attr:`Target.covariance`, add.
+    """
+    starts, by_pose, points = _balls(targets, poses)
+    information, pull = np.zeros((len(poses), 6, 6)), np.zeros((len(points), 6, 3))
+    for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
+        by_point = projection.project(camera, rotation, translation, points).by_point
+        by_ball = by_point @ by_pose
+        information += np.add.reduceat(by_ball.swapaxes(1, 2) @ by_ball, starts)
+        pull += by_ball.swapaxes(1, 2) @ by_point
+    effects = {}
+    for pose, start, known in zip(poses, starts.tolist(), information, strict=True):
+        target = targets[pose.name]
+        own = (pull[start : start + len(target.points)] @ pose.rotation).swapaxes(0, 1).reshape(6, -1)
+        values, vectors = np.linalg.eigh(target.covariance)
+        effects[pose.name] = np.linalg.solve(known, own) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return effects
+
+
+def _balls(targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Index of the first ball of each target, (b, 3, 6) derivatives of all balls by their poses, (b, 3) balls."""
+    turned = [targets[pose.name].points @ pose.rotation.T for pose in poses]
+    counts = [len(each) for each in turned]
+    arms = np.concatenate(turned)
+    by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -so3.skew(arms)], axis=-1)
+    points = arms + np.repeat([pose.translation for pose in poses], counts, axis=0)
+    return np.cumsum([0, *counts[:-1]]), by_pose, points

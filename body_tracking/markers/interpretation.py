@@ -8,15 +8,16 @@ at most, so the targets that compete for points are judged together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import FEWEST, chi_square_gate, maximum_likelihood, shape_covariance
+from body_tracking.markers.pose import FEWEST, balls_covariance, chi_square_gate, maximum_likelihood
 from body_tracking.markers.search import Deadline
 from body_tracking.markers.targets import Target
 
@@ -77,56 +78,87 @@ def fitted(
 
     A part of an assignment that fits is left out: the same with a ball less. Balls nearly on one line give no pose.
     """
-    by_size: dict[int, list[tuple[int, ...]]] = {}
-    for assignment in dict.fromkeys(assignments):
-        by_size.setdefault(sum(point >= 0 for point in assignment), []).append(assignment)
-    known: list[frozenset[tuple[int, int]]] = []
-    candidates: list[Candidate] = []
-    for size in sorted(by_size, reverse=True):
-        by_balls: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
-        for assignment in by_size[size]:
+    return fitted_together([(target, assignments)], points, deadline, missed)[0]
+
+
+def fitted_together(
+    wanted: Sequence[tuple[Target, Sequence[tuple[int, ...]]]],
+    points: Points,
+    deadline: Deadline,
+    missed: float = MISSED,
+) -> list[list[Candidate]]:
+    """:func:`fitted` of several targets, whose poses are computed at once: a call costs more than its numbers."""
+    by_size: dict[int, list[_Fitting]] = {}
+    for place, (target, assignments) in enumerate(wanted):
+        for assignment in dict.fromkeys(assignments):
             seen = tuple(ball for ball, point in enumerate(assignment) if point >= 0)
-            if not any(frozenset((ball, assignment[ball]) for ball in seen) <= larger for larger in known):
-                by_balls.setdefault(seen, []).append(assignment)
-        for seen, same in by_balls.items():
-            for start in range(0, len(same), _BATCH):
+            by_size.setdefault(len(seen), []).append(_Fitting(place, target, seen, assignment))
+    known: list[list[frozenset[tuple[int, int]]]] = [[] for _ in wanted]
+    candidates: list[list[Candidate]] = [[] for _ in wanted]
+    for size in sorted(by_size, reverse=True):
+        fittings = [
+            each
+            for each in by_size[size]
+            if _determined(each.target, each.seen) and not any(each.matches <= larger for larger in known[each.place])
+        ]
+        for known_shape in (True, False):
+            some = [each for each in fittings if (not each.target.covariance.any()) is known_shape]
+            for start in range(0, len(some), _BATCH):
                 deadline.check()
-                for candidate in _fit(target, points, seen, same[start : start + _BATCH], missed):
-                    candidates.append(candidate)
-                    known.append(frozenset((ball, candidate.assignment[ball]) for ball in seen))
-    return sorted(candidates, key=lambda candidate: candidate.cost)
+                for each, candidate in _fit(points, some[start : start + _BATCH], known_shape, missed):
+                    candidates[each.place].append(candidate)
+                    known[each.place].append(each.matches)
+    return [sorted(each, key=lambda candidate: candidate.cost) for each in candidates]
+
+
+class _Fitting(NamedTuple):
+    """An assignment to be fitted: of which of the targets, its balls that are seen, the point of each ball."""
+
+    place: int
+    target: Target
+    seen: tuple[int, ...]
+    assignment: tuple[int, ...]
+
+    @property
+    def matches(self) -> frozenset[tuple[int, int]]:
+        """Balls with their points."""
+        return frozenset((ball, self.assignment[ball]) for ball in self.seen)
+
+
+@lru_cache(maxsize=4096)
+def _determined(target: Target, seen: tuple[int, ...]) -> bool:
+    """Whether these balls of a target are not nearly on one line."""
+    return spread(target.points[list(seen)])
 
 
 def _fit(
-    target: Target, points: Points, seen: tuple[int, ...], assignments: list[tuple[int, ...]], missed: float
-) -> list[Candidate]:
-    balls = np.array(seen)
-    if not spread(target.points[balls]):
-        return []
-    count, size = len(assignments), len(seen)
-    chosen = np.array(assignments)[:, balls]
-    shape = shape_covariance(target, balls)
+    points: Points, fittings: Sequence[_Fitting], known_shape: bool, missed: float
+) -> Iterator[tuple[_Fitting, Candidate]]:
+    """Of assignments of as many balls each, those that fit."""
+    size = len(fittings[0].seen)
+    chosen = np.array([[each.assignment[ball] for ball in each.seen] for each in fittings])
     fits = maximum_likelihood(
-        np.broadcast_to(target.points[balls], (count, size, 3)),
+        np.stack([each.target.points[list(each.seen)] for each in fittings]),
         points.positions[chosen],
         points.covariance[chosen],
-        None if shape is None else np.broadcast_to(shape, (count, 3 * size, 3 * size)),
+        None if known_shape else np.stack([balls_covariance(each.target, np.array(each.seen)) for each in fittings]),
     )
     gate = chi_square_gate(3 * size - 6, missed)
-    hidden = HIDDEN_COST * (len(target.points) - size)
-    return [
-        Candidate(
-            assignments[row],
-            fits.rotation[row],
-            fits.translation[row],
-            fits.covariance[row],
-            float(fits.residual[row]),
-            float(fits.chi_square[row]),
-            float(fits.chi_square[row]) + hidden,
-            target.points @ fits.rotation[row].T + fits.translation[row],
+    for row in np.flatnonzero(fits.chi_square <= gate).tolist():
+        each = fittings[row]
+        yield (
+            each,
+            Candidate(
+                each.assignment,
+                fits.rotation[row],
+                fits.translation[row],
+                fits.covariance[row],
+                float(fits.residual[row]),
+                float(fits.chi_square[row]),
+                float(fits.chi_square[row]) + HIDDEN_COST * (len(each.target.points) - size),
+                each.target.points @ fits.rotation[row].T + fits.translation[row],
+            ),
         )
-        for row in np.flatnonzero(fits.chi_square <= gate)
-    ]
 
 
 def expected_by_chance(target: Target, points: Points, candidate: Candidate, poses: float | None = None) -> float:

@@ -7,6 +7,7 @@ a triangulated point is several times less sure along the line of sight than acr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -53,6 +54,7 @@ class Fits:
     residual: FloatArray
 
 
+@lru_cache(maxsize=256)
 def chi_square_gate(degrees: int, missed: float) -> float:
     """The value that a chi-square variable of so many degrees of freedom exceeds with this probability."""
     return 2.0 * float(gammainccinv(0.5 * degrees, missed))
@@ -174,10 +176,13 @@ def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose
 
 def shape_covariance(target: Target, balls: IntArray) -> FloatArray | None:
     """(1, 3m, 3m) of these balls of a target; None where the target is known exactly."""
-    if not target.covariance.any():
-        return None
+    return balls_covariance(target, balls)[None] if target.covariance.any() else None
+
+
+def balls_covariance(target: Target, balls: IntArray) -> FloatArray:
+    """(3m, 3m) of these balls of a target."""
     rows = (3 * balls[:, None] + np.arange(3)).ravel()
-    part: FloatArray = target.covariance[np.ix_(rows, rows)][None]
+    part: FloatArray = target.covariance[np.ix_(rows, rows)]
     return part
 
 

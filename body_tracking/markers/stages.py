@@ -18,7 +18,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import centred, pose_sensitivity
+from body_tracking.markers.corrections import centred, pose_sensitivities
 from body_tracking.markers.detection import DetectionSettings, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
@@ -143,11 +143,12 @@ class TriangulationStage(Stage):
     def _points(self, sets: Iterable[Mapping[str, ImageBalls]]) -> Iterator[Output]:
         for frames in sets:
             balls = tuple(frames.values())
-            self._monitor.take(balls)
             points = triangulate(self.rig, balls, self._settings)
             if self._diameter and len(points.positions):
                 points = triangulate(self.rig, centred(self.rig, balls, points, self._diameter), self._settings)
             yield Output(setup.POINTS, points, points.stamp_ns)
+            # nothing waits for it: after the points are on their way
+            self._monitor.take(balls)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -236,9 +237,7 @@ class AnglesOfTargetsStage(Stage):
 
     def _found(self, sets: Iterable[Mapping[str, TargetPose]]) -> Iterator[Output]:
         for poses in sets:
-            sensitivities = {
-                name: pose_sensitivity(self._rig, self._shapes[name], pose) for name, pose in poses.items()
-            }
+            sensitivities = pose_sensitivities(self._rig, self._shapes, list(poses.values()))
             found = self._angles.estimate(tuple(poses.values()), sensitivities, self._rig.covariance)
             angles = with_rates(found, self._last)
             self._last = angles

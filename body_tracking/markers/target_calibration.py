@@ -313,7 +313,10 @@ def _maximise(name: str, shape: FloatArray, views: FloatArray, seen: BoolArray, 
 
 
 def _without_frame(shape: FloatArray) -> FloatArray:
-    """(3k, 3k - 6) an orthonormal basis of the changes of points that neither move nor turn them as a whole."""
+    """(3k, 3k - 6) an orthonormal basis of the changes of points that neither move nor turn them as a whole.
+
+    Gaschler (2011): eq. 4.14-4.17 remove the same six degrees of freedom by zeros.
+    """
     balls = len(shape)
     motion = np.zeros((balls, 3, 6))
     motion[..., :3] = np.eye(3)
@@ -360,7 +363,10 @@ def _flexibility(residuals: FloatArray, seen: BoolArray, covariance: FloatArray 
 
 
 def _axes(name: str, shape: FloatArray) -> FloatArray:
-    """(3, 3) the rows are the axes of the target's frame."""
+    """(3, 3) the rows are the axes of the target's frame.
+
+    Gaschler (2011): eq. 4.14-4.17, the rotation of a QR decomposition with positive signs on R's diagonal.
+    """
     x = shape[1] - shape[0]
     x = x / np.linalg.norm(x)
     across = shape[2:] - shape[0]

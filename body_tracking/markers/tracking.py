@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,7 +12,7 @@ import numpy as np
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
-from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted
+from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted_together
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST, chi_square_gate
 from body_tracking.markers.recognition import Recogniser, check_points, target_pose
@@ -188,25 +188,30 @@ class TargetTracker:
         reach = max(float(shape.distances.max() + shape.tolerance.max()) for shape in self._recogniser.shapes.values())
         pairs = near_pairs(points.positions[rows], points.covariance[rows], reach)
         pairs = Pairs(rows[pairs.first], rows[pairs.second], pairs.low, pairs.high)
-        return {name: self._near(name, points, pairs, gate, until) for name, gate in gates.items()}
+        searches = {name: self._search(name, pairs, gate, until) for name, gate in gates.items()}
+        candidates: dict[str, list[Candidate]] = {name: [] for name in searches}
+        # one ball of each may be hidden; of targets that are not found so, one more each time
+        fewest = {name: max(FEWEST, len(self._targets[name].points) - 1) for name in searches}
+        left = list(searches)
+        while left:
+            found = [(self._targets[name], list(searches[name](fewest[name]))) for name in left]
+            for name, fits in zip(left, fitted_together(found, points, until), strict=True):
+                expected = [each for fit in fits if (each := _expected(self._tracks[name], fit)) is not None]
+                candidates[name] = sorted(expected, key=lambda candidate: candidate.cost)
+                fewest[name] -= 1
+            left = [name for name in left if not candidates[name] and fewest[name] >= FEWEST]
+        return candidates
 
-    def _near(self, name: str, points: Points, pairs: Pairs, gate: BoolArray, until: Deadline) -> list[Candidate]:
-        target, shape, track = self._targets[name], self._recogniser.shapes[name], self._tracks[name]
+    def _search(
+        self, name: str, pairs: Pairs, gate: BoolArray, until: Deadline
+    ) -> Callable[[int], Iterator[tuple[int, ...]]]:
+        """Assignments of points within a target's gates to at least so many of its balls."""
+        shape = self._recogniser.shapes[name]
         inside: BoolArray = np.asarray(gate.any(axis=0))
         both: BoolArray = inside[pairs.first] & inside[pairs.second]
-        own = Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both])
-        relations = shape.relations(own)
+        relations = shape.relations(Pairs(pairs.first[both], pairs.second[both], pairs.low[both], pairs.high[both]))
         allowed = [sum(1 << point for point in np.flatnonzero(row).tolist()) for row in gate]
-        for fewest in range(max(FEWEST, shape.balls - 1), FEWEST - 1, -1):
-            found = list(shape.assignments(relations, fewest, until, allowed))
-            candidates = [
-                expected
-                for candidate in fitted(target, points, found, until)
-                if (expected := _expected(track, candidate)) is not None
-            ]
-            if candidates:
-                return sorted(candidates, key=lambda candidate: candidate.cost)
-        return []
+        return lambda fewest: shape.assignments(relations, fewest, until, allowed)
 
     def _recognise(
         self, points: Points, chosen: dict[str, Candidate], unsure: set[str], until: Deadline

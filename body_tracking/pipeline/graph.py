@@ -160,6 +160,11 @@ def joint_states_stddev_topic(body: str) -> str:
     return f"{joint_states_topic(body)}_stddev"
 
 
+def true_angles_topic(body: str) -> str:
+    """The topic of the true joint angles of one body among several, or of a chain of targets."""
+    return f"/ground_truth/{body}/joint_states"
+
+
 def bodies_among(topics: Iterable[str]) -> tuple[str, ...]:
     """The ids of the persons whose joint angles are among these topics, sorted."""
     found = (re.fullmatch(r"/humans/bodies/([A-Za-z]\w*)/joint_states", topic) for topic in topics)

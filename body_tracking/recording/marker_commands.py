@@ -23,10 +23,10 @@ from body_tracking.core.parameters import Value, check_all
 from body_tracking.markers import setup
 from body_tracking.markers.boards import Chessboard
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
-from body_tracking.markers.chain import JointDescription, fit_chain
+from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
 from body_tracking.markers.chain_files import save_chain, to_urdf
 from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import pose_sensitivity
+from body_tracking.markers.corrections import pose_sensitivities, shape_effects
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
@@ -141,6 +141,26 @@ def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetP
     return [frames[stamp_ns] for stamp_ns in sorted(frames)]
 
 
+def fit_recording(bag_path: Path, folder: Path, joints: Sequence[JointDescription], diameter: float) -> ChainFit:
+    """The chain of a recording in which every joint moves.
+
+    Args:
+        bag_path: with images, balls or points.
+        folder: the setup, of which ``rig.yaml`` and ``targets.yaml`` are read.
+        joints: of the chain.
+        diameter: of the balls, metres, or 0.
+
+    Raises:
+        BodyTrackingError: the recording or the setup cannot be used, or the joints cannot be fitted.
+    """
+    rig = load_rig(setup.file_of(folder, setup.RIG, "calibrate"))
+    targets = {each.name: each for each in load_targets(setup.file_of(folder, setup.TARGETS, "target"))}
+    frames = poses_of(bag_path, folder, diameter)
+    sensitivities = [pose_sensitivities(rig, targets, poses) for poses in frames]
+    shapes = [shape_effects(rig, targets, poses) for poses in frames]
+    return fit_chain(frames, joints, sensitivities, shapes)
+
+
 # --- commands
 
 
@@ -223,11 +243,7 @@ def fit(args: argparse.Namespace) -> int:
         if len(parts) != 4 or parts[1] not in tuple(JointKind):
             raise MarkerCommandError(f"joint {entry!r}: expected NAME:KIND:PARENT:CHILD, KIND {', '.join(JointKind)}")
         joints.append(JointDescription(parts[0], parts[2], parts[3], JointKind(parts[1])))
-    rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
-    targets = {each.name: each for each in load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))}
-    frames = poses_of(args.bag, args.setup, args.diameter)
-    sensitivities = [{each.name: pose_sensitivity(rig, targets[each.name], each) for each in poses} for poses in frames]
-    found = fit_chain(frames, joints, sensitivities)
+    found = fit_recording(args.bag, args.setup, joints, args.diameter)
     path = args.setup / setup.CHAIN
     save_chain(found.chain, path)
     path.with_suffix(".urdf").write_text(to_urdf(found.chain, "markers"), encoding="utf-8")

@@ -30,6 +30,7 @@ from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
+from body_tracking.simulation import marker_bags
 from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
@@ -223,13 +224,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     bags = subparsers.add_parser(
         "make-bags",
-        description="Simulate two Kinect v2 sensors and a person in three motions, and write a bag of each.",
+        description="Simulate two Kinect v2 sensors and a person in three motions, and two infrared cameras and an arm "
+        "with targets, and write a bag of each.",
     )
     bags.add_argument(
         "-o", "--output", type=Path, default=Path("bags"), metavar="FOLDER", help="where the bags go (default: bags)"
     )
     bags.add_argument("--seed", type=int, default=SEED, help=f"of the random generators (default: {SEED})")
-    bags.add_argument("--motion", choices=sorted(SHIPPED), help="only this one")
+    bags.add_argument(
+        "--setup",
+        type=Path,
+        default=Path("config") / "marker_setup",
+        metavar="FOLDER",
+        help=f"where the setup of {marker_bags.SHIPPED} goes (default: %(default)s)",
+    )
+    bags.add_argument("--motion", choices=[*sorted(SHIPPED), marker_bags.SHIPPED], help="only this one")
     bags.set_defaults(run=make_bags)
 
 
@@ -287,6 +296,8 @@ def make_bags(args: argparse.Namespace) -> int:
             recording = simulate(shipped(name, args.seed))
             write_bag(recording, args.output / name, overwrite=True)
             _print_summary(recording, args.output / name)
+    if args.motion in (None, marker_bags.SHIPPED):
+        marker_bags.make_shipped(args.output, args.setup)
     return 0
 
 

@@ -1,9 +1,15 @@
-"""``body_tracking markers render``: images of a simulated arm with targets, as a bag, and the setup to track them."""
+"""``body_tracking markers render``: images of a simulated arm with targets, as a bag, and the setup to track them.
+
+Also the recording of images that is shipped, ``bags/markers_arm``, and its setup, ``config/marker_setup``.
+"""
 
 from __future__ import annotations
 
 import argparse
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -13,6 +19,9 @@ from body_tracking.core.message_types import IMAGE, JOINT_STATE
 from body_tracking.core.qos import LATCHED, RELIABLE
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.markers import setup
+from body_tracking.markers.boards import Chessboard, Image
+from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
+from body_tracking.markers.chain_files import save_chain
 from body_tracking.markers.codecs import CameraImage, Info
 from body_tracking.markers.rendering import Sensor, render, render_chessboard
 from body_tracking.markers.rig import Rig
@@ -20,19 +29,33 @@ from body_tracking.markers.rig_storage import save_rig
 from body_tracking.markers.targets_file import save_targets
 from body_tracking.messages.base import to_header
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.pipeline import graph
+from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter
-from body_tracking.simulation.marker_scene import DIAMETER, MarkerScene, marker_scene
+from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene
 from body_tracking.simulation.repertoire import MOTIONS
 
 START_NS = 1_750_000_000 * NANOSECONDS
-TRUE_ANGLES = f"/ground_truth/{setup.BODY}/joint_states"
+TRUE_ANGLES = graph.true_angles_topic(setup.BODY)
 COLUMNS, ROWS, SQUARE = 9, 6, 0.04
 """Of the chessboard: inner corners, and metres."""
+SHIPPED: Final = "markers_arm"
+"""The recording of images in ``bags/``."""
+DARK: Final = Sensor(background=0.0, read_noise=0.0008)
+"""The sensor of the shipped images: 62 dB from the read noise to saturation, as data sheets of global shutter sensors
+have it, and a filter that leaves no light but the balls'. Most dark pixels are 0 then, and the images compress to a
+thirtieth; with the noise of :class:`Sensor` itself they compress to a fifth."""
+SEED, _MOTION = 10, "random"
+"""A motion that turns all joints about all their axes, no angle near where it is not determined."""
+_RATE, _FIT_RATE = 30.0, 15.0
+_START, _SECONDS, _FIT_SECONDS = 15.0, 5.0, 14.0
+"""The joints are fitted to the beginning of the motion, the recording is what follows later."""
+_BOARDS: Final = 16
 
 
 def write_scene(scene: MarkerScene, output: Path, sensor: Sensor, seed: int, *, overwrite: bool = False) -> None:
-    """Write images, calibrations and true angles of the elbow.
+    """Write images, calibrations and the true angles of the scene's chain.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
@@ -45,50 +68,116 @@ def write_scene(scene: MarkerScene, output: Path, sensor: Sensor, seed: int, *, 
             bag.write(setup.info_topic(camera.frame_id), Info().encode((START_NS, camera), BAG_WIRE), START_NS)
         bag.add_topic(TRUE_ANGLES, JOINT_STATE, RELIABLE)
         progress = Progress(0, len(scene.times))
-        velocity = np.gradient(scene.translations, scene.times, axis=0)
+        angles = scene.angles()
         for index, time in enumerate(scene.times - scene.times[0]):
             stamp_ns = START_NS + round(float(time) * NANOSECONDS)
-            balls = scene.balls(index)
-            speeds = np.repeat(velocity[index], [len(target.points) for target in scene.targets], axis=0)
-            for camera, rotation, translation in zip(
-                scene.rig.cameras, scene.rig.rotations, scene.rig.translations, strict=True
-            ):
-                image = render(
-                    camera, rotation, translation, balls, DIAMETER, sensor, seed * 100_003 + index, velocities=speeds
-                ).image
+            for camera, image in zip(scene.rig.cameras, images(scene, index, sensor, seed), strict=True):
                 message = CameraImage().encode((stamp_ns, camera.frame_id, image), BAG_WIRE)
                 bag.write(setup.image_topic(camera.frame_id), message, stamp_ns)
-            bag.write(TRUE_ANGLES, _angles(stamp_ns, frames[0], scene.elbow[index]), stamp_ns)
+            bag.write(TRUE_ANGLES, _angles(stamp_ns, frames[0], scene.chain.angle_names, angles[index]), stamp_ns)
             progress.at(index)
         progress.end()
 
 
-def _angles(stamp_ns: int, frame_id: str, elbow: FloatArray) -> bytes:
+def images(scene: MarkerScene, index: int, sensor: Sensor, seed: int) -> list[Image]:
+    """The image of each camera at one time; balls move during the exposure."""
+    near = slice(max(index - 1, 0), index + 2)
+    velocity = np.gradient(scene.translations[near], scene.times[near], axis=0)[index - near.start]
+    speeds = np.repeat(velocity, [len(target.points) for target in scene.targets], axis=0)
+    return [
+        render(
+            camera,
+            rotation,
+            translation,
+            scene.balls(index),
+            DIAMETER,
+            sensor,
+            seed * 100_003 + index,
+            velocities=speeds,
+        ).image
+        for camera, rotation, translation in zip(
+            scene.rig.cameras, scene.rig.rotations, scene.rig.translations, strict=True
+        )
+    ]
+
+
+def _angles(stamp_ns: int, frame_id: str, names: tuple[str, ...], angles: FloatArray) -> bytes:
     message = BAG_MESSAGES.make(
         JOINT_STATE,
         header=to_header(stamp_ns, frame_id, BAG_MESSAGES),
-        name=["elbow_flexion", "forearm_pronation"],
-        position=BAG_MESSAGES.floats(np.ascontiguousarray(elbow)),
+        name=list(names),
+        position=BAG_MESSAGES.floats(angles),
         velocity=BAG_MESSAGES.floats(np.empty(0)),
         effort=BAG_MESSAGES.floats(np.empty(0)),
     )
     return BAG_WIRE.serialize(JOINT_STATE, message)
 
 
-def write_boards(rig: Rig, folder: Path, count: int, seed: int) -> None:
-    """Write images of a chessboard, held in ``count`` poses before the rig, a folder per camera."""
+def board_images(rig: Rig, count: int, seed: int, sensor: Sensor | None = None) -> Iterator[list[Image]]:
+    """An image of each camera of a chessboard that is held in ``count`` poses before the rig."""
     rng = np.random.default_rng([seed, 1999])
     size = np.array([(COLUMNS - 1) * SQUARE, (ROWS - 1) * SQUARE, 0.0])
-    for camera in rig.cameras:
-        (folder / setup.camera_name(camera.frame_id)).mkdir(parents=True, exist_ok=True)
     for number in range(count):
         turn = so3.quat_to_matrix(so3.exp(rng.uniform(-0.5, 0.5, 3)))
         place = np.array([rng.uniform(-0.05, 0.2), rng.uniform(-0.1, 0.1), rng.uniform(0.9, 1.5)]) - turn @ size / 2.0
-        for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
-            image = render_chessboard(
-                camera, rotation @ turn, rotation @ place + translation, COLUMNS, ROWS, SQUARE, seed * 1009 + number
+        yield [
+            render_chessboard(
+                camera,
+                rotation @ turn,
+                rotation @ place + translation,
+                COLUMNS,
+                ROWS,
+                SQUARE,
+                seed * 1009 + number,
+                sensor,
             )
-            cv2.imwrite(str(folder / setup.camera_name(camera.frame_id) / f"{number:02d}.png"), image)
+            for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True)
+        ]
+
+
+def write_boards(rig: Rig, folder: Path, count: int, seed: int) -> None:
+    """Write images of a chessboard, held in ``count`` poses before the rig, a folder per camera."""
+    names = [setup.camera_name(camera.frame_id) for camera in rig.cameras]
+    for name in names:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    for number, images in enumerate(board_images(rig, count, seed)):
+        for name, image in zip(names, images, strict=True):
+            cv2.imwrite(str(folder / name / f"{number:02d}.png"), image)
+
+
+def shipped_scene() -> MarkerScene:
+    """The motion in the shipped recording."""
+    return marker_scene(_MOTION, SEED, _RATE, _SECONDS, _START)
+
+
+def make_shipped(bags: Path, folder: Path) -> None:
+    """Write the shipped recording of images, and the setup to track it, as a laboratory would make it.
+
+    The cameras are calibrated from rendered boards, the geometry of the targets is known as from a drawing, and the
+    joints are fitted to rendered images of an earlier part of the motion.
+
+    Args:
+        bags: folder of the recording :data:`SHIPPED`, which is replaced.
+        folder: of the setup, whose files are replaced.
+
+    Raises:
+        BagError: the recording cannot be written.
+    """
+    scene = shipped_scene()
+    write_scene(scene, bags / SHIPPED, DARK, SEED, overwrite=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    series = list(zip(*board_images(scene.rig, _BOARDS, SEED, DARK), strict=True))
+    frames = [camera.frame_id for camera in scene.rig.cameras]
+    sizes = [(camera.width, camera.height) for camera in scene.rig.cameras]
+    found = calibrate_cameras(frames, sizes, find_boards(Chessboard(COLUMNS, ROWS, SQUARE), series))
+    save_rig(found.rig, folder / setup.RIG)
+    save_targets(scene.targets, folder / setup.TARGETS)
+    with tempfile.TemporaryDirectory() as temporary:
+        motion = Path(temporary) / "motion"
+        write_scene(marker_scene(_MOTION, SEED, _FIT_RATE, _FIT_SECONDS, 0.0), motion, DARK, SEED + 1)
+        save_chain(fit_recording(motion, folder, JOINTS, DIAMETER).chain, folder / setup.CHAIN)
+    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
+    print(f"{bags / SHIPPED}: {len(scene.times)} pairs of images, {size / 1e6:.2f} MB; setup in {folder}")
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -14,7 +14,11 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.markers.angles import AngleEstimator
+from body_tracking.markers.chain import Chain, JointDescription
+from body_tracking.markers.joint_model import SIZE, Joint, JointKind, axis_frame, conventional
+from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.targets import Target
 from body_tracking.simulation.people import MODEL, Person
@@ -26,11 +30,22 @@ DIAMETER: Final = 0.014
 EXTENT: Final = 0.098
 SEGMENTS: Final = {"shoulder": "clavicle_left", "upper_arm": "upper_arm_left", "forearm": "forearm_left"}
 """The segment that carries each target."""
+JOINTS: Final = (
+    JointDescription("shoulder", "shoulder", "upper_arm", JointKind.BALL),
+    JointDescription("elbow", "upper_arm", "forearm", JointKind.UNIVERSAL),
+)
+"""Between the targets."""
 _MOUNTS: Final = {"shoulder": (0.03, 0.10, 0.05), "upper_arm": (0.03, 0.06, -0.14), "forearm": (0.03, 0.05, -0.13)}
 """Where on its segment, metres: x forward, y to the left, z up, while the arm hangs."""
 _TRIALS: Final = 2000
+_APART: Final = 2.0 * DIAMETER
+"""Metres between the centres of two balls of a target, at least."""
 _AWAY: Final = 1.7
 """Metres from the rig to the middle of the arm."""
+_FLEXION, _PRONATION = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+"""Axes of the elbow in the upper arm's segment and in the forearm's (:mod:`body_tracking.kinematics.upper_body`)."""
+_EXACT: Final = 1e-6
+"""Standard deviation of a true pose, metres and radians: a covariance has to be positive definite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +60,7 @@ class MarkerScene:
         translations: (n, t, 3) metres: true poses of the targets in the rig's frame.
         shoulder: (n, 3, 3) true rotations of the upper arm's target by the shoulder's.
         elbow: (n, 2) radians, flexion and pronation.
+        chain: the true joints, exactly known.
     """
 
     rig: Rig
@@ -54,6 +70,7 @@ class MarkerScene:
     translations: FloatArray
     shoulder: FloatArray
     elbow: FloatArray
+    chain: Chain
 
     def balls(self, index: int) -> FloatArray:
         """(b, 3) all balls at one time in the rig's frame, target by target."""
@@ -63,6 +80,34 @@ class MarkerScene:
                 for target, rotation, translation in zip(
                     self.targets, self.rotations[index], self.translations[index], strict=True
                 )
+            ]
+        )
+
+    def poses(self, index: int, stamp_ns: int) -> list[TargetPose]:
+        """The true poses of all targets at one time, without noise but for :data:`_EXACT`."""
+        return [
+            TargetPose(
+                target.name,
+                stamp_ns,
+                self.rig.cameras[0].frame_id,
+                rotation,
+                translation,
+                _EXACT**2 * np.eye(6),
+                np.arange(len(target.points)),
+                0.0,
+            )
+            for target, rotation, translation in zip(
+                self.targets, self.rotations[index], self.translations[index], strict=True
+            )
+        ]
+
+    def angles(self) -> FloatArray:
+        """(n, k) true angles of :attr:`chain`, radians, by the conventions of :mod:`body_tracking.markers.angles`."""
+        estimator, start = AngleEstimator(self.chain), self.times[0]
+        return np.stack(
+            [
+                estimator.estimate(self.poses(index, round((time - start) * NANOSECONDS))).angles
+                for index, time in enumerate(self.times)
             ]
         )
 
@@ -91,11 +136,11 @@ def make_targets(seed: int = 0) -> tuple[Target, ...]:
             drawn = rng.uniform(-0.5, 0.5, (5, 3)) * np.array([1.0, 1.0, 0.45])
             drawn *= EXTENT / _distances(drawn).max()
             own = _distances(drawn)
+            if own.min() < _APART:
+                continue
             others = np.concatenate([own, *(_distances(each.points) for each in found)])
-            # balls well apart, distances within a target far from each other, those of different targets less so
-            worth = min(
-                own.min() / 2.5 / DIAMETER, np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4
-            )
+            # distances within a target far from each other, those of different targets less so
+            worth = min(np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4)
             if worth > best:
                 best, points = worth, drawn - drawn.mean(axis=0)
         found.append(Target(name, points, np.zeros((15, 15)), DIAMETER))
@@ -108,20 +153,26 @@ def _distances(points: FloatArray) -> FloatArray:
     return apart
 
 
-def marker_scene(motion: str = "reaching", seed: int = 0, rate: float = 60.0, seconds: float = 20.0) -> MarkerScene:
+def marker_scene(
+    motion: str = "reaching", seed: int = 0, rate: float = 60.0, seconds: float = 20.0, start: float | None = None
+) -> MarkerScene:
     """A person, drawn by the seed, who moves before the rig.
 
     Args:
         motion: of the repertoire.
         seed: of the person and the manner.
         rate: images a second.
-        seconds: from the middle of the motion.
+        seconds: of the motion.
+        start: seconds of the motion that are left out before; None takes its middle.
     """
     rng = np.random.default_rng([seed, 20110215])
     person = Person.draw(rng)
+    # the same in all motions of a person, so that joints fitted to one serve for the others
+    worn = so3.quat_to_matrix(so3.exp(np.random.default_rng([seed, 98]).normal(0.0, 0.3, (len(SEGMENTS), 3))))
     movement = make_movement(motion, person, rng, None)
     count = round(rate * min(seconds, movement.duration))
-    times = max(0.0, 0.5 * (movement.duration - count / rate)) + np.arange(count) / rate
+    start = max(0.0, 0.5 * (movement.duration - count / rate)) if start is None else start
+    times = start + np.arange(count) / rate
     course = movement.course(times)
     posture = MODEL.forward(course.q, person.lengths)
     indices = [MODEL.segment_names.index(segment) for segment in SEGMENTS.values()]
@@ -131,7 +182,6 @@ def marker_scene(motion: str = "reaching", seed: int = 0, rate: float = 60.0, se
     rig = stereo_rig()
     middle = 0.5 * (APART - _AWAY * np.tan(TOED_IN))  # between the axes of the cameras
     mounts = np.array([_MOUNTS[name] for name in SEGMENTS])
-    worn = so3.quat_to_matrix(so3.exp(rng.normal(0.0, 0.3, (len(SEGMENTS), 3))))
     on_segments = posture.rotations[:, indices]
     origins = posture.origins[:, indices] + np.einsum("ntij,tj->nti", on_segments, mounts)
     translations = (origins - away) @ to_rig.T + np.array([middle, 0.0, _AWAY])
@@ -139,4 +189,34 @@ def marker_scene(motion: str = "reaching", seed: int = 0, rate: float = 60.0, se
     upper, lower = (MODEL.coordinate_names.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left"))
     angles = MODEL.difference(MODEL.neutral(), course.q)[:, [upper, lower]]
     shoulder = rotations[:, 0].transpose(0, 2, 1) @ rotations[:, 1]
-    return MarkerScene(rig, make_targets(), times, rotations, translations, shoulder, angles)
+    centres = (posture.origins[0, indices] - away) @ to_rig.T + np.array([middle, 0.0, _AWAY])
+    chain = _true_chain(rotations[0], translations[0], centres, worn)
+    return MarkerScene(rig, make_targets(), times, rotations, translations, shoulder, angles, chain)
+
+
+def _true_chain(rotations: FloatArray, translations: FloatArray, origins: FloatArray, worn: FloatArray) -> Chain:
+    """The joints, by poses (3, ...) of the targets and origins (3, 3) of their segments, which are the joints' centres.
+
+    ``worn``: (3, 3, 3) rotations of the targets in their segments.
+    """
+    joints: list[Joint] = []
+    for child, described in enumerate(JOINTS, 1):
+        parent = child - 1
+        own, other = (rotations[index].T @ (origins[child] - translations[index]) for index in (parent, child))
+        frames = np.eye(3), np.eye(3)
+        if described.kind is JointKind.UNIVERSAL:
+            frames = axis_frame(worn[parent].T @ _FLEXION, own), axis_frame(worn[child].T @ _PRONATION, other)
+        joint = Joint(
+            described.name,
+            described.parent,
+            described.child,
+            described.kind,
+            frames[0],
+            own,
+            frames[1],
+            other,
+            np.zeros((SIZE, SIZE)),
+        )
+        joints.append(conventional(joint)[0])
+    size = SIZE * len(joints)
+    return Chain(tuple(joints), np.zeros((size, size)), np.zeros((size, 0)))

@@ -43,7 +43,10 @@ def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def triangulate(pixels: FloatArray) -> FloatArray:
-    """(n, 3) points by the linear method (Hartley and Sturm 1997, section 5.1), from pixels (2, n, 2)."""
+    """(n, 3) points by the linear method (Hartley and Sturm 1997, section 5.1), from pixels (2, n, 2).
+
+    Gaschler (2011): eq. 3.4-3.5.
+    """
     flat = pixels / _FOCAL
     poses = np.concatenate([ROTATIONS, TRANSLATIONS[..., None]], axis=2)
     rows = flat[..., None] * poses[:, None, 2:] - poses[:, None, :2]

@@ -263,3 +263,15 @@ def test_places_follow_from_turns() -> None:
             assert (
                 np.abs(rotations[:, parent] @ joint.parent_axis - rotations[:, child] @ joint.child_axis).max() < 1e-12
             )
+
+
+def test_a_root_that_is_not_seen_takes_the_angles_of_its_joints_only() -> None:
+    """Where it is, and how its joints are turned, are not determined then; all others are, however small the noise."""
+    for seed, scale in ((50, 1.0), (51, 0.1), (52, 0.01)):
+        rng, tree = arm(seed)
+        whole, without = AngleEstimator(known(tree)), AngleEstimator(known(tree))
+        for frame in measured(rng, tree, random_posture(rng, tree, 15), scale):
+            one = whole.estimate(frame)
+            other = without.estimate([pose for pose in frame if pose.name != "torso"])
+            assert np.isnan(other.angles[:3]).all() and np.isinf(other.stddev[:3]).all()
+            assert (np.abs(other.angles[3:] - one.angles[3:]) < 6.0 * other.stddev[3:]).all()

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.rendering import Capsule, RenderingError, Sensor, render, render_chessboard
 from body_tracking.markers.spheres import SphereError, outlines, polygon_centroids, sphere_centre_correction
 from body_tracking.simulation.ball_images import CAMERA, DIAMETER, HERE, NOISELESS, apart, at, half_hidden, overlapping
+from body_tracking.simulation.marker_scene import EXTENT, make_targets
 from draws import draws
 
 RADIUS = 0.5 * DIAMETER
@@ -125,3 +127,11 @@ def test_impossible_scenes_are_errors() -> None:
         Sensor(bits=20)
     with pytest.raises(RenderingError):
         render_chessboard(CAMERA, *HERE, 0, 6, 0.03, 0)
+
+
+def test_balls_of_the_scenes_targets_do_not_touch_and_the_targets_are_told_apart() -> None:
+    targets = make_targets()
+    for target in targets:
+        apart = np.linalg.norm(target.points[:, None] - target.points, axis=2)[np.triu_indices(5, 1)]
+        assert apart.min() >= 2.0 * DIAMETER and apart.max() == pytest.approx(EXTENT)
+    check_distinct(targets, 3e-4)
