@@ -18,8 +18,8 @@ is bilinear in vec Z and vec X, so that the largest singular vector of the stack
 
 with the scatter of the estimate's errors S_t, estimated from the residuals, plus the target's own covariance. Outliers
 are downweighted as by a multivariate Student distribution (Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989)
-881). Errors of a tracker are correlated over time, so the variance of a target's scores is multiplied by the samples per
-independent sample: the integral of the autocorrelation of its residuals.
+881). Errors of a tracker are correlated over time, so the variance of a target's scores is multiplied by the number
+of samples per independent sample: the integral of the autocorrelation of its residuals.
 """
 
 from __future__ import annotations
@@ -206,7 +206,8 @@ def principal_motion(targets: FloatArray, known: BoolArray) -> FloatArray:
         if len(there):
             turns = rotation_vectors(there @ nearest_rotation(there.sum(axis=0)).T)
             scatter, count = scatter + turns.T @ turns, count + len(turns)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(scatter / max(count, 1))[::-1], 0.0))
+    motion: FloatArray = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter / max(count, 1))[::-1], 0.0))
+    return motion
 
 
 def fit_hand_eye(
@@ -273,7 +274,7 @@ class _Fit:
         known_mountings: dict[str, Mounting],
     ) -> None:
         self.times, self.targets, self.names = times, targets, tuple(names)
-        self.seen: BoolArray = np.isfinite(segments).all(axis=(-1, -2))
+        self.seen: BoolArray = np.asarray(np.isfinite(segments).all(axis=(-1, -2)))
         self.segments = np.where(self.seen[..., None, None], segments, np.eye(3))
         self.middle = float(times.mean()) if middle is None else middle
         self.clock, self.begin = clock.copy(), clock.copy()
