@@ -33,7 +33,7 @@ import numpy as np
 from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, correlation_time
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import BoolArray, FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers.joints import ONE_AXIS, SMALL_MOTION
 
 MAX_GAP: Final = 0.1
@@ -194,8 +194,13 @@ def closed_form(segments: FloatArray, targets: FloatArray, known: BoolArray) -> 
     left = np.linalg.svd(np.concatenate(sums / np.maximum(weight.sum(axis=0), 1.0)[:, None, None], axis=1))[0]
     world = left[:, 0].reshape(3, 3)
     world = nearest_rotation(world * np.sign(np.linalg.det(world)))
-    mountings = np.einsum("nk,nkca,cd,nkdb->kab", weight, segments, world, targets, optimize=True)
-    return world, nearest_rotation(mountings)
+    return world, mountings_in(world, segments, targets, known)
+
+
+def mountings_in(world: FloatArray, segments: FloatArray, targets: FloatArray, known: BoolArray) -> FloatArray:
+    """(k, 3, 3) X of eq. 1 for a given Z; other arguments as of :func:`closed_form`."""
+    weight = known.astype(np.float64)
+    return nearest_rotation(np.einsum("nk,nkca,cd,nkdb->kab", weight, segments, world, targets, optimize=True))
 
 
 def principal_motion(targets: FloatArray, known: BoolArray) -> FloatArray:
@@ -231,7 +236,8 @@ def fit_hand_eye(
         clock: (2,) offset at ``middle`` and drift to begin with, correct to within 0.15 s.
         fit_clock: whether to fit the clock too.
         middle: s of ``times`` at which the offset is that of ``clock``; the mean time where None.
-        known_mountings: of some targets, by name: further observations of their X.
+        known_mountings: of some targets, by name: their X, which is not fitted. The estimate would pull it to where its
+            own constant errors vanish.
 
     Raises:
         HandEyeError: too few instants, or a motion that is small or about one axis only.
@@ -279,7 +285,14 @@ class _Fit:
         self.middle = float(times.mean()) if middle is None else middle
         self.clock, self.begin = clock.copy(), clock.copy()
         self.size = 3 * len(targets) + 5
-        self.priors = [(names.index(name), each) for name, each in known_mountings.items() if name in names]
+        self.fixed: BoolArray = np.array([name in known_mountings for name in names])
+        self.given = np.zeros((self.size, self.size))
+        self.mountings = np.broadcast_to(np.eye(3), (len(targets), 3, 3)).copy()
+        for number, name in enumerate(names):
+            if name in known_mountings:
+                where = slice(3 * number, 3 * number + 3)
+                self.given[where, where] = known_mountings[name].covariance
+                self.mountings[number] = known_mountings[name].rotation
 
     def sample(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Targets' rotations and covariances at the present clock, and which instants count, (n, k, ...)."""
@@ -304,12 +317,20 @@ class _Fit:
         first, second, _ = np.degrees(self.motion)
         least = np.degrees(SMALL_MOTION)
         moved = f"the targets turned by {first:.2g} deg RMS about one axis and by {second:.2g} about a second"
-        if not self.priors and (second < least or second < ONE_AXIS * first):
+        if not self.fixed.any() and (second < least or second < ONE_AXIS * first):
             raise HandEyeError(
                 f"{moved}; mountings and world are not determined unless the second is at least {least:.0f} deg and a "
                 f"tenth of the first: every target on a segment that moves, or another motion"
             )
-        self.world, self.mountings = closed_form(self.segments, rotations, known)
+        if self.fixed.any():
+            weight, there = known[:, self.fixed], (self.segments @ self.mountings)[:, self.fixed]
+            self.world = nearest_rotation(
+                np.einsum("nk,nkac,nkbc->ab", weight, there, rotations[:, self.fixed], optimize=True)
+            )
+            found = mountings_in(self.world, self.segments, rotations, known)
+            self.mountings = np.where(self.fixed[:, None, None], self.mountings, found)
+        else:
+            self.world, self.mountings = closed_form(self.segments, rotations, known)
         residuals = self.residuals(rotations)
         squares = (residuals**2).sum(axis=-1)
         self.scatter = np.stack(
@@ -321,13 +342,14 @@ class _Fit:
         return rotation_vectors(self.mountings @ rotations.swapaxes(-1, -2) @ self.world.T @ self.segments)
 
     def descend(self, fit_clock: bool) -> None:
-        free = self.size if fit_clock else self.size - 2
+        free = self._free(fit_clock)
         for _ in range(_ITERATIONS):
             normal = self._normal()
             information, gradient = normal.information.sum(axis=0), normal.gradient
-            self._add_priors(information, gradient)
+            information[-1, -1] += DRIFT_PRIOR**-2
+            gradient[-1] += self.clock[1] * DRIFT_PRIOR**-2
             step = np.zeros(self.size)
-            step[:free] = np.linalg.solve(information[:free, :free], -gradient[:free])
+            step[free] = np.linalg.solve(information[np.ix_(free, free)], -gradient[free])
             step[-2] = np.clip(step[-2], -0.05, 0.05)
             self._move(step)
             if np.abs(step).max() < _CONVERGED:
@@ -368,15 +390,12 @@ class _Fit:
         self.scatter = (axes * np.maximum(values, _LEAST_SCATTER)[:, None]) @ axes.swapaxes(-1, -2)
         return _Normal(gradient, information, weights, distance, known)
 
-    def _add_priors(self, information: FloatArray, gradient: FloatArray) -> None:
-        """The drift's prior, and mountings that are known from elsewhere."""
-        information[-1, -1] += DRIFT_PRIOR**-2
-        gradient[-1] += self.clock[1] * DRIFT_PRIOR**-2
-        for number, prior in self.priors:
-            where = slice(3 * number, 3 * number + 3)
-            precision = np.linalg.inv(prior.covariance)
-            information[where, where] += precision
-            gradient[where] += precision @ rotation_vectors(self.mountings[number] @ prior.rotation.T)
+    def _free(self, fit_clock: bool) -> IntArray:
+        """Indices of what is fitted."""
+        free = np.ones(self.size, dtype=np.bool_)
+        free[:-5] = ~np.repeat(self.fixed, 3)
+        free[-2:] = fit_clock
+        return np.flatnonzero(free)
 
     def _move(self, step: FloatArray) -> None:
         turns = so3.quat_to_matrix(so3.exp(step[:-2].reshape(-1, 3)))
@@ -387,14 +406,17 @@ class _Fit:
         """The solution with the sandwich covariance: information per target, times its residuals' variance."""
         normal = self._normal()
         residuals = np.where(normal.known[..., None], self.residuals(self.sample()[0]), np.nan)
-        free = self.size if fit_clock else self.size - 2
+        free, given = self._free(fit_clock), np.flatnonzero(np.repeat(self.fixed, 3))
         factors = np.array([self._factors(normal, residuals, k) for k in range(len(self.names))])
         information, middle = np.tensordot(factors, normal.information, axes=(0, 0))
-        self._add_priors(information, np.zeros(self.size))
-        inverse = np.linalg.inv(information[:free, :free])
-        self._add_priors(middle, np.zeros(self.size))
-        covariance = np.zeros((self.size, self.size))
-        covariance[:free, :free] = inverse @ middle[:free, :free] @ inverse
+        information[-1, -1] += DRIFT_PRIOR**-2
+        middle[-1, -1] += DRIFT_PRIOR**-2
+        inverse = np.linalg.inv(information[np.ix_(free, free)])
+        # an error of a given mounting moves what is fitted
+        moves = np.eye(self.size)
+        moves[np.ix_(free, given)] = -inverse @ information[np.ix_(free, given)]
+        covariance = moves @ self.given @ moves.T
+        covariance[np.ix_(free, free)] += inverse @ middle[np.ix_(free, free)] @ inverse
         return HandEye(
             self.world, self.mountings, self.clock, self.middle, covariance, self.scatter, residuals, self.motion
         )

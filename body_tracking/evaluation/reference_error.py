@@ -57,7 +57,7 @@ class Judged:
         measured: RMS difference.
         reference: RMS deviation of the reference, root of V.
         error: RMS error of the estimate by eq. 1; NaN where the reference is too poor.
-        low, high: its 95 % interval; where the reference is too poor ``low`` is NaN, and ``high`` that of the difference.
+        low, high: its 95 % interval; NaN and that of the difference where the reference is too poor.
         offset: mean difference, a length for orientations; NaN where mountings are fitted, which absorb it.
         offset_stddev: of the offset.
         change: mean difference in the second half less that in the first, half of it as each half is measured by the
@@ -113,10 +113,13 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
         ]
     )
     by_mounting = float(share @ np.sqrt(drawn)) ** 2 if mountings_known else float(share**2 @ drawn)
-    freedom = 2.0 * measured**2 / max(float(share**2 @ sampling) + by_mounting, 1e-30)
-    tail = 0.5 * (1.0 - _LEVEL)
-    low, high = (freedom * measured / chi2.ppf(each, freedom) - reference for each in (1.0 - tail, tail))
     poor = not np.sqrt(reference) < TOO_POOR * np.sqrt(measured)
+    # for an upper bound without the reference: its errors only add to the difference
+    scatter = float(share**2 @ sampling) + (0.0 if poor else by_mounting)
+    freedom = max(2.0 * measured**2 / max(scatter, 1e-30), 1.0)
+    tail = 0.5 * (1.0 - _LEVEL)
+    low, high = (freedom * measured / chi2.ppf(each, freedom) for each in (1.0 - tail, tail))
+    low, high = (low, high) if poor else (max(low - reference, 0.0), max(high - reference, 0.0))
     offset, offset_stddev = _offset(parts, share, means, mountings) if mountings_known else (np.nan, np.nan)
     change = 0.5 * (means[-1] - means[0])
     return Judged(
@@ -125,8 +128,8 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
         float(np.sqrt(measured)),
         float(np.sqrt(reference)),
         float("nan") if poor else float(np.sqrt(max(measured - reference, 0.0))),
-        float("nan") if poor else float(np.sqrt(max(low, 0.0))),
-        float(np.sqrt(max(high + (reference if poor else 0.0), 0.0))),
+        float("nan") if poor else float(np.sqrt(low)),
+        float(np.sqrt(high)),
         offset,
         offset_stddev,
         _signed(change),

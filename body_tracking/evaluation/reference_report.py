@@ -88,8 +88,8 @@ def facts(result: ReferenceEvaluation) -> str:
         ("compared", f"{result.seconds:.2f} s; each half by mountings that were fitted to the other"),
         (
             "clock",
-            f"the reference's minus the estimate's {result.offset_s:+.4f} s +- {1e3 * result.clock_stddev:.1f} ms (less "
-            f"any constant delay of the estimate), drift {drift:+.0f} +- {drift_stddev:.0f} ppm",
+            f"the reference's minus the estimate's {result.offset_s:+.4f} s, +- {1e3 * result.clock_stddev:.1f} ms "
+            f"(less any constant delay of the estimate), drift {drift:+.0f} +- {drift_stddev:.0f} ppm",
         ),
         ("world", f"rig to world known to {np.degrees(fit.world_stddev):.2f} deg per axis"),
         ("motion", f"of the targets {first:.0f} deg RMS about one axis, {second:.0f} about a second"),
