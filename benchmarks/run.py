@@ -135,6 +135,12 @@ BENCHMARKS = (
         recordings("marker_functional"),
         1,
     ),
+    Benchmark(
+        "markers_reference",
+        "a Kinect judged by the marker system beside the truth, and a real pendulum by Vicon",
+        NOTHING,
+        6,
+    ),
     Benchmark("latency", "delay from capture to angles through the live graph, beside bare relays", NOTHING, 1),
     Benchmark("four_sensors", "four sensors live with `ekf`: frames lost, processor time, delay", NOTHING, 1),
     Benchmark("imu_live", "ten inertial sensors and two Kinects live: delay, and whether it grows", NOTHING, 2),
