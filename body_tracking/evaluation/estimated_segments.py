@@ -174,6 +174,6 @@ def split_near(chain: Chain, rotations: FloatArray, near: FloatArray) -> tuple[F
     Returns:
         (n, 3) radians and (n, 3, 3) their derivatives by a rotation in the parent's frame.
     """
-    sequences = EulerSequences([chain.angles] * len(rotations))
-    split = sequences.split(rotations, np.zeros((len(rotations), 3)), near)
+    # one sequence, which all instants share
+    split = EulerSequences([chain.angles]).split(rotations, np.zeros((len(rotations), 3)), near)
     return split.angles, split.gradients

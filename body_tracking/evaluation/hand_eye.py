@@ -252,14 +252,14 @@ class _Normal(NamedTuple):
     """Normal equations.
 
     Attributes:
-        gradient: (p,) of the cost.
+        scores: (n, k, p) gradient of the cost at each instant by each target.
         information: (k, p, p) by each target.
         weights: (n, k) of the Student distribution; 0 where unknown.
         distance: (n, k) squared Mahalanobis distance of the residuals.
         known: (n, k).
     """
 
-    gradient: FloatArray
+    scores: FloatArray
     information: FloatArray
     weights: FloatArray
     distance: FloatArray
@@ -345,7 +345,7 @@ class _Fit:
         free = self._free(fit_clock)
         for _ in range(_ITERATIONS):
             normal = self._normal()
-            information, gradient = normal.information.sum(axis=0), normal.gradient
+            information, gradient = normal.information.sum(axis=0), normal.scores.sum(axis=(0, 1))
             information[-1, -1] += DRIFT_PRIOR**-2
             gradient[-1] += self.clock[1] * DRIFT_PRIOR**-2
             step = np.zeros(self.size)
@@ -381,14 +381,14 @@ class _Fit:
         derivative[..., -2] = -turning
         derivative[..., -1] = -turning * (self.times - self.middle)[:, None, None]
         weighted = weights[..., None, None] * precision @ derivative
-        gradient = np.einsum("nkip,nki->p", weighted, residuals)
+        scores = np.einsum("nkip,nki->nkp", weighted, residuals)
         information = np.einsum("nkip,nkiq->kpq", weighted, derivative, optimize=True)
         shares = weights / np.maximum(known.sum(axis=0), 1)
         scatter = np.einsum("nk,nki,nkj->kij", shares, residuals, residuals)
         scatter -= np.einsum("nk,nkij->kij", known / np.maximum(known.sum(axis=0), 1), own)
         values, axes = np.linalg.eigh(scatter)
         self.scatter = (axes * np.maximum(values, _LEAST_SCATTER)[:, None]) @ axes.swapaxes(-1, -2)
-        return _Normal(gradient, information, weights, distance, known)
+        return _Normal(scores, information, weights, distance, known)
 
     def _free(self, fit_clock: bool) -> IntArray:
         """Indices of what is fitted."""
@@ -403,12 +403,17 @@ class _Fit:
         self.clock = self.clock + step[-2:]
 
     def result(self, fit_clock: bool) -> HandEye:
-        """The solution with the sandwich covariance: information per target, times its residuals' variance."""
+        """The solution with the sandwich covariance (White 1980).
+
+        The scatter of the scores has what targets' errors have in common, as by the pelvis of which all segments hang.
+        """
         normal = self._normal()
         residuals = np.where(normal.known[..., None], self.residuals(self.sample()[0]), np.nan)
         free, given = self._free(fit_clock), np.flatnonzero(np.repeat(self.fixed, 3))
-        factors = np.array([self._factors(normal, residuals, k) for k in range(len(self.names))])
-        information, middle = np.tensordot(factors, normal.information, axes=(0, 0))
+        bends, samples = np.array([self._factors(normal, residuals, k) for k in range(len(self.names))]).T
+        information = np.tensordot(bends, normal.information, axes=1)
+        scores = np.tensordot(normal.scores, np.sqrt(samples), axes=([1], [0]))
+        middle = scores.T @ scores
         information[-1, -1] += DRIFT_PRIOR**-2
         middle[-1, -1] += DRIFT_PRIOR**-2
         inverse = np.linalg.inv(information[np.ix_(free, free)])
@@ -422,7 +427,7 @@ class _Fit:
         )
 
     def _factors(self, normal: _Normal, residuals: FloatArray, target: int) -> tuple[float, float]:
-        """Second derivative of a target's cost, and variance of its scores, in units of its information.
+        """Second derivative of a target's cost in units of its information, and samples per independent sample.
 
         The weights fall where residuals grow, which takes 2/3 of ``w d / (freedom + d)`` off the second derivative.
         """
@@ -432,5 +437,4 @@ class _Fit:
         step = float(np.median(np.diff(self.times[known])))
         columns = (weights[:, None] * residuals[known, target]).T
         correlated = [correlation_time(column - column.mean(), step) / step for column in columns]
-        spread = float((weights**2 * distance).mean() / 3.0 * np.mean(correlated))
-        return bend / float(weights.mean()), spread / float(weights.mean())
+        return bend / float(weights.mean()), float(np.mean(correlated))

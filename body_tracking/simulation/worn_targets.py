@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,11 @@ class WornTargets:
     stddev: float
     mountings: FloatArray
     world: FloatArray
+
+    def until(self, seconds: float) -> WornTargets:
+        """Only what is measured in the first seconds."""
+        count = int(np.searchsorted(self.times, self.times[0] + seconds))
+        return replace(self, times=self.times[:count], rotations=self.rotations[:count])
 
     @property
     def covariances(self) -> FloatArray:
