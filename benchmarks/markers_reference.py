@@ -5,7 +5,8 @@ with 0.15 degrees of noise. The clock of the marker system is 1.7 s and 50 ppm o
 Replayed with each filter, the estimate is judged as ``body_tracking evaluate EST --truth MARKERS`` does.
 
 - ``by markers``: RMS error of an angle that the reference gives, with its interval.
-- ``true``: RMS of the same angle's true error without its mean, which mountings absorb.
+- ``true``: RMS of the same angle's true error without its mean. Mountings absorb more than means: a constant rotation
+  of each segment.
 - ``inside``: share of angles whose true error lies in the interval, of those for which the reference is not too poor.
 - ``clock``: error of the offset, which has the filter's delay in it, in ms, beside its stated deviation.
 
@@ -27,16 +28,18 @@ import common
 import numpy as np
 from imu_pendulum import LINKS, SETTLING_S, fit, one_offset, record
 
+from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.evaluation.estimated_segments import read_segments
+from body_tracking.evaluation.estimated_segments import joint_chains, read_segments, split_near
 from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye, rotation_vectors
 from body_tracking.evaluation.marker_reference import read_marker_reference
 from body_tracking.evaluation.metrics import wrapped
-from body_tracking.evaluation.reading import read_truth, true_angles, true_at
+from body_tracking.evaluation.reading import read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.inertial.clock import clock_offset, turning
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import Setup, simulate
 from body_tracking.simulation.worn_targets import ARM, wear_targets, write_targets
 
@@ -95,8 +98,11 @@ def judge(job: Job) -> Case:
         write_targets(worn, folder / "markers", int(truth.stamps_ns[0]))
         estimate = read_segments(folder / "out")
         result = evaluate_by_markers(estimate, read_marker_reference(folder / "markers"))
-        true = true_at(estimate.angles, true_angles(estimate.angles.names, truth.angles, truth.coordinates))
-        return Case(job, *_clock(result, int(truth.stamps_ns[0])), tuple(_angles(result, true)))
+        rotations = MODEL.forward(q, MODEL.default_lengths()).rotations
+        everywhere = np.zeros((len(times), 3, 3))
+        true = {segment: Track(times, rotations[:, SEGMENT_NUMBER[segment]], everywhere) for segment in worn.segments}
+        elapsed = int(estimate.stamps_ns[0] - truth.stamps_ns[0]) / NANOSECONDS
+        return Case(job, *_clock(result, int(truth.stamps_ns[0])), tuple(_angles(result, true, elapsed)))
 
 
 def _clock(result: ReferenceEvaluation, zero_ns: int) -> tuple[float, float]:
@@ -105,19 +111,29 @@ def _clock(result: ReferenceEvaluation, zero_ns: int) -> tuple[float, float]:
     return 1e3 * (result.offset_s - OFFSET - DRIFT * elapsed), 1e3 * result.clock_stddev
 
 
-def _angles(result: ReferenceEvaluation, true: FloatArray) -> list[Angle]:
-    """What the markers give and what is true, of the instants that the markers compare."""
-    series = result.estimate.angles
+def _angles(result: ReferenceEvaluation, true: dict[str, Track], elapsed: float) -> list[Angle]:
+    """What the markers give and what is true at the same instants, of equivalent triples of angles the nearest one.
+
+    Args:
+        result: by the markers.
+        true: orientations of the segments, in s since the truth begins.
+        elapsed: s from then until the estimate begins.
+    """
     found = []
-    for each in result.angles:
-        column = series.names.index(each.name)
-        here = result.curves.names.index(each.name)
-        at = result.estimate.stamps_ns[0] + np.rint(result.curves.times * NANOSECONDS).astype(np.int64)
-        compared = at[np.isfinite(result.curves.true[:, here])]
-        rows = np.isin(series.stamps_ns, compared)
-        error = wrapped(series.position[rows, column] - true[rows, column])
-        spread = float(np.nanstd(error))
-        found.append(Angle(each.name, *np.degrees([spread, each.error, each.low, each.high]).tolist()))
+    curves, judged = result.curves, {each.name: each for each in result.angles}
+    for chain in joint_chains(result.estimate.convention, frozenset(true), MODEL):
+        named = [name for name in chain.names if name in curves.names]
+        near = np.zeros((len(curves.times), 3))
+        for place, name in enumerate(chain.names):
+            if name in named:
+                near[:, place] = curves.found[:, curves.names.index(name)]
+        parent, child = (true[each].at(curves.times + elapsed) for each in (chain.parent, chain.child))
+        angles, _ = split_near(chain, parent.rotations.swapaxes(-1, -2) @ child.rotations, np.nan_to_num(near))
+        for place, name in enumerate(chain.names):
+            if name in named and name in judged:
+                compared = np.isfinite(curves.true[:, curves.names.index(name)]) & parent.known & child.known
+                error, each = wrapped(near[:, place] - angles[:, place])[compared], judged[name]
+                found.append(Angle(name, *np.degrees([error.std(), each.error, each.low, each.high]).tolist()))
     return found
 
 
