@@ -149,9 +149,12 @@ def test_deviations_are_true_over_seeds(correlation: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("link", [1, 2, 3])
+@pytest.mark.parametrize("link", [1, 2])
 def test_a_real_pendulum_tells_the_clock_and_nothing_of_mountings(shared_data: Path, link: int) -> None:
-    """It turns about one axis. Sensors and Vicon were stamped together: the offset is some ms, and wanders by 20."""
+    """It turns about one axis. Sensors and Vicon were stamped together: the offset is some ms, and wanders by 20.
+
+    Not the third link, whose markers Vicon swapped for seconds, which looks like motion about a second axis.
+    """
     path = shared_data / "imu" / "pendulum_with_reference" / f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz"
     if not path.is_file():
         pytest.skip(f"{path} is absent")
