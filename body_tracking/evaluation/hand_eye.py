@@ -41,7 +41,7 @@ MAX_GAP: Final = 0.1
 MIN_SAMPLES: Final = 60
 """Instants at which a segment and its target must both be known: 2 s of a camera at 30 Hz."""
 _FREEDOM: Final = 5.0
-"""Degrees of freedom of the Student distribution: 5 keeps 94 % of the efficiency for normal errors."""
+"""Degrees of freedom of the Student distribution: 5 keeps 91 % of the efficiency for normal errors."""
 _MEDIAN_3: Final = 2.366
 """Median of the chi squared distribution with three degrees of freedom."""
 _LEAST_SCATTER: Final = np.radians(0.05) ** 2
