@@ -5,11 +5,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from body_tracking.evaluation import reference_report
 from body_tracking.evaluation.comparison import EvaluationParameters, evaluate
-from body_tracking.evaluation.pictures import pictures
+from body_tracking.evaluation.estimated_segments import read_segments
+from body_tracking.evaluation.marker_reference import (
+    is_marker_reference,
+    load_mountings,
+    read_marker_reference,
+    save_mountings,
+)
+from body_tracking.evaluation.pictures import LEGEND, angle_picture, pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
+from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.evaluation.report import as_csv, as_json, facts, page, text, write
 from body_tracking.recording.replay import Progress
+from body_tracking.recording.rig import RigReader
 
 _DEFAULTS = EvaluationParameters()
 
@@ -44,7 +54,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--truth",
         type=Path,
         metavar="TRUTH",
-        help="a bag with /ground_truth/skeleton (default: EST itself), or a C3D file with Plug-in Gait's markers",
+        help="a bag with /ground_truth/skeleton (default: EST itself), a C3D file with Plug-in Gait's markers, or a "
+        "recording of the marker system, with poses of targets",
     )
     parser.add_argument("--topic", help="skeletons to judge (default: /filtered/skeleton, else /fused/skeleton)")
     parser.add_argument("--body", metavar="ID", help="whose angles (default: the first in the recording)")
@@ -59,6 +70,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--measurements", type=Path, metavar="FILE", help="the subject's, from Vicon (default: those in the C3D file)"
     )
     parser.add_argument(
+        "--mounted",
+        action="append",
+        default=[],
+        metavar="TARGET=SEGMENT",
+        help="of a recording of the marker system: the segment that carries a target; may be repeated (default: the "
+        "segment of the target's name)",
+    )
+    parser.add_argument(
+        "--mountings",
+        type=Path,
+        metavar="FILE",
+        help="likewise: how targets are mounted, as --save-mountings wrote it; constant offsets of EST show only so",
+    )
+    parser.add_argument(
+        "--save-mountings", type=Path, metavar="FILE", help="likewise: write how the targets are mounted by EST"
+    )
+    parser.add_argument(
         "--off-track",
         type=float,
         default=1e3 * _DEFAULTS.beyond,
@@ -71,9 +99,52 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+def _by_markers(args: argparse.Namespace) -> bool:
+    """Whether the truth is a recording of the marker system.
+
+    Raises:
+        BagError: the truth is no readable bag.
+        EvaluationError: an option for such recordings was given with another truth, or the other way round.
+    """
+    found = False
+    if args.truth is not None and args.truth.suffix.lower() != ".c3d":
+        with RigReader(args.truth) as bag:
+            found = is_marker_reference(bag)
+    if not found:
+        for name in ("mounted", "mountings", "save_mountings"):
+            if getattr(args, name):
+                option = name.replace("_", "-")
+                raise EvaluationError(
+                    f"--{option}: of a recording of the marker system; the truth is {args.truth or args.estimate}"
+                )
+    return found
+
+
+def _judge_by_markers(args: argparse.Namespace) -> ReferenceEvaluation:
+    for name in ("subject", "measurements"):
+        if getattr(args, name) is not None:
+            raise EvaluationError(f"--{name}: of a C3D file; the truth is {args.truth}")
+    reference = read_marker_reference(args.truth, args.mounted)
+    known = None if args.mountings is None else load_mountings(args.mountings, reference.segments)
+    result = evaluate_by_markers(read_segments(args.estimate, args.topic, args.body), reference, known)
+    if args.save_mountings is not None:
+        save_mountings(args.save_mountings, result.mountings, reference.segments)
+    return result
+
+
 def run(args: argparse.Namespace) -> int:
     if not 0.0 < args.off_track < float("inf"):
         raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm, and finite")
+    if _by_markers(args):
+        judged = _judge_by_markers(args)
+        if args.html is not None:
+            drawn = [(f"Angles, degrees; {LEGEND}", angle_picture(judged.curves))] if judged.angles else []
+            write(args.html, reference_report.page(judged, drawn).encode())
+        if args.csv is not None:
+            write(args.csv, reference_report.as_csv(judged).encode())
+        lines = f"{reference_report.facts(judged)}\n{reference_report.text(judged)}"
+        _print(args, reference_report.as_json(judged) if args.json else lines)
+        return 0
     progress = Progress(0, 1000)
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)
@@ -86,9 +157,13 @@ def run(args: argparse.Namespace) -> int:
         write(args.html, page(result, pictures(result)).encode())
     if args.csv is not None:
         write(args.csv, as_csv(result).encode())
-    print(as_json(result) if args.json else f"{facts(result)}\n{text(result)}")
+    _print(args, as_json(result) if args.json else f"{facts(result)}\n{text(result)}")
+    return 0
+
+
+def _print(args: argparse.Namespace, content: str) -> None:
+    print(content)
     if not args.json:
-        for name, path in (("numbers", args.csv), ("report", args.html)):
+        for name, path in (("numbers", args.csv), ("report", args.html), ("mountings", args.save_mountings)):
             if path is not None:
                 print(f"\n{name}: {path}")
-    return 0

@@ -26,7 +26,7 @@ _FINE = 0.5
 """Degrees of deviation below which errors have panels of their own."""
 _VIEW = np.radians(25.0)
 """Angle of the view from the person's front, so that depth is visible."""
-_LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
+LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
 
 
 def draw(tracked: Tracked, path: Path) -> None:
@@ -43,7 +43,7 @@ def draw(tracked: Tracked, path: Path) -> None:
     heights = [3.6] * bool(tracked.skeletons) + [_height(each.names) for each in shown]
     figure = _figure(0.3 + sum(heights))
     parts = figure.subfigures(len(heights), 1, height_ratios=heights) if len(heights) > 1 else (figure,)
-    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {_LEGEND}", fontsize=11)
+    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {LEGEND}", fontsize=11)
     if tracked.skeletons:
         _draw_person(parts[0], tracked, start_ns)
     for part, each in zip(parts[-len(shown) :], shown, strict=True):
@@ -61,16 +61,21 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
     """Captions and ``data:`` addresses of the pictures of an evaluation's report."""
     first = result.comparisons[0]
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
-    stated = np.isfinite(angles.stddev)
-    figure = _figure(_height(angles.names))
-    _draw_angles(figure, replace(angles, found=np.where(stated | ~stated.any(), angles.found, np.nan)))
     drawn = [
         (f"Distance of each joint from the truth, mm, {first.name}; white: not known in both", _errors(result)),
-        (f"Angles, degrees, {first.name}; {_LEGEND}", _address(figure)),
+        (f"Angles, degrees, {first.name}; {LEGEND}", angle_picture(angles)),
     ]
     if result.calibration:
         drawn.append(("Calibration over time against the true one", _calibration(result)))
     return drawn
+
+
+def angle_picture(angles: AngleComparison) -> str:
+    """``data:`` address of a picture of angles beside true ones, without those that the estimate does not state."""
+    stated = np.isfinite(angles.stddev)
+    figure = _figure(_height(angles.names))
+    _draw_angles(figure, replace(angles, found=np.where(stated | ~stated.any(), angles.found, np.nan)))
+    return _address(figure)
 
 
 def _figure(height: float) -> Any:

@@ -6,7 +6,7 @@ import csv
 import html
 import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -210,12 +210,17 @@ def text(result: Evaluation) -> str:
 
 def as_csv(result: Evaluation) -> str:
     """A line per number: table, row, column, unit, value; the value is empty for NaN."""
+    return tables_as_csv([("recording", "all", "delay", "ms", 1e3 * result.delay)], tables(result))
+
+
+def tables_as_csv(others: Iterable[tuple[str, str, str, str, float]], shown: Iterable[Table]) -> str:
+    """As :func:`as_csv`, of other numbers (table, row, column, unit, value) and of tables."""
     lines = io.StringIO()
     writer = csv.writer(lines, lineterminator="\n")
     writer.writerow(("table", "row", "column", "unit", "value"))
-    numbers = [("recording", "all", "delay", "ms", 1e3 * result.delay)] + [
+    numbers = [*others] + [
         (table.key, name, column.key, column.unit, column.values[row])
-        for table in tables(result)
+        for table in shown
         for row, name in enumerate(table.names)
         for column in table.columns
     ]
@@ -223,43 +228,54 @@ def as_csv(result: Evaluation) -> str:
     return lines.getvalue()
 
 
+def numbered(value: float) -> float | None:
+    """A number for JSON; null for NaN and infinity."""
+    return round(float(value), 6) if np.isfinite(value) else None
+
+
 def as_json(result: Evaluation) -> str:
     """Facts and tables as JSON; null for NaN."""
-
-    def number(value: float) -> float | None:
-        return round(float(value), 6) if np.isfinite(value) else None
-
     content = {
         "estimate": str(result.estimate.source),
         "topic": result.estimate.topic,
         "truth": str(result.truth.source),
-        "span_s": [number(each) for each in result.span],
-        "delay_ms": number(1e3 * result.delay),
+        "span_s": [numbered(each) for each in result.span],
+        "delay_ms": numbered(1e3 * result.delay),
         "notes": list(result.notes),
-        "tables": {
-            table.key: {
-                "units": {column.key: column.unit for column in table.columns},
-                "rows": {
-                    name: {column.key: number(column.values[row]) for column in table.columns}
-                    for row, name in enumerate(table.names)
-                },
-            }
-            for table in tables(result)
-        },
     }
-    return json.dumps(content, indent=1)
+    return tables_as_json(content, tables(result))
+
+
+def tables_as_json(content: Mapping[str, object], shown: Iterable[Table]) -> str:
+    """JSON of some facts, and tables under the key ``tables``."""
+    by_key = {
+        table.key: {
+            "units": {column.key: column.unit for column in table.columns},
+            "rows": {
+                name: {column.key: numbered(column.values[row]) for column in table.columns}
+                for row, name in enumerate(table.names)
+            },
+        }
+        for table in shown
+    }
+    return json.dumps({**content, "tables": by_key}, indent=1)
 
 
 def page(result: Evaluation, pictures: Iterable[tuple[str, str]]) -> str:
     """One self-contained HTML page; ``pictures`` are captions and ``data:`` addresses."""
-    title = html.escape(f"{result.estimate.source.name}: accuracy")
+    return tables_as_page(f"{result.estimate.source.name}: accuracy", facts(result), text(result), pictures)
+
+
+def tables_as_page(name: str, lines: str, shown_tables: str, pictures: Iterable[tuple[str, str]]) -> str:
+    """One self-contained HTML page of a title, facts, tables and pictures as of :func:`page`."""
+    title = html.escape(name)
     shown = "".join(f'<h2>{html.escape(caption)}</h2>\n<img alt="" src="{data}">\n' for caption, data in pictures)
     return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <style>body {{ max-width: 1250px; margin: auto; }} h2 {{ font: 16px sans-serif; }} img {{ max-width: 100%; }}</style>
 </head><body><h1>{title}</h1>
-<pre>{html.escape(facts(result))}</pre>
-{shown}<pre>{html.escape(text(result))}</pre>
+<pre>{html.escape(lines)}</pre>
+{shown}<pre>{html.escape(shown_tables)}</pre>
 </body></html>
 """
 

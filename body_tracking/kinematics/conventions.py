@@ -91,6 +91,7 @@ class Convention:
 
     Attributes:
         names: n, in the order of the output.
+        chains: all of them, those that use frames last.
         rows: (n,) row of each among all computed quantities: coordinates, then three angles of each chain.
         stages: chains that are computed together: their sequences, parents and children among the segments, and rows.
     """
@@ -113,6 +114,7 @@ class Convention:
             later: chains that use the frames.
         """
         self.names = tuple(names)
+        self.chains = (*chains, *later)
         self._model = model
         self._frames = [
             (segment, frame.chain, frame.count)
@@ -125,10 +127,9 @@ class Convention:
         rows = {name: number for number, name in enumerate(coordinates)}
         self._scalar: IntArray = model.scalar_q
         self._scalar_row: IntArray = (model.scalar_v - 6).astype(np.intp)
-        all_chains = [*chains, *later]
         count = len(coordinates)
-        zero = count + 3 * len(all_chains)
-        for number, chain in enumerate(all_chains):
+        zero = count + 3 * len(self.chains)
+        for number, chain in enumerate(self.chains):
             rows |= {name: count + 3 * number + k for k, name in enumerate(chain.names) if name is not None}
             rows |= dict.fromkeys(chain.redundant, zero)
         self.rows: IntArray = np.array([rows[name] for name in names], dtype=np.intp)

@@ -1,0 +1,245 @@
+"""A Kinect judged by the marker system, beside the truth: simulated people, and a real pendulum.
+
+``people``: a simulated person before one Kinect wears targets on thorax, clavicle, upper arm and forearm, each pose
+with 0.15 degrees of noise. The clock of the marker system is 1.7 s and 50 ppm off, rig and mountings are random.
+Replayed with each filter, the estimate is judged as ``body_tracking evaluate EST --truth MARKERS`` does.
+
+- ``by markers``: RMS error of an angle that the reference gives, with its interval.
+- ``true``: RMS of the same angle's true error without its mean. Mountings absorb more than means: a constant rotation
+  of each segment.
+- ``inside``: share of angles whose true error lies in the interval, of those for which the reference is not too poor.
+- ``clock``: error of the offset, which has the filter's delay in it, in ms, beside its stated deviation.
+
+``pendulum``: orientations of a real pendulum's links from raw inertial data (RepoIMU), judged by Vicon as if its
+clusters were targets. Every link turns about one axis only, so that the fit has to refuse (``refused``). With the
+mounting of the other half, of which one free rotation about that axis is chosen as it comes, world and clock are fitted
+there and the difference is taken here. ``imu_pendulum`` fits mounting and world to the whole recording: ``1 offset``
+there is the figure to compare with; its smaller ones follow Vicon's wandering clock, which this cannot.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import common
+import numpy as np
+from imu_pendulum import LINKS, SETTLING_S, fit, one_offset, record
+
+from body_tracking.core.orientation import SEGMENT_NUMBER
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.evaluation.estimated_segments import joint_chains, read_segments, split_near
+from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye, rotation_vectors
+from body_tracking.evaluation.marker_reference import read_marker_reference
+from body_tracking.evaluation.metrics import wrapped
+from body_tracking.evaluation.reading import read_truth
+from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
+from body_tracking.inertial.clock import clock_offset, turning
+from body_tracking.recording.replay import ReplaySettings, replay
+from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.scene import Setup, simulate
+from body_tracking.simulation.worn_targets import ARM, wear_targets, write_targets
+
+OFFSET, DRIFT = 1.7, 50e-6
+SECONDS = 40.0
+MOTIONS = ("reaching", "arm_raises", "punching")
+FILTERS = ("lkf_constant_velocity", "ekf")
+FIRST_SEED = 700
+"""Other people than those of the tests."""
+SHOWN = ("shoulder_abduction_left", "elbow_flexion_left", "forearm_pronation_left")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One person in one motion with one filter."""
+
+    motion: str
+    filter: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Angle:
+    """Degrees."""
+
+    name: str
+    true: float
+    error: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """Result of a job; milliseconds."""
+
+    job: Job
+    clock_error: float
+    clock_stddev: float
+    angles: tuple[Angle, ...]
+
+
+def judge(job: Job) -> Case:
+    """Simulate, replay, judge."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recording = simulate(Setup(job.motion, seconds=SECONDS, seed=FIRST_SEED + job.seed))
+        write_bag(recording, folder / "in")
+        replay(folder / "in", folder / "out", ReplaySettings((), filter_name=job.filter))
+        truth = read_truth(folder / "in")
+        person = recording.truths[0]
+        q = np.stack([person.estimate(k).q for k in range(len(person.stamps_ns))])
+        times = truth.seconds(int(truth.stamps_ns[0]))
+        rng = np.random.default_rng([job.seed, 3])
+        worn = wear_targets(times, q, rng, segments=("upper_trunk", *ARM), offset=OFFSET, drift=DRIFT)
+        write_targets(worn, folder / "markers", int(truth.stamps_ns[0]))
+        estimate = read_segments(folder / "out")
+        result = evaluate_by_markers(estimate, read_marker_reference(folder / "markers"))
+        rotations = MODEL.forward(q, MODEL.default_lengths()).rotations
+        everywhere = np.zeros((len(times), 3, 3))
+        true = {segment: Track(times, rotations[:, SEGMENT_NUMBER[segment]], everywhere) for segment in worn.segments}
+        elapsed = int(estimate.stamps_ns[0] - truth.stamps_ns[0]) / NANOSECONDS
+        return Case(job, *_clock(result, int(truth.stamps_ns[0])), tuple(_angles(result, true, elapsed)))
+
+
+def _clock(result: ReferenceEvaluation, zero_ns: int) -> tuple[float, float]:
+    """Error of the clock's offset at the middle, and its deviation, ms."""
+    elapsed = result.fit.middle + (int(result.estimate.stamps_ns[0]) - zero_ns) / NANOSECONDS
+    return 1e3 * (result.offset_s - OFFSET - DRIFT * elapsed), 1e3 * result.clock_stddev
+
+
+def _angles(result: ReferenceEvaluation, true: dict[str, Track], elapsed: float) -> list[Angle]:
+    """What the markers give and what is true at the same instants, of equivalent triples of angles the nearest one.
+
+    Args:
+        result: by the markers.
+        true: orientations of the segments, in s since the truth begins.
+        elapsed: s from then until the estimate begins.
+    """
+    found = []
+    curves, judged = result.curves, {each.name: each for each in result.angles}
+    for chain in joint_chains(result.estimate.convention, frozenset(true), MODEL):
+        named = [name for name in chain.names if name in curves.names]
+        near = np.zeros((len(curves.times), 3))
+        for place, name in enumerate(chain.names):
+            if name in named:
+                near[:, place] = curves.found[:, curves.names.index(name)]
+        parent, child = (true[each].at(curves.times + elapsed) for each in (chain.parent, chain.child))
+        angles, _ = split_near(chain, parent.rotations.swapaxes(-1, -2) @ child.rotations, np.nan_to_num(near))
+        for place, name in enumerate(chain.names):
+            if name in named and name in judged:
+                compared = np.isfinite(curves.true[:, curves.names.index(name)]) & parent.known & child.known
+                error, each = wrapped(near[:, place] - angles[:, place])[compared], judged[name]
+                found.append(Angle(name, *np.degrees([error.std(), each.error, each.low, each.high]).tolist()))
+    return found
+
+
+@dataclass(frozen=True)
+class Pendulum:
+    """A link: degrees, milliseconds."""
+
+    link: int
+    refused: bool
+    offset_ms: float
+    offset_stddev_ms: float
+    other_half: float
+    one_offset: float
+
+
+def pendulum(folder: Path) -> list[Pendulum]:
+    """Each link alone: Vicon's cluster is the target, the inertial sensor the segment."""
+    names = [f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz" for link in LINKS]
+    return [judge_link(*each) for each in zip(LINKS, common.recordings(folder, names), strict=True)]
+
+
+def judge_link(link: int, path: Path) -> Pendulum:
+    """One link."""
+    recording, name = record(path), f"link {link}"
+    zeros = np.zeros((int(recording.kept.sum()), 3, 3))
+    target = Track(recording.times[recording.kept], recording.vicon[recording.kept], zeros)
+    settled = np.flatnonzero(recording.stamps > recording.stamps[0] + SETTLING_S)[::2]
+    times, ours = recording.stamps[settled], recording.ours[settled].as_matrix()
+    own = Track(times, ours, np.zeros((len(times), 3, 3)))
+    speeds = [turning(each.times, np.linalg.norm(each.rates(each.times), axis=1)) for each in (own, target)]
+    # the pendulum swings for three minutes at one frequency: only a narrow search is unambiguous
+    clock = clock_offset(*speeds, window=0.5)
+    middle = float(times.mean())
+    start = np.zeros(2) if clock is None else np.array([clock.offset, 0.0])
+    refused = False
+    try:
+        fit_hand_eye(times, ours[:, None], [target], [name], start, middle=middle)
+    except HandEyeError:
+        refused = True
+    left, offsets = [], []
+    for half in (times < middle, times >= middle):
+        sampled = target.at(times[~half] + start[0])
+        _, mounting = fit(ours[~half][sampled.known], sampled.rotations[sampled.known], 100)
+        known = {name: Mounting(mounting, 1e-8 * np.eye(3))}
+        solved = fit_hand_eye(
+            *(times[~half], ours[~half, None], [target], [name], start), middle=middle, known_mountings=known
+        )
+        offsets.append((solved.clock[0], solved.covariance[-2, -2]))
+        here = target.at(solved.to_reference(times[half]))
+        there = solved.world @ here.rotations @ mounting.T
+        left.append(rotation_vectors(there.swapaxes(-1, -2) @ ours[half])[here.known])
+    constant = one_offset(recording)
+    offset, variance = np.mean(offsets, axis=0)
+    return Pendulum(
+        link,
+        refused,
+        1e3 * float(offset),
+        1e3 * float(np.sqrt(variance / 2.0)),
+        _rms(np.concatenate(left)),
+        constant.total,
+    )
+
+
+def _rms(vectors: FloatArray) -> float:
+    return float(np.degrees(np.sqrt((vectors**2).sum(axis=1).mean())))
+
+
+def show(cases: list[Case], links: list[Pendulum]) -> None:
+    """The tables."""
+    print(f"{'people':32}{'clock':>7}{'+-':>6}" + "".join(f"{name:>26}" for name in SHOWN))
+    print(f"{'degrees, ms':45}" + f"{'by markers        true':>26}" * len(SHOWN))
+    for case in cases:
+        by_name = {angle.name: angle for angle in case.angles}
+        cells = ""
+        for name in SHOWN:
+            angle = by_name[name]
+            error = "-" if np.isnan(angle.error) else f"{angle.error:.1f}"
+            low = "-" if np.isnan(angle.low) else f"{angle.low:.1f}"
+            cells += f"{f'{error} [{low}, {angle.high:.1f}] {angle.true:6.1f}':>26}"
+        name = f"{case.job.motion}, {case.job.filter} {case.job.seed}"
+        print(f"{name:32}{case.clock_error:>7.1f}{case.clock_stddev:>6.1f}{cells}")
+    stated = [angle for case in cases for angle in case.angles if np.isfinite(angle.error)]
+    inside = [angle.low <= angle.true <= angle.high for angle in stated]
+    ratios = [angle.error / angle.true for angle in stated]
+    count = sum(len(case.angles) for case in cases)
+    print(
+        f"{len(stated)} of {count} angles stated; inside {np.mean(inside):.0%}; by markers / true: median "
+        f"{np.median(ratios):.2f}, 10 to 90 % {np.percentile(ratios, 10):.2f} to {np.percentile(ratios, 90):.2f}"
+    )
+    if links:
+        print(f"\n{'pendulum':10}{'refused':>8}{'offset, ms':>12}{'+-':>6}{'other half':>12}{'1 offset':>10}")
+    for each in links:
+        refused = "yes" if each.refused else "no"
+        clock = f"{each.offset_ms:>12.1f}{each.offset_stddev_ms:>6.1f}"
+        print(f"link {each.link:<5}{refused:>8}{clock}{each.other_half:>12.2f}{each.one_offset:>10.2f}")
+
+
+def main() -> None:
+    """The benchmark."""
+    args = common.parser(__doc__, seeds=2, jobs=True, data=True).parse_args()
+    jobs = [Job(*each) for each in product(MOTIONS, FILTERS, range(args.seeds))]
+    cases = common.mapped(judge, jobs, args.jobs)
+    folder = args.data / "imu" / "pendulum_with_reference"
+    links = pendulum(folder) if folder.is_dir() else []
+    common.report(args, {"people": cases, "pendulum": links}, lambda: show(cases, links))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""Orientations of a person's segments in a recording, and joint angles as rotations of pairs of segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.evaluation.reading import (
+    AngleSeries,
+    EvaluationError,
+    bodies,
+    read_angles,
+    read_joint_states,
+    read_skeletons,
+)
+from body_tracking.kinematics.conventions import CONVENTIONS, Chain, angles_of, convention
+from body_tracking.kinematics.euler import EulerAngles, EulerSequences
+from body_tracking.kinematics.tracking import SkeletonFit
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.pipeline import graph
+from body_tracking.recording.rig import RigReader
+
+_ANY: Final = (-180.0, 180.0)
+_MIDDLE: Final = (-90.0, 90.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatedSegments:
+    """A person's segments over time.
+
+    Attributes:
+        source: the bag or file.
+        topic: where the orientations come from.
+        stamps_ns: (n,) capture times, increasing, nanoseconds.
+        rotations: (n, 12, 3, 3) in the order of ``SEGMENTS``: a segment's vectors to world.
+        angles: in one of ``CONVENTIONS``.
+        convention: of the angles.
+        warnings: a line each.
+    """
+
+    source: Path
+    topic: str
+    stamps_ns: IntArray
+    rotations: FloatArray
+    angles: AngleSeries
+    convention: str
+    warnings: tuple[str, ...]
+
+    @property
+    def seconds(self) -> FloatArray:
+        """(n,) s since the first instant."""
+        seconds: FloatArray = (self.stamps_ns - self.stamps_ns[0]) / NANOSECONDS
+        return seconds
+
+
+def read_segments(path: Path, topic: str | None = None, body: str | None = None) -> EstimatedSegments:
+    """The estimated segments and angles in a bag.
+
+    The orientations are those of ``/filtered/model_state``, which the filter ``ekf`` publishes. Without it, or where a
+    topic is given, they are those of the body model that is fitted to the skeletons, as ``joint_angles`` does.
+
+    Args:
+        path: a bag folder or an mcap file.
+        topic: of skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
+        body: whose angles; the first in the bag where None.
+
+    Raises:
+        BagError: no such bag, or it is unreadable.
+        EvaluationError: neither a state of the model nor skeletons with covariances, or no angles of this person.
+    """
+    model = UpperBody()
+    with RigReader(path) as bag:
+        state = None if topic is not None else read_joint_states(bag, graph.MODEL_STATE, "")
+        angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
+        warnings = list(bag.warnings)
+        if state is not None and state.names == model.coordinate_names:
+            whole = np.isfinite(state.position).all(axis=1)
+            stamps, topic = state.stamps_ns[whole], graph.MODEL_STATE
+            q = model.integrate(model.neutral(), state.position[whole])
+            computed = None
+        else:
+            topic = topic or next(
+                (each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics), graph.FILTERED
+            )
+            fit, fitted = SkeletonFit(model), []
+            skeletons = read_skeletons(bag, topic)
+            for skeleton in skeletons:
+                estimate = fit.update(skeleton)
+                if estimate is not None:
+                    fitted.append(estimate)
+            if skeletons and not fitted:
+                raise EvaluationError(
+                    f"{path}: none of the {len(skeletons)} skeletons of {topic} has a trunk with covariances"
+                )
+            stamps = np.array([each.stamp_ns for each in fitted], dtype=np.int64)
+            q = np.array([each.q for each in fitted]).reshape(-1, model.nq)
+            computed = fitted
+        if len(stamps) < 2:
+            raise EvaluationError(
+                f"{path}: holds neither {graph.MODEL_STATE} nor skeletons on {topic}; make some with replay"
+            )
+    rotations = model.forward(q, model.default_lengths()).rotations
+    name = None if angles is None else _convention_of(angles.names, model)
+    if angles is None or name is None:
+        if computed is None:
+            raise EvaluationError(f"{path}: holds {graph.MODEL_STATE}, but no joint angles; make them with replay")
+        series: list[JointAngles] = []
+        for estimate in computed:
+            series.append(angles_of(estimate, model, "model", series[-1] if series else None))
+        if angles is not None:
+            warnings.append(
+                f"{path}: its joint angles are of no convention of the body model; those compared here are of the "
+                f"convention model, from {topic}"
+            )
+        names = convention("model", model).names
+        position, stddev = (
+            np.stack([getattr(each, part) for each in series]) for part in ("position", "position_stddev")
+        )
+        angles, name = AngleSeries(stamps, names, position, stddev), "model"
+    return EstimatedSegments(path, topic, stamps, rotations, angles, name, tuple(warnings))
+
+
+def _convention_of(names: tuple[str, ...], model: UpperBody) -> str | None:
+    return next((name for name in CONVENTIONS if convention(name, model).names == names), None)
+
+
+def joint_chains(name: str, mounted: frozenset[str], model: UpperBody) -> tuple[Chain, ...]:
+    """The joint angles of a convention that are rotations between two of some segments.
+
+    Args:
+        name: one of ``CONVENTIONS``.
+        mounted: names of segments.
+        model: the body.
+
+    Returns:
+        Chains between segments; those of the convention, and one for each joint whose angles are coordinates of the
+        model. Their third axis, which the model does not have, has no name.
+    """
+    found = convention(name, model)
+    chains = [
+        chain for chain in found.chains if chain.parent in mounted and chain.child in mounted and any(chain.names)
+    ]
+    neutral = model.linearise(model.neutral(), model.default_lengths())
+    for segment, where in enumerate(model.segment_coordinates):
+        names = model.coordinate_names[where]
+        parent = model.parents[segment]
+        if parent < 0 or not set(names) & set(found.names) or not {SEGMENTS[parent], SEGMENTS[segment]} <= mounted:
+            continue
+        # all frames are aligned in the neutral pose, where the axes of the joint are those of its coordinates
+        axes = np.rint(neutral.rotation_jacobian[segment][:, where].T)
+        if len(axes) == 2:
+            sequence = EulerAngles((axes[0], np.cross(axes[1], axes[0]), axes[1]), (_ANY, _MIDDLE, _ANY))
+            chains.append(Chain((names[0], None, names[1]), SEGMENTS[parent], SEGMENTS[segment], sequence))
+        elif len(axes) == 3:
+            sequence = EulerAngles((axes[0], axes[1], axes[2]), (_ANY, _MIDDLE, _ANY))
+            chains.append(Chain((names[0], names[1], names[2]), SEGMENTS[parent], SEGMENTS[segment], sequence))
+    return tuple(chains)
+
+
+def split_near(chain: Chain, rotations: FloatArray, near: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Angles of a chain over time, of the equivalent triples those nearest to others.
+
+    Args:
+        chain: the joint.
+        rotations: (n, 3, 3) of the child in the parent.
+        near: (n, 3) radians.
+
+    Returns:
+        (n, 3) radians and (n, 3, 3) their derivatives by a rotation in the parent's frame.
+    """
+    # one sequence, which all instants share
+    split = EulerSequences([chain.angles]).split(rotations, np.zeros((len(rotations), 3)), near)
+    return split.angles, split.gradients

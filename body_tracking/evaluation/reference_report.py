@@ -1,0 +1,140 @@
+"""Writes what :mod:`body_tracking.evaluation.reference_comparison` finds: tables, CSV, JSON and a page."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
+from body_tracking.evaluation.reference_error import Judged
+from body_tracking.evaluation.report import Column, Table, numbered, tables_as_csv, tables_as_json, tables_as_page
+
+_NOTE = (
+    "difference: RMS of estimate minus reference. reference: its own RMS deviation (poses, calibration, clock, "
+    "mountings).\nerror: the difference without that, in quadrature, and its 95 % interval; - where the reference is "
+    "too poor."
+)
+_OFFSET = "offset: mean difference, and its deviation. change: of the offset from the first half to the second."
+_COVERED = "in 95%: share of differences within 1.96 of the deviation that estimate and reference state."
+
+
+def _degrees(values: list[float]) -> FloatArray:
+    return np.degrees(np.array(values, dtype=np.float64))
+
+
+def _judged_table(key: str, title: str, rows: tuple[Judged, ...], known: bool, note: str) -> Table:
+    columns = [
+        Column("difference", "difference", "deg", _degrees([row.measured for row in rows])),
+        Column("reference", "reference", "deg", _degrees([row.reference for row in rows])),
+        Column("error", "error", "deg", _degrees([row.error for row in rows])),
+        Column("low", "from", "deg", _degrees([row.low for row in rows])),
+        Column("high", "to", "deg", _degrees([row.high for row in rows])),
+    ]
+    if known:
+        columns += [
+            Column("offset", "offset", "deg", _degrees([row.offset for row in rows])),
+            Column("offset_stddev", "+-", "deg", _degrees([row.offset_stddev for row in rows])),
+        ]
+    columns += [Column("change", "change", "deg", _degrees([row.change for row in rows]))]
+    if key == "reference_angles":
+        columns += [Column("covered", "in 95%", "%", 1e2 * np.array([row.covered for row in rows]))]
+    return Table(key, title, tuple(row.name for row in rows), tuple(columns), note)
+
+
+def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
+    """All results as tables."""
+    known = bool(result.mountings_known)
+    made = []
+    if result.angles:
+        title = f"angles ({result.estimate.convention})"
+        note = f"{_NOTE}\n{_OFFSET}\n{_COVERED}"
+        made.append(_judged_table("reference_angles", title, result.angles, known, note))
+    note = f"{_NOTE}\n{_OFFSET if not made else 'Rotations in space: lengths of rotation vectors.'}"
+    made.append(_judged_table("reference_orientations", "segment orientations", result.orientations, known, note))
+    residuals = result.fit.residuals
+    columns = (
+        Column("residual", "residual", "deg", np.degrees(np.sqrt(np.nanmean((residuals**2).sum(axis=-1), axis=0)))),
+        Column(
+            "mounting_stddev",
+            "mounting",
+            "deg",
+            _degrees([result.fit.mounting_stddev(k) for k in range(len(result.targets))]),
+        ),
+        Column("known", "frames", "%", 1e2 * np.isfinite(residuals[..., 0]).mean(axis=0)),
+    )
+    rows = tuple(f"{target} on {result.reference.segments[target]}" for target in result.targets)
+    made.append(
+        Table(
+            "reference_targets",
+            "targets",
+            rows,
+            columns,
+            "residual: RMS of the fit to the whole recording. mounting: deviation per axis of the target on its "
+            "segment.\nframes: share in which both are known.",
+        )
+    )
+    return tuple(made)
+
+
+def facts(result: ReferenceEvaluation) -> str:
+    """Facts about the whole recording, a line each."""
+    estimate, reference, fit = result.estimate, result.reference, result.fit
+    seconds = float(estimate.stamps_ns[-1] - estimate.stamps_ns[0]) / NANOSECONDS
+    drift, drift_stddev = 1e6 * fit.clock[1], 1e6 * float(np.sqrt(fit.covariance[-1, -1]))
+    first, second, _ = np.degrees(fit.motion)
+    rows = [
+        ("estimate", f"{estimate.source} {estimate.topic}: {len(estimate.stamps_ns)} frames, {seconds:.2f} s"),
+        ("reference", f"{reference.source}: targets {', '.join(result.targets)}"),
+        ("compared", f"{result.seconds:.2f} s; each half by mountings that were fitted to the other"),
+        (
+            "clock",
+            f"the reference's minus the estimate's {result.offset_s:+.4f} s, +- {1e3 * result.clock_stddev:.1f} ms "
+            f"(less any constant delay of the estimate), drift {drift:+.0f} +- {drift_stddev:.0f} ppm",
+        ),
+        ("world", f"rig to world known to {np.degrees(fit.world_stddev):.2f} deg per axis"),
+        ("motion", f"of the targets {first:.0f} deg RMS about one axis, {second:.0f} about a second"),
+    ]
+    return "\n".join(f"{name:<9} {value}" for name, value in (*rows, *(("note", note) for note in result.notes)))
+
+
+def text(result: ReferenceEvaluation) -> str:
+    """The tables as text."""
+    return "\n".join(f"\n{each.text()}\n{each.note}" for each in tables(result))
+
+
+def as_csv(result: ReferenceEvaluation) -> str:
+    """As of an evaluation by the truth."""
+    clock = [
+        ("recording", "all", "clock_offset", "ms", 1e3 * result.offset_s),
+        ("recording", "all", "clock_offset_stddev", "ms", 1e3 * result.clock_stddev),
+    ]
+    return tables_as_csv(clock, tables(result))
+
+
+def as_json(result: ReferenceEvaluation) -> str:
+    """Facts and tables as JSON; null for NaN."""
+    fit = result.fit
+    return tables_as_json(
+        {
+            "estimate": str(result.estimate.source),
+            "topic": result.estimate.topic,
+            "reference": str(result.reference.source),
+            "convention": result.estimate.convention,
+            "compared_s": numbered(result.seconds),
+            "clock": {
+                "offset_ms": numbered(1e3 * result.offset_s),
+                "stddev_ms": numbered(1e3 * result.clock_stddev),
+                "drift_ppm": numbered(1e6 * fit.clock[1]),
+                "drift_stddev_ppm": numbered(1e6 * float(np.sqrt(fit.covariance[-1, -1]))),
+            },
+            "world_stddev_deg": numbered(float(np.degrees(fit.world_stddev))),
+            "too_poor": [each.name for each in (*result.angles, *result.orientations) if each.too_poor],
+            "notes": list(result.notes),
+        },
+        tables(result),
+    )
+
+
+def page(result: ReferenceEvaluation, pictures: list[tuple[str, str]]) -> str:
+    """One self-contained HTML page."""
+    return tables_as_page(f"{result.estimate.source.name}: accuracy by markers", facts(result), text(result), pictures)
