@@ -143,6 +143,7 @@ BENCHMARKS = (
         "--calibrations 10",
     ),
     Benchmark("markers_time", "time from a pair of images to joint angles, computed and live", NOTHING, 2),
+    Benchmark(
         "markers_reference",
         "a Kinect judged by the marker system beside the truth, and a real pendulum by Vicon",
         NOTHING,
