@@ -28,10 +28,10 @@ import common
 import numpy as np
 from common import rms_deg
 
+from body_tracking.core import so3
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.filters.ekf import ExtendedKalmanFilter
-from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.simulated_errors import IDEAL
@@ -227,7 +227,7 @@ def angle_errors(q: FloatArray, true: FloatArray) -> FloatArray:
     columns = []
     for side in range(2):
         arms = [each[:, _TRUNK].swapaxes(-1, -2) @ each[:, _ARMS[side]] for each in (found, right)]
-        columns += list(rotation_vectors(arms[0] @ arms[1].swapaxes(-1, -2)).T)
+        columns += list(so3.rotation_vectors(arms[0] @ arms[1].swapaxes(-1, -2)).T)
         columns.append(scalars[:, _ELBOWS[side]])
     columns += list(scalars[:, _PRONATIONS].T)
     return np.stack(columns, axis=1)

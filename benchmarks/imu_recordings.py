@@ -31,10 +31,8 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.alignment import (
     Stream,
     align_in_pose,
-    mean_rotation,
     pose_covariance,
     pose_rotations,
-    rotation_vectors,
     still_periods,
     wrapped,
 )
@@ -92,7 +90,7 @@ def two_arm(path: Path) -> dict[str, Any]:
     segments = [stream.segment for stream in streams]
     begin = max(stream.stamps[0] for stream in streams)
     pose = pose_rotations(MODEL, "t")[[SEGMENTS.index(name) for name in segments]]
-    measured = np.array([mean_rotation(stream.between(begin, begin + 0.1).rotations) for stream in streams])
+    measured = np.array([so3.mean_rotation(stream.between(begin, begin + 0.1).rotations) for stream in streams])
     # nobody knows how these were put on; both have magnetometers: a common heading, any, and 10 degrees of each
     headings = np.pi**2 / 3.0 + np.radians(10.0) ** 2 * np.eye(2)
     alignment = align_in_pose(
@@ -207,12 +205,12 @@ def xsens(path: Path) -> dict[str, Any]:
         number, constant = SEGMENTS.index(segment), to_ours(data, segment)
         theirs[:, number] = data["segments"][name] @ constant
         tpose[segment] = float(
-            np.degrees(np.linalg.norm(rotation_vectors(pose[number].T @ data["tpose"][name] @ constant)))
+            np.degrees(np.linalg.norm(so3.rotation_vectors(pose[number].T @ data["tpose"][name] @ constant)))
         )
         sensor = data["sensors"][name]
-        alignment = mean_rotation(sensor[:ALIGNED_FRAMES].swapaxes(-1, -2) @ theirs[:ALIGNED_FRAMES, number])
+        alignment = so3.mean_rotation(sensor[:ALIGNED_FRAMES].swapaxes(-1, -2) @ theirs[:ALIGNED_FRAMES, number])
         ours[:, number] = sensor @ alignment
-        off = rotation_vectors(theirs[:, number].swapaxes(-1, -2) @ ours[:, number])
+        off = so3.rotation_vectors(theirs[:, number].swapaxes(-1, -2) @ ours[:, number])
         rigid[segment] = float(np.degrees(np.sqrt((off[ALIGNED_FRAMES:] ** 2).sum(axis=1).mean())))
     angles = SegmentAngles(MODEL)
 

@@ -28,10 +28,11 @@ import common
 import numpy as np
 from imu_pendulum import LINKS, SETTLING_S, fit, one_offset, record
 
+from body_tracking.core import so3
 from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.estimated_segments import joint_chains, read_segments, split_near
-from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye, rotation_vectors
+from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye
 from body_tracking.evaluation.marker_reference import read_marker_reference
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import read_truth
@@ -184,7 +185,7 @@ def judge_link(link: int, path: Path) -> Pendulum:
         offsets.append((solved.clock[0], solved.covariance[-2, -2]))
         here = target.at(solved.to_reference(times[half]))
         there = solved.world @ here.rotations @ mounting.T
-        left.append(rotation_vectors(there.swapaxes(-1, -2) @ ours[half])[here.known])
+        left.append(so3.rotation_vectors(there.swapaxes(-1, -2) @ ours[half])[here.known])
     constant = one_offset(recording)
     offset, variance = np.mean(offsets, axis=0)
     return Pendulum(

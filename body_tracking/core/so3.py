@@ -105,6 +105,24 @@ def log(q: FloatArray) -> FloatArray:
     return result
 
 
+def rotation_vectors(rotations: FloatArray) -> FloatArray:
+    """(..., 3) shortest rotation vectors, radians, of (..., 3, 3) rotations."""
+    return log(matrix_to_quat(rotations))
+
+
+def nearest_rotation(matrices: FloatArray) -> FloatArray:
+    """(..., 3, 3) the rotations nearest to (..., 3, 3) matrices (Umeyama 1991)."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    result: FloatArray = left @ right
+    return result
+
+
+def mean_rotation(rotations: FloatArray) -> FloatArray:
+    """(3, 3) the mean of (n, 3, 3): the rotation nearest to the sum of all (Moakher 2002, eq. 3.9)."""
+    return nearest_rotation(rotations.sum(axis=0))
+
+
 def right_jacobian(v: FloatArray) -> FloatArray:
     """(..., 3, 3) derivative of ``log(exp(-v) * exp(v + d))`` by d at 0, for rotation vectors (Sola eq. 143)."""
     angle_squared = (v * v).sum(axis=-1)[..., None, None]

@@ -95,7 +95,7 @@ class Track:
         known: BoolArray = (share >= 0.0) & (share <= 1.0) & (gap <= max_gap)
         share = np.where(known, share, 0.0)[:, None]
         start = self.rotations[before]
-        turn = rotation_vectors(start.swapaxes(-1, -2) @ self.rotations[after])
+        turn = so3.rotation_vectors(start.swapaxes(-1, -2) @ self.rotations[after])
         rotations = np.where(known[:, None, None], start @ so3.quat_to_matrix(so3.exp(share * turn)), np.eye(3))
         # two samples with independent noise: their mixture has less
         mixed = (1.0 - share[..., None]) ** 2 * self.covariances[before]
@@ -105,7 +105,7 @@ class Track:
     def rates(self, times: FloatArray, span: float = 2.0 * MAX_GAP) -> FloatArray:
         """(n, 3) rad/s about the own axes: the rotation over ``span`` seconds around each time; NaN where unknown."""
         start, end = self.at(times - 0.5 * span), self.at(times + 0.5 * span)
-        turn = rotation_vectors(start.rotations.swapaxes(-1, -2) @ end.rotations) / span
+        turn = so3.rotation_vectors(start.rotations.swapaxes(-1, -2) @ end.rotations) / span
         result: FloatArray = np.where((start.known & end.known)[:, None], turn, np.nan)
         return result
 
@@ -164,19 +164,6 @@ class HandEye:
         return float(np.sqrt(self.covariance.diagonal()[-5:-2].mean()))
 
 
-def rotation_vectors(rotations: FloatArray) -> FloatArray:
-    """(..., 3) shortest rotation vectors, radians, of (..., 3, 3) rotations."""
-    return so3.log(so3.matrix_to_quat(rotations))
-
-
-def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """(..., 3, 3) the rotations nearest to matrices (Umeyama 1991)."""
-    left, _, right = np.linalg.svd(matrix)
-    left[..., 2] *= np.linalg.det(left @ right)[..., None]
-    result: FloatArray = left @ right
-    return result
-
-
 def closed_form(segments: FloatArray, targets: FloatArray, known: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Z and X of eq. 1 for clocks that agree (Shah 2013, section 3).
 
@@ -193,14 +180,14 @@ def closed_form(segments: FloatArray, targets: FloatArray, known: BoolArray) -> 
     sums = np.einsum("nk,nkac,nkbd->kabcd", weight, segments, targets, optimize=True).reshape(-1, 9, 9)
     left = np.linalg.svd(np.concatenate(sums / np.maximum(weight.sum(axis=0), 1.0)[:, None, None], axis=1))[0]
     world = left[:, 0].reshape(3, 3)
-    world = nearest_rotation(world * np.sign(np.linalg.det(world)))
+    world = so3.nearest_rotation(world * np.sign(np.linalg.det(world)))
     return world, mountings_in(world, segments, targets, known)
 
 
 def mountings_in(world: FloatArray, segments: FloatArray, targets: FloatArray, known: BoolArray) -> FloatArray:
     """(k, 3, 3) X of eq. 1 for a given Z; other arguments as of :func:`closed_form`."""
     weight = known.astype(np.float64)
-    return nearest_rotation(np.einsum("nk,nkca,cd,nkdb->kab", weight, segments, world, targets, optimize=True))
+    return so3.nearest_rotation(np.einsum("nk,nkca,cd,nkdb->kab", weight, segments, world, targets, optimize=True))
 
 
 def principal_motion(targets: FloatArray, known: BoolArray) -> FloatArray:
@@ -209,7 +196,7 @@ def principal_motion(targets: FloatArray, known: BoolArray) -> FloatArray:
     for number in range(targets.shape[1]):
         there = targets[known[:, number], number]
         if len(there):
-            turns = rotation_vectors(there @ nearest_rotation(there.sum(axis=0)).T)
+            turns = so3.rotation_vectors(there @ so3.nearest_rotation(there.sum(axis=0)).T)
             scatter, count = scatter + turns.T @ turns, count + len(turns)
     motion: FloatArray = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter / max(count, 1))[::-1], 0.0))
     return motion
@@ -324,7 +311,7 @@ class _Fit:
             )
         if self.fixed.any():
             weight, there = known[:, self.fixed], (self.segments @ self.mountings)[:, self.fixed]
-            self.world = nearest_rotation(
+            self.world = so3.nearest_rotation(
                 np.einsum("nk,nkac,nkbc->ab", weight, there, rotations[:, self.fixed], optimize=True)
             )
             found = mountings_in(self.world, self.segments, rotations, known)
@@ -339,7 +326,7 @@ class _Fit:
 
     def residuals(self, rotations: FloatArray) -> FloatArray:
         """(n, k, 3) eq. 2."""
-        return rotation_vectors(self.mountings @ rotations.swapaxes(-1, -2) @ self.world.T @ self.segments)
+        return so3.rotation_vectors(self.mountings @ rotations.swapaxes(-1, -2) @ self.world.T @ self.segments)
 
     def descend(self, fit_clock: bool) -> None:
         free = self._free(fit_clock)

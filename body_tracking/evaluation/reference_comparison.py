@@ -14,13 +14,14 @@ from typing import Final
 import numpy as np
 
 from body_tracking.calibration.clock_correlation import MIN_STDDEV
+from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.evaluation.comparison import AngleComparison
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, joint_chains, split_near
-from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, Track, fit_hand_eye, rotation_vectors
+from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, Track, fit_hand_eye
 from body_tracking.evaluation.marker_reference import MarkerReference
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.reading import EvaluationError
@@ -311,7 +312,7 @@ class _Compared:
         """Differences of an orientation, in the child's frame."""
         true, found, known = self.relative(parent, child)
         own, mounting = self.uncertainty(parent, child)
-        errors = rotation_vectors(true.swapaxes(-1, -2) @ found)
+        errors = so3.rotation_vectors(true.swapaxes(-1, -2) @ found)
         return Differences(self.step, errors[known], np.trace(own, axis1=-2, axis2=-1)[known], mounting[known])
 
     def angle(

@@ -212,18 +212,6 @@ def wrapped(angle: FloatArray) -> FloatArray:
     return result
 
 
-def rotation_vectors(rotations: FloatArray) -> FloatArray:
-    """(..., 3) radians of (..., 3, 3) rotations."""
-    return so3.log(so3.matrix_to_quat(rotations))
-
-
-def mean_rotation(rotations: FloatArray) -> FloatArray:
-    """(3, 3) the mean of (n, 3, 3): the rotation nearest to the sum of all (Moakher 2002, eq. 3.9)."""
-    u, _, vt = np.linalg.svd(rotations.sum(axis=0))
-    result: FloatArray = (u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])) @ vt
-    return result
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # the pose
 
@@ -312,7 +300,7 @@ def _turned(stream: Stream) -> float:
     """Radians between the first and the last orientation; infinite without samples."""
     if len(stream.stamps) < 2:
         return np.inf
-    return float(np.linalg.norm(rotation_vectors(stream.rotations[0].T @ stream.rotations[-1])))
+    return float(np.linalg.norm(so3.rotation_vectors(stream.rotations[0].T @ stream.rotations[-1])))
 
 
 def pose_of(streams: Sequence[Stream], mountings: FloatArray, period: StillPeriod) -> Pose | None:
@@ -328,7 +316,7 @@ def pose_of(streams: Sequence[Stream], mountings: FloatArray, period: StillPerio
         if stream.segment.startswith(("upper_arm", "forearm")):
             part = stream.between(period.begin, period.end)
             if len(part.stamps):
-                slopes.append(float((mean_rotation(part.rotations) @ -mounting[:, 2])[2]))
+                slopes.append(float((so3.mean_rotation(part.rotations) @ -mounting[:, 2])[2]))
     if not slopes:
         return None
     angles = np.arcsin(np.clip(slopes, -1.0, 1.0))
@@ -403,8 +391,8 @@ def align_in_pose(
     information = np.eye(4 * k)
     for _ in range(_STEPS):
         world = yaw(psi) @ measured @ rotations
-        off = rotation_vectors(posed.swapaxes(-1, -2) @ world)
-        away = None if mountings is None else rotation_vectors(mountings.swapaxes(-1, -2) @ rotations)
+        off = so3.rotation_vectors(posed.swapaxes(-1, -2) @ world)
+        away = None if mountings is None else so3.rotation_vectors(mountings.swapaxes(-1, -2) @ rotations)
         back = so3.right_jacobian_inverse(off)
         jacobian = np.zeros((3 * k, 4 * k))
         information, gradient = np.zeros((4 * k, 4 * k)), np.zeros(4 * k)

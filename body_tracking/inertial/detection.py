@@ -25,11 +25,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from body_tracking.calibration.clock_correlation import STEP, Series
+from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.alignment import (
     MOUNTING_STDDEV,
     AlignmentError,
-    rotation_vectors,
     yaw,
 )
 from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, independent_samples
@@ -141,7 +141,7 @@ def likelihood_by_pose(
     tables = []
     for psi in np.linspace(-np.pi, np.pi, steps, endpoint=False):
         expected = yaw(psi).T @ pose @ mountings.swapaxes(-1, -2)
-        off = rotation_vectors(measured[:, None].swapaxes(-1, -2) @ expected)
+        off = so3.rotation_vectors(measured[:, None].swapaxes(-1, -2) @ expected)
         tables.append(-0.5 * (off**2).sum(axis=-1) / variance - 1.5 * np.log(variance))
     best = max(tables, key=lambda table: float(table[linear_sum_assignment(table, maximize=True)].sum()))
     return np.asarray(best)

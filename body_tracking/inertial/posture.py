@@ -18,7 +18,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.inertial.alignment import AlignmentError, rotation_vectors
+from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
@@ -75,7 +75,7 @@ class OrientationKinematics:
         for _ in range(_STEPS):
             lines = model.linearise(q, self._lengths)
             world = lines.posture.rotations[self._numbers]
-            off = rotation_vectors(world.swapaxes(-1, -2) @ rotations)
+            off = so3.rotation_vectors(world.swapaxes(-1, -2) @ rotations)
             turning = world.swapaxes(-1, -2) @ lines.rotation_jacobian[self._numbers]
             jacobian = (so3.right_jacobian_inverse(-off) @ turning)[..., 3:]
             soft = ranges.soft_coordinates(q)

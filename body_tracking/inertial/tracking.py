@@ -32,7 +32,6 @@ from body_tracking.inertial.alignment import (
     Stream,
     align_by_elbow,
     align_in_pose,
-    mean_rotation,
     yaw,
 )
 from body_tracking.inertial.body import WornBody, joint_variances
@@ -579,7 +578,7 @@ class InertialTracker:
         """Align the active sensors by a pose; the others keep their alignment."""
         numbers = [number for number, _ in active]
         segments = [self.segments[number] for number in numbers]
-        measured = np.array([mean_rotation(stream.rotations) for stream in held.streams])
+        measured = np.array([so3.mean_rotation(stream.rotations) for stream in held.streams])
         posed = self._poses.rotations(held.name, segments)
         magnetic = bool(self._magnetic[numbers].all())
         if len(segments) > 1 and (held.facing is None or magnetic):

@@ -17,7 +17,6 @@ from body_tracking.core.clocks import ReceiptClock
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.imu import ImuSample, ImuWatch
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.imu_orientation import OUTAGE_S, OrientationEstimator
 
 HISTORY_S: Final = 40.0
@@ -237,7 +236,7 @@ class WornSensor:
             if self.latest is not None:
                 elapsed = (sample.stamp_ns - self.latest.stamp_ns) / NANOSECONDS
                 if elapsed < OUTAGE_S:
-                    rate = rotation_vectors(self.latest.rotation.T @ rotation) / elapsed
+                    rate = so3.rotation_vectors(self.latest.rotation.T @ rotation) / elapsed
         return OrientedReading(sample.stamp_ns, rotation, covariance, rate, sample.angular_velocity is not None)
 
     def _estimated(self, sample: ImuSample) -> OrientedReading | None:

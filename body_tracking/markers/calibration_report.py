@@ -46,7 +46,7 @@ def table(calibration: CameraCalibration) -> str:
 def _pose(rig: Rig, index: int) -> list[str]:
     start = projection.offsets(rig)[index + 1] - 6
     covariance = rig.covariance[start : start + 6, start : start + 6]
-    turn = so3.log(so3.matrix_to_quat(rig.rotations[index]))
+    turn = so3.rotation_vectors(rig.rotations[index])
     shift = rig.translations[index]
     angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
     # the axis turns with itself: the angle changes by the part of exp(w) along it

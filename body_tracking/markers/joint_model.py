@@ -135,7 +135,7 @@ class Joint:
     def difference(self, other: Joint) -> FloatArray:
         """(12,) the step by which ``other.changed(step)`` is this joint."""
         turns = np.stack([self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T])
-        parent, child = so3.log(so3.matrix_to_quat(turns))
+        parent, child = so3.rotation_vectors(turns)
         return np.concatenate(
             [self.parent_centre - other.parent_centre, parent, self.child_centre - other.child_centre, child]
         )

@@ -218,6 +218,6 @@ def differentiate(
 
 def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
     """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to those that are seen."""
-    turn = so3.log(so3.matrix_to_quat(poses.rotations @ rotations.swapaxes(-1, -2)))
+    turn = so3.rotation_vectors(poses.rotations @ rotations.swapaxes(-1, -2))
     result: FloatArray = np.concatenate([poses.translations - translations, turn], axis=-1) * poses.seen[..., None]
     return result

@@ -162,9 +162,7 @@ def fit_joint(name: str, kind: JointKind, poses: PoseTable, parent: str, child: 
 
 def principal_motion(pair: PoseTable, rotations: FloatArray) -> FloatArray:
     """(3,) :attr:`JointFit.motion` of a pair of targets whose relative rotations are (n, 3, 3)."""
-    left, _, right = np.linalg.svd(rotations.sum(axis=0))
-    mean = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    turns = so3.log(so3.matrix_to_quat(rotations @ mean.T))
+    turns = so3.rotation_vectors(rotations @ so3.mean_rotation(rotations).T)
     squares = np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1]
     noise = np.trace(pair.covariance[:, :, 3:, 3:], axis1=-2, axis2=-1).sum(axis=1).mean() / 3.0
     result: FloatArray = np.sqrt(np.maximum(squares - noise, 0.0))

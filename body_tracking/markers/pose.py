@@ -74,9 +74,7 @@ def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tup
     share = (weights / weights.sum(axis=1, keepdims=True))[:, None, :]
     from_, to = share @ model, share @ measured
     cross = (measured - to).swapaxes(1, 2) @ ((model - from_) * share.swapaxes(1, 2))
-    u, _, vt = np.linalg.svd(cross)
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    rotation: FloatArray = u @ vt
+    rotation = so3.nearest_rotation(cross)
     return rotation, to[:, 0] - (rotation @ from_.swapaxes(1, 2))[:, :, 0]
 
 

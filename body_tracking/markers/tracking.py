@@ -262,7 +262,7 @@ def _gates(target: Target, track: _Track, points: Points) -> BoolArray:
 
 def _innovation(track: _Track, candidate: Candidate) -> FloatArray:
     """(6,) from the predicted to the measured pose."""
-    turned = so3.log(so3.matrix_to_quat(candidate.rotation @ track.rotation.T))
+    turned = so3.rotation_vectors(candidate.rotation @ track.rotation.T)
     return np.concatenate([candidate.translation - track.translation, turned])
 
 

@@ -129,7 +129,7 @@ def write_targets(
             for name, rotation in zip(names, rotations, strict=True):
                 pose = TargetPose(name, stamp_ns, _FRAME, rotation, np.zeros(3), covariance, unseen, float("nan"))
                 bag.write(setup.pose_topic(name), PoseOfTarget(name).encode(pose, BAG_WIRE), stamp_ns)
-            turn = so3.log(so3.matrix_to_quat(rotations[-2].T @ rotations[-1]))
+            turn = so3.rotation_vectors(rotations[-2].T @ rotations[-1])
             stated = JointAngles(stamp_ns, ("elbow_x",), turn[:1], unknown, np.array([angle_stddev]), unknown)
             both = angles_to_joint_states(stated, setup.BODY, "markers", BAG_MESSAGES)
             for suffix, message in zip(("", "_stddev"), both, strict=True):

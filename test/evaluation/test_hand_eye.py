@@ -12,6 +12,7 @@ from known_errors import DRIFT, OFFSET, Scene, scene
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.hand_eye import (
     HandEye,
@@ -20,7 +21,6 @@ from body_tracking.evaluation.hand_eye import (
     Track,
     closed_form,
     fit_hand_eye,
-    rotation_vectors,
 )
 from body_tracking.inertial.clock import clock_offset, turning
 from body_tracking.inertial.imu_csv import ImuCsvRecording
@@ -43,7 +43,7 @@ def solve(made: Scene, **options: object) -> HandEye:
 
 def off(true: FloatArray, found: FloatArray) -> FloatArray:
     """(..., 3) radians."""
-    return rotation_vectors(true @ found.swapaxes(-1, -2))
+    return so3.rotation_vectors(true @ found.swapaxes(-1, -2))
 
 
 @given(st.integers(0, 10**6))
@@ -64,7 +64,7 @@ def test_a_track_is_interpolated_and_unknown_in_gaps() -> None:
     track = Track(times, Rotation.from_rotvec(np.outer(times, [0.0, 0.0, 2.0])).as_matrix(), covariance)
     found = track.at(np.array([-0.01, 0.0, 0.075, 0.2, 0.41, 0.46]))
     assert found.known.tolist() == [False, True, True, False, True, False]
-    assert_allclose(rotation_vectors(found.rotations[2]), [0.0, 0.0, 0.15], atol=1e-12)
+    assert_allclose(so3.rotation_vectors(found.rotations[2]), [0.0, 0.0, 0.15], atol=1e-12)
     assert_allclose(found.covariances[1:3], [4.0 * np.eye(3), 2.0 * np.eye(3)])
     assert_allclose(track.rates(np.array([0.05]), 0.1), [[0.0, 0.0, 2.0]], atol=1e-12)
 

@@ -126,7 +126,7 @@ class Source:
         step = 1e-4
         after = MODEL.forward(person.motion.configuration(times + step), person.body.lengths).rotations
         turned = rotations[:, SEGMENT_NUMBER[self.segment]].swapaxes(-1, -2) @ after[:, SEGMENT_NUMBER[self.segment]]
-        rates = so3.log(so3.matrix_to_quat(mounting.swapaxes(-1, -2) @ turned @ mounting)) / step
+        rates = so3.rotation_vectors(mounting.swapaxes(-1, -2) @ turned @ mounting) / step
         rates += self.spin * rng.normal(size=rates.shape)
         return [
             replace(each, angular_velocity=rate, angular_velocity_variance=self.spin**2)
@@ -177,7 +177,7 @@ def learnt(estimator: ExtendedKalmanFilter, source: Source) -> tuple[FloatArray,
     number = state.sources.find(f"imu_{source.segment}")
     assert number is not None
     right = so3.quat_to_matrix(so3.exp(np.array(source.misalignment)))
-    off = so3.log(so3.matrix_to_quat(right @ state.sources.misalignment[number].T))
+    off = so3.rotation_vectors(right @ state.sources.misalignment[number].T)
     begin = BODY + PER_SOURCE * number
     covariance = state.covariance[begin : begin + 4, begin : begin + 4]
     return np.append(off, source.heading - state.sources.heading[number]), covariance
@@ -333,7 +333,7 @@ def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None
     for state in (held, loose):
         pushed = estimator._priors._pushed_back(state, row, np.array([0.5]))
         before, after = (MODEL.turning(each.q, SEGMENT_NUMBER["forearm_left"])[0] for each in (state, pushed))
-        turned.append(np.linalg.norm(so3.log(so3.matrix_to_quat(after @ before.T))))
+        turned.append(np.linalg.norm(so3.rotation_vectors(after @ before.T)))
         assert_allclose(pushed.sources.misalignment, state.sources.misalignment, rtol=0.0, atol=1e-12)
     # about one axis the gain of a push is v / (v + limit^2), and held by a source v is less than held^2
     limit, hold = np.radians(_LIMIT_STDDEV) ** 2, _HELD_STDDEV**2
@@ -372,7 +372,7 @@ def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
     found = MODEL.forward(estimate.q, MODEL.default_lengths()).rotations
     said = {each.segment: each.rotation for each in events}
     for segment, rotation in said.items():
-        off = so3.log(so3.matrix_to_quat(rotation.T @ found[SEGMENT_NUMBER[segment]]))
+        off = so3.rotation_vectors(rotation.T @ found[SEGMENT_NUMBER[segment]])
         assert np.linalg.norm(off) < np.radians(6.0), segment
 
 
@@ -420,7 +420,7 @@ def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turn
         before = said() if k >= 20 else None
         estimator.take(Skeleton(stamp_ns, "world", positions, tracked))
         if before is not None:
-            taught += np.abs(so3.log(so3.matrix_to_quat(before.T @ said())))
+            taught += np.abs(so3.rotation_vectors(before.T @ said()))
         estimator.take_orientation(
             SegmentOrientation(stamp_ns + 5_000_000, "imu", "forearm_right", forearm, 0.03**2 * np.eye(3))
         )
@@ -528,7 +528,7 @@ def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera
     assert estimator.counters["slips"] == 0
     estimate = known(estimator)
     found = MODEL.forward(estimate.q, estimate.lengths).rotations[SEGMENT_NUMBER["upper_arm_right"]]
-    off = so3.log(so3.matrix_to_quat(rotation.T @ found))
+    off = so3.rotation_vectors(rotation.T @ found)
     stddev = np.sqrt(estimate.covariance[MODEL.ball_v[-1, 2], MODEL.ball_v[-1, 2]])
     assert abs(off[2]) < max(np.radians(15.0), 2.0 * stddev)
 
@@ -762,7 +762,7 @@ def test_a_pose_is_found_from_orientations() -> None:
     ]
     q = orientation.pose_of(MODEL, Ranges(MODEL), measured)
     found = MODEL.forward(q, person.body.lengths).rotations
-    off = so3.log(so3.matrix_to_quat(found @ posture.rotations.swapaxes(-1, -2)))
+    off = so3.rotation_vectors(found @ posture.rotations.swapaxes(-1, -2))
     assert np.degrees(np.linalg.norm(off, axis=-1)).max() < 10.0
     assert_allclose(q[:3], 0.0, atol=1e-9)
 

@@ -15,7 +15,6 @@ from body_tracking.inertial.alignment import (
     Alignment,
     AlignmentError,
     elbow_segment_axes,
-    rotation_vectors,
     wrapped,
     yaw,
 )
@@ -61,7 +60,7 @@ class Wearer:
 
     def error(self, alignment: Alignment, instant: int) -> FloatArray:
         """(8,) as of the covariance."""
-        turned = rotation_vectors(alignment.rotations.swapaxes(-1, -2) @ self.true)
+        turned = so3.rotation_vectors(alignment.rotations.swapaxes(-1, -2) @ self.true)
         apart = wrapped(self.psi[instant] - alignment.headings)
         return np.concatenate([turned, apart[:, None]], axis=1).reshape(-1)
 
@@ -175,7 +174,7 @@ def test_one_wild_skeleton_moves_nothing_much() -> None:
     found = tracker.observe_bone(21.0, ARM[0], sensors[0], -wearer.world[-1, 0] @ [0.0, 0.3, -1.0], 0.03)
     assert found is not None
     assert found.weight < 0.2
-    moved = rotation_vectors(before.rotations[0].T @ tracker.alignment.rotations[0])
+    moved = so3.rotation_vectors(before.rotations[0].T @ tracker.alignment.rotations[0])
     assert np.linalg.norm(moved) < np.radians(4.0)
 
 

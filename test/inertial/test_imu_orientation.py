@@ -269,12 +269,6 @@ def test_orientation_alone_is_no_raw_data() -> None:
         estimator.update(ImuSample(0, "imu_link", angular_velocity=still_here))
 
 
-def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    left, _, right = np.linalg.svd(matrix)
-    result: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return result
-
-
 def test_a_real_pendulum(shared_data: Path) -> None:
     """The first link against Vicon: within 2 degrees, inclination within 1, after two constant rotations."""
     path = shared_data / "imu" / "pendulum_with_reference" / "Pendulum_Test02a_Trial1_Segment_1.csv.gz"
@@ -291,8 +285,8 @@ def test_a_real_pendulum(shared_data: Path) -> None:
     # vicon = world @ ours @ mounting, by turns; the mounting starts as what fits the first instant
     world, mounting = np.eye(3), ours[0].T @ vicon[0]
     for _ in range(400):  # slowly: it turns mostly about one axis
-        world = nearest_rotation(np.einsum("nij,nkj->ik", vicon[::5], ours[::5] @ mounting))
-        mounting = nearest_rotation(np.einsum("nji,njk->ik", world @ ours[::5], vicon[::5]))
+        world = so3.nearest_rotation(np.einsum("nij,nkj->ik", vicon[::5], ours[::5] @ mounting))
+        mounting = so3.nearest_rotation(np.einsum("nji,njk->ik", world @ ours[::5], vicon[::5]))
     error = Rotation.from_matrix(vicon @ (world @ ours @ mounting).swapaxes(1, 2)).as_rotvec(degrees=True)
     tilt = error - np.outer(error @ world[:, 2], world[:, 2])
     assert np.sqrt((error**2).sum(axis=1).mean()) < 2.0

@@ -17,11 +17,9 @@ from body_tracking.inertial.alignment import (
     align_by_elbow,
     align_in_pose,
     elbow_segment_axes,
-    mean_rotation,
     pose_covariance,
     pose_of,
     pose_rotations,
-    rotation_vectors,
     still_periods,
     wrapped,
     yaw,
@@ -85,7 +83,8 @@ def test_alignment_and_heading_are_within_what_is_stated() -> None:
         meant, true, psi, measured = worn(rng, pose, spread, np.radians(10.0))
         found = align_in_pose(WORN, measured, pose, spread, mountings=meant)
         error = np.concatenate(
-            [rotation_vectors(found.rotations.swapaxes(-1, -2) @ true), wrapped(psi - found.headings)[:, None]], axis=1
+            [so3.rotation_vectors(found.rotations.swapaxes(-1, -2) @ true), wrapped(psi - found.headings)[:, None]],
+            axis=1,
         ).reshape(-1)
         together.append(float(error @ np.linalg.solve(found.covariance, error)))
         single.append(error / found.stddev.reshape(-1))
@@ -153,7 +152,7 @@ def sensed(segment: str, times: FloatArray, world: FloatArray, true: FloatArray,
     """Of a segment's orientations what a perfect sensor says."""
     sensor = yaw(-psi) @ world @ true.T
     rates = np.zeros((len(times), 3))
-    rates[1:-1] = rotation_vectors(sensor[:-2].swapaxes(-1, -2) @ sensor[2:]) / (times[2] - times[0])
+    rates[1:-1] = so3.rotation_vectors(sensor[:-2].swapaxes(-1, -2) @ sensor[2:]) / (times[2] - times[0])
     return Stream(segment, times[1:-1], sensor[1:-1], rates[1:-1])
 
 
@@ -216,7 +215,7 @@ def test_the_mean_of_rotations_about_one_is_that_one() -> None:
     middle = random_rotations(rng, 1)[0]
     small = 0.1 * rng.normal(size=(50, 3))
     spread = middle @ so3.quat_to_matrix(so3.exp(np.concatenate([small, -small])))
-    np.testing.assert_allclose(mean_rotation(spread), middle, atol=1e-9)
+    np.testing.assert_allclose(so3.mean_rotation(spread), middle, atol=1e-9)
 
 
 def test_what_is_no_stream_and_no_pose_is_refused() -> None:

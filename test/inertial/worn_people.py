@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
-from body_tracking.inertial.alignment import rotation_vectors
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.tracking import InertialTracker
@@ -85,7 +85,7 @@ class Fed:
         true = self.true_rotations([each.stamp_ns for each in published])[:, SEGMENTS.index(segment)]
         found = np.array([each.rotation for each in published])
         stddev = np.array([np.sqrt(each.covariance.diagonal()) for each in published])
-        return rotation_vectors(found @ true.swapaxes(-1, -2)), stddev
+        return so3.rotation_vectors(found @ true.swapaxes(-1, -2)), stddev
 
 
 def feed(

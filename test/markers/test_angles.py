@@ -39,7 +39,7 @@ def known(tree: Tree) -> Chain:
 def turn_errors(found: list[ChainAngles], posture: Posture, joint: int) -> FloatArray:
     """(n, 3) rotation vectors of the errors of a joint's turns."""
     turns = np.stack([each.rotations[joint] for each in found])
-    return so3.log(so3.matrix_to_quat(turns @ posture.turns[joint].swapaxes(-1, -2)))
+    return so3.rotation_vectors(turns @ posture.turns[joint].swapaxes(-1, -2))
 
 
 def rms_deg(errors: FloatArray) -> float:

@@ -132,7 +132,7 @@ def errors(truth: Rig, made: Rig) -> FloatArray:
     """(p,) what is to be added to the parameters of a calibration."""
     parts = []
     for index, (there, here) in enumerate(zip(truth.cameras, made.cameras, strict=True)):
-        turn = so3.log(so3.matrix_to_quat(truth.rotations[index] @ made.rotations[index].T))
+        turn = so3.rotation_vectors(truth.rotations[index] @ made.rotations[index].T)
         parts += [
             (there.matrix - here.matrix)[[0, 1, 0, 1], [0, 1, 2, 2]],
             there.distortion - here.distortion,
@@ -200,7 +200,7 @@ def test_four_real_cameras_fit_a_charuco_board_better_than_in_the_calibration_th
     other = adjust_points(theirs, intersect(theirs, seen, 12), seen, edges, free, 0.5)
     print(f"RMS {mine.rms():.3f} px, of caliscope's cameras {other.rms():.3f}")
     assert mine.rms() <= other.rms()
-    turn = so3.log(so3.matrix_to_quat(mine.rig.rotations @ theirs.rotations.transpose(0, 2, 1)))
+    turn = so3.rotation_vectors(mine.rig.rotations @ theirs.rotations.transpose(0, 2, 1))
     assert np.linalg.norm(turn, axis=-1).max() < np.radians(0.5)
     assert np.linalg.norm(mine.rig.translations - theirs.translations, axis=-1).max() < 0.01
 

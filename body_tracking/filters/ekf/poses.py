@@ -325,5 +325,5 @@ class PoseSearch:
         if not len(segments):
             return False
         now, then = (self._model.forward(each, state.lengths).rotations[segments] for each in (state.q, q))
-        apart = so3.log(so3.matrix_to_quat(now @ then.swapaxes(-1, -2)))
+        apart = so3.rotation_vectors(now @ then.swapaxes(-1, -2))
         return bool(((apart * apart).sum(axis=1) > _CONTRADICTION**2).any())

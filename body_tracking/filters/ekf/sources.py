@@ -281,7 +281,7 @@ class Sources:
             return None
         left = np.minimum(1.0, after / before)
         new = np.maximum(after - before, 0.0) + after * (1.0 - left)
-        turn = so3.log(so3.matrix_to_quat(self.misalignment[number]))
+        turn = so3.rotation_vectors(self.misalignment[number])
         misalignment, heading, stated = self.misalignment.copy(), self.heading.copy(), self.stated.copy()
         misalignment[number] = so3.quat_to_matrix(so3.exp(left[0] * turn))
         heading[number] *= left[1]
@@ -382,7 +382,7 @@ def expect(
     before = level @ persisting
     by_turning = before @ rotation
     predicted = by_turning @ misalignment
-    innovation = so3.log(so3.matrix_to_quat(measured @ predicted.T))
+    innovation = so3.rotation_vectors(measured @ predicted.T)
     # R_p changes to Exp(d) R_p, and the innovation by -J_r^-1 d
     by_source = np.empty((3, PER_SOURCE))
     by_source[:, _MISALIGNMENT] = by_turning if correction is None else by_turning @ by_turn
@@ -431,7 +431,7 @@ def _fitted(
     for _ in range(_STEPS):
         lines = model.linearise(q, lengths)
         rotations = lines.posture.rotations
-        errors = so3.log(so3.matrix_to_quat(measured @ rotations[segments].swapaxes(-1, -2)))
+        errors = so3.rotation_vectors(measured @ rotations[segments].swapaxes(-1, -2))
         soft = ranges.soft_coordinates(q)
         upright = np.zeros((2, nv))
         upright[:, :] = so3.skew(-rotations[0, :, 2])[:2] @ lines.rotation_jacobian[0]
