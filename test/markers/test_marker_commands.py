@@ -15,7 +15,8 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.codecs import SpacePoints
 from body_tracking.markers.rig_storage import save_rig
-from body_tracking.markers.targets_file import load_targets
+from body_tracking.markers.targets import Target
+from body_tracking.markers.targets_file import load_targets, save_targets
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 from body_tracking.simulation.marker_scene import stereo_rig
 from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation
@@ -66,10 +67,12 @@ def test_a_target_is_measured_from_a_recording(turned: Path, capsys: pytest.Capt
     ],
 )
 def test_what_does_not_serve_is_refused_in_one_line(
-    turned: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    turned: Path, tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [word.format(bag=turned / "bag", folder=turned) for word in words]
-    assert cli.main(["markers", *given, "--setup", str(turned)]) == 2
+    save_rig(stereo_rig(), tmp_path / setup.RIG)
+    save_targets([Target("hand", TARGET_POINTS, np.zeros((15, 15)))], tmp_path / setup.TARGETS)
+    given = [word.format(bag=turned / "bag", folder=tmp_path) for word in words]
+    assert cli.main(["markers", *given, "--setup", str(tmp_path)]) == 2
     out = capsys.readouterr()
     assert said in out.err and out.err.count("\n") == 1
-    assert not (turned / "out").exists()
+    assert not (tmp_path / "out").exists()

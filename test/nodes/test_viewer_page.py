@@ -191,9 +191,10 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     assert "calibration/start" not in browser.answer("calibration: calibrate")
     browser.press("record")
     assert "recording into" in browser.answer("recording: record")
-    recorded = "bag_recorder"
+    recorded, before = "bag_recorder", len(clouds)
     browser.until(
-        lambda: int(running.diagnostics.get(recorded, {}).get("messages", 0)) > 100, "messages in the recording"
+        lambda: int(running.diagnostics.get(recorded, {}).get("messages", 0)) > 100 and len(clouds) > before + 20,
+        "messages in the recording, twice as many filtered skeletons as are asked for",
     )
     browser.press("stop")
     assert "messages in" in browser.answer("recording: stop")
