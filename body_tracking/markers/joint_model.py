@@ -161,10 +161,7 @@ def turn_axes(kind: JointKind, turns: FloatArray) -> FloatArray:
 
 
 def turn_angles(kind: JointKind, turns: FloatArray) -> FloatArray:
-    """(n, d) angles of a hinge or universal joint, radians, nearest to (n, 3, 3) turns (Gaschler eq. 5.16, 5.17).
-
-    Gaschler (2011): eq. 5.15-5.17.
-    """
+    """(n, d) angles of a hinge or universal joint, radians, nearest to (n, 3, 3) turns (Gaschler eq. 5.15-5.17)."""
     if kind is JointKind.HINGE:
         return np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])[:, None]
     first = np.arctan2(-turns[:, 0, 2], turns[:, 1, 2])
@@ -284,8 +281,6 @@ def _zeroed(joint: Joint, near_axis: BoolArray) -> Joint:
 
 def axis_frame(axis: FloatArray, centre: FloatArray, near_axis: bool = False) -> FloatArray:
     """(3, 3) the frame of a z axis (Gaschler eq. 5.12-5.14).
-
-    Gaschler (2011): eq. 5.12-5.14.
 
     Args:
         axis: (3,) unit vector.

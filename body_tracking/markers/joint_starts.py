@@ -39,9 +39,7 @@ def closed_form(
 def centres(rotations: FloatArray, translations: FloatArray, along_axis: bool) -> tuple[FloatArray, FloatArray]:
     """The centre in the parent and in the child, (3,) each, metres.
 
-    Gaschler (2011): eq. 5.2-5.4; eq. 5.10.
-
-    Least squares of c1 - R_i c2 = t_i (Gaschler eq. 5.4).
+    Least squares of c1 - R_i c2 = t_i (Gaschler eq. 5.2-5.4; for a hinge, eq. 5.10).
 
     Args:
         rotations: (n, 3, 3) of the child in the parent.
@@ -63,8 +61,6 @@ def centres(rotations: FloatArray, translations: FloatArray, along_axis: bool) -
 
 def hinge_axes(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A hinge's axis in the parent and in the child, (3,) unit vectors, from rotations (n, 3, 3).
-
-    Gaschler (2011): eq. 5.11.
 
     The null space of Gaschler's eq. 5.11 is the first pair of singular vectors of the sum of the rotations.
     """

@@ -87,9 +87,7 @@ class JointFit:
 
 
 def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """A ball joint (Gaschler section 5.1).
-
-    Gaschler (2011): figures 5.1-5.2; eq. 5.1.
+    """A ball joint (Gaschler section 5.1: figures 5.1-5.2, eq. 5.1).
 
     Args:
         parent: n poses of the target before the joint.
@@ -104,10 +102,7 @@ def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], na
 
 
 def fit_hinge_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """A hinge (Gaschler section 5.2); see :func:`fit_ball_joint`.
-
-    Gaschler (2011): figure 5.5; eq. 5.8-5.9.
-    """
+    """A hinge (Gaschler section 5.2: figure 5.5, eq. 5.8-5.9); see :func:`fit_ball_joint`."""
     return _fit(JointKind.HINGE, parent, child, name)
 
 
