@@ -64,7 +64,9 @@ def calibrate_target(
     diameter: float = 0.0,
     flexible: bool = False,
 ) -> TargetCalibration:
-    """The most likely points of a target, over its points and its poses in all views (Gaschler 2011, eq. 4.13, 4.18-4.19).
+    """The most likely points of a target, over its points and its poses in all views.
+
+    Gaschler (2011): eq. 4.13, 4.18-4.19.
 
     A generalised Procrustes analysis gives the start, Gauss-Newton the maximum; in each step the poses are eliminated
     (Schur complement), so that the time grows with the number of views only. Views that do not fit are dropped.
