@@ -58,8 +58,8 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         yield running
 
 
-@pytest.mark.parametrize("name", ["kinect_skeleton", "fusion", "skeleton_filter", "joint_angles"])
-def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -> None:
+def stopped_and_continued(live: Live, name: str) -> tuple[float, float]:
+    """Seconds: age at the end of the standstill of the oldest angles but one that came after it; delay otherwise."""
     process = live.processes[name]
     process.send_signal(signal.SIGSTOP)
     live.until(lambda: False, STOPPED)
@@ -68,10 +68,19 @@ def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -
     continued_ns = time.time_ns()
     process.send_signal(signal.SIGCONT)
     assert live.until(lambda: sum(stamp > continued_ns for stamp, _ in live.stamps) > 60, 30.0)
-    # A message is left out where it was sent so long before; to which the nodes add what they need on a busy machine.
     undisturbed = [*before, *(each for each in live.stamps if each[0] > continued_ns)]
     delay = max(arrival - stamp for stamp, arrival in undisturbed)
     # One may have been between the last look at the clock and the system call that sends it, which nothing can see.
     oldest = continued_ns - sorted(stamp for stamp, _ in live.stamps)[1]
-    assert oldest / NANOSECONDS < MAX_AGE + max(0.2, delay / NANOSECONDS)
-    assert delay / NANOSECONDS < STOPPED / 2  # or the test would say nothing
+    return oldest / NANOSECONDS, delay / NANOSECONDS
+
+
+@pytest.mark.parametrize("name", ["kinect_skeleton", "fusion", "skeleton_filter", "joint_angles"])
+def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -> None:
+    for _ in range(3):
+        oldest, delay = stopped_and_continued(live, name)
+        # A message is left out where it was sent so long before; to which the nodes add what they need on a busy machine.
+        assert oldest < MAX_AGE + max(0.2, delay)
+        if delay < STOPPED / 2:
+            return
+    pytest.fail(f"angles come {delay:.1f} s late without a standstill, so that the test says nothing")
