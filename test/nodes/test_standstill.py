@@ -79,7 +79,7 @@ def stopped_and_continued(live: Live, name: str) -> tuple[float, float]:
 def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -> None:
     for _ in range(3):
         oldest, delay = stopped_and_continued(live, name)
-        # A message is left out where it was sent so long before; to which the nodes add what they need on a busy machine.
+        # A message is left out where it was sent so long before; on a busy machine the nodes add their own delay.
         assert oldest < MAX_AGE + max(0.2, delay)
         if delay < STOPPED / 2:
             return
