@@ -53,9 +53,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from body_tracking.core.c3d import MarkerError, Trial, listed, read_trial
 from body_tracking.core.files import open_regular
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
-from body_tracking.evaluation.c3d import MarkerError, Trial, listed, read_trial
 from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, runs, smooth
 
 THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")

@@ -1,8 +1,9 @@
 """``body_tracking import``: recordings of other formats, one or several views, as one bag.
 
 Skeletons go to ``/<sensor>/skeleton``, inertial readings to ``/<sensor>/imu/data`` (with orientation) or
-``/<sensor>/imu/data_raw``, and ``/<sensor>/imu/mag``; joint angles in a file to ``/ground_truth/joint_states``. A
-message's header stamp is the sensor's own clock exactly as recorded; the bag's log time is the time of receipt.
+``/<sensor>/imu/data_raw``, and ``/<sensor>/imu/mag``; joint angles in a file to ``/ground_truth/joint_states``; points
+of another motion capture system to ``/markers/points``. A message's header stamp is the sensor's own clock exactly as
+recorded; the bag's log time is the time of receipt.
 """
 
 from __future__ import annotations
@@ -30,6 +31,14 @@ from body_tracking.inertial.imu_csv import ImuCsvRecording, is_imu_csv
 from body_tracking.inertial.mvnx import MvnxRecording
 from body_tracking.kinect.csv_recording import CsvRecording, sensor_column
 from body_tracking.kinect.ntu import NtuRecording
+from body_tracking.markers import setup
+from body_tracking.markers.messages import points_to_cloud
+from body_tracking.markers.trajectories import (
+    DEFAULT_NOISE,
+    RecordedPoints,
+    TrajectoryRecording,
+    is_trajectory_file,
+)
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
@@ -40,7 +49,8 @@ CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
 MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
 
-_Item = RecordedFrame | RecordedImu | RecordedAngles
+_Recording = Recording | ImuRecording | TrajectoryRecording
+_Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints
 _Message = tuple[str, str, Qos, object]
 """Topic, its type and quality, message."""
 
@@ -51,11 +61,11 @@ class ImportFileError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True)
 class ImportedSensor:
-    """The imported messages of one sensor.
+    """The imported messages of one sensor, or of ``markers`` for points.
 
     Attributes:
         frames: number of messages.
-        bodies: the most bodies in one frame; 0 for an inertial sensor.
+        bodies: the most bodies in one frame; 0 for an inertial sensor and for points.
         seconds: from the first to the last receipt.
         topics: of the messages.
     """
@@ -119,7 +129,7 @@ class _Tally:
     times_ns: list[int] = field(default_factory=list)
     topics: dict[str, None] = field(default_factory=dict)
 
-    def add(self, item: RecordedFrame | RecordedImu, topics: Iterable[str]) -> None:
+    def add(self, item: RecordedFrame | RecordedImu | RecordedPoints, topics: Iterable[str]) -> None:
         self.frames += 1
         self.bodies = max(self.bodies, len(item.skeletons) if isinstance(item, RecordedFrame) else 0)
         self.topics |= dict.fromkeys(topics)
@@ -151,9 +161,13 @@ def open_recording(path: Path, sensor: str | None = None, partial: bool = False)
     raise ImportFileError(f"{path}: not a {', '.join((*CSV_SUFFIXES, NTU_SUFFIX))} file")
 
 
-def _open_any(path: Path, name: str | None, partial: bool) -> Recording | ImuRecording:
-    """The reader for a file of skeletons or of inertial readings."""
+def _open_any(path: Path, name: str | None, partial: bool, labels: Sequence[str], noise: float) -> _Recording:
+    """The reader for a file of skeletons, of inertial readings or of points."""
     if path.is_file():
+        if is_trajectory_file(path):
+            if name is not None:
+                raise ImportFileError(f"--sensor {name}={path}: its points are of no sensor")
+            return TrajectoryRecording(path, labels, noise, partial)
         if path.name.lower().endswith(MVNX_SUFFIXES):
             if name is not None:
                 raise ImportFileError(f"--sensor {name}={path}: an MVNX file names its sensors itself")
@@ -172,6 +186,8 @@ def import_files(
     bag: Path,
     *,
     sensors: Mapping[Path, str] | None = None,
+    labels: Sequence[str] = (),
+    noise: float = DEFAULT_NOISE,
     overwrite: bool = False,
     partial: bool = False,
     progress: bool = False,
@@ -183,6 +199,8 @@ def import_files(
         bag: the folder to create.
         sensors: names by file, for files that lack the sensor's name or to replace it. By default CSV files without the
             column ``sensor`` are ``kinect1``, ``kinect2``, ...
+        labels: of the points of another motion capture system that are imported; all when empty.
+        noise: standard deviation of each coordinate of these points, metres.
         overwrite: replace an existing bag.
         partial: import truncated files up to their last whole frame.
         progress: show progress on stderr.
@@ -196,8 +214,11 @@ def import_files(
     twice = [str(path) for path, count in Counter(files).items() if count > 1]
     if twice:
         raise ImportFileError(f"{twice[0]}: is to be imported twice")
+    if not 0.0 < noise < 1.0:
+        raise ImportFileError(f"noise of points {noise:g} m, expected more than 0 and less than 1")
     recordings = [
-        _open_any(path, name, partial) for path, name in zip(files, _names(files, sensors or {}), strict=True)
+        _open_any(path, name, partial, labels, noise)
+        for path, name in zip(files, _names(files, sensors or {}), strict=True)
     ]
     tallies: dict[str, _Tally] = {}
     owners: dict[str, Path] = {}
@@ -229,7 +250,9 @@ def import_files(
         if shown is not None:
             shown.end()
         if not tallies:
-            raise ImportFileError(f"{', '.join(map(str, files))}: no body in any frame, and no inertial reading")
+            raise ImportFileError(
+                f"{', '.join(map(str, files))}: no body in any frame, no inertial reading and no point"
+            )
         writer.close()
     except BaseException:
         writer.discard()
@@ -259,8 +282,12 @@ def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]
     for path in files:
         name = given.get(path)
         if name is None and path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and not sensor_column(path):
-            # the inertial reader names its sensors itself
-            name = None if _is_inertial(path) else f"kinect{sum(value is not None for value in names) + 1}"
+            # the inertial reader names its sensors itself, and points have none
+            name = (
+                None
+                if _is_inertial(path) or is_trajectory_file(path)
+                else f"kinect{sum(value is not None for value in names) + 1}"
+            )
         names.append(name)
     return names
 
@@ -270,6 +297,8 @@ def _messages(item: _Item) -> list[_Message]:
     if isinstance(item, RecordedFrame):
         cloud = skeletons_to_cloud(item.skeletons, BAG_MESSAGES)
         return [(f"/{item.sensor}/skeleton", POINT_CLOUD, SENSOR_DATA, cloud)]
+    if isinstance(item, RecordedPoints):
+        return [(setup.POINTS, POINT_CLOUD, RELIABLE, points_to_cloud(item.points, BAG_MESSAGES))]
     if isinstance(item, RecordedAngles):
         nothing = np.full(len(item.names), np.nan)
         angles = JointAngles(item.received_ns, item.names, item.angles, nothing, nothing, nothing)
@@ -283,7 +312,7 @@ def _messages(item: _Item) -> list[_Message]:
     return found
 
 
-def _ordered(recording: Recording | ImuRecording, number: int) -> Iterator[tuple[int, int, _Item]]:
+def _ordered(recording: _Recording, number: int) -> Iterator[tuple[int, int, _Item]]:
     """Items with a non-decreasing key, so that merging keeps the order within each file."""
     latest = -(2**63)
     for item in recording:
@@ -294,7 +323,7 @@ def _ordered(recording: Recording | ImuRecording, number: int) -> Iterator[tuple
 class _Progress:
     """A percentage on stderr, if that is a terminal and the import takes more than a second."""
 
-    def __init__(self, recordings: Sequence[Recording | ImuRecording]) -> None:
+    def __init__(self, recordings: Sequence[_Recording]) -> None:
         self._recordings = recordings
         self._due_s = time.monotonic() + 1.0
         self._shown = False
@@ -320,10 +349,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "import",
         description="Turn recordings into one bag with a topic /<sensor>/skeleton per camera, and /<sensor>/imu/data "
-        "or data_raw, and /<sensor>/imu/mag, per inertial sensor. Header stamps are the "
-        "sensors' own clocks as recorded, the bag's log time is the time of receipt. Formats: docs/recordings.md.",
+        "or data_raw, and /<sensor>/imu/mag, per inertial sensor; points of another motion capture system (C3D, CSV of "
+        "Motive) go to /markers/points. Header stamps are the sensors' own clocks as recorded, the bag's log time is "
+        "the time of receipt. Formats: docs/recordings.md.",
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz")
+    parser.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz, .c3d"
+    )
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="BAG", help="the bag (a folder) to make")
     parser.add_argument(
         "--sensor",
@@ -332,6 +364,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="NAME[=FILE]",
         help="the sensor's name, if the file lacks it or to replace it; with several files, once per file; "
         "NAME,NAME,... for a file of several inertial sensors",
+    )
+    parser.add_argument(
+        "--labels",
+        type=lambda text: tuple(each.strip() for each in text.split(",") if each.strip()),
+        default=(),
+        metavar="LABEL,...",
+        help="import only these points of a .c3d file or of an export of Motive (default: all)",
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=DEFAULT_NOISE,
+        metavar="METRES",
+        help="standard deviation of each coordinate of these points (default %(default)s)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     parser.add_argument("--partial", action="store_true", help="import files that are cut off as far as they go")
@@ -345,6 +391,8 @@ def run(args: argparse.Namespace) -> int:
         args.files,
         args.output,
         sensors=_parse_sensors(args.sensor, args.files),
+        labels=args.labels,
+        noise=args.noise,
         overwrite=args.overwrite,
         partial=args.partial,
         progress=True,

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.c3d import MarkerError
 from body_tracking.core.skeleton import FloatArray, Joint
-from body_tracking.evaluation.c3d import MarkerError
 from body_tracking.evaluation.plug_in_gait import (
     MARKERS,
     MarkerTruth,

@@ -1,4 +1,4 @@
-"""One subject's points in a C3D file, read with ezc3d, in metres and z up."""
+"""Points in a C3D file, read with ezc3d, in metres; those of one subject by their names, z up."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from body_tracking.core.files import open_regular
 from body_tracking.core.skeleton import FloatArray
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
+UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
 """The cyclic permutation that makes an axis of the file z, by the axis that points up."""
+_COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
+"""Parameters of the group POINT that list the labels of points that are no places (https://www.c3d.org, POINT)."""
 
 _BLOCK = 512
 _BIG_ENDIAN = 86
@@ -26,6 +28,34 @@ _BIG_ENDIAN = 86
 
 class MarkerError(BodyTrackingError):
     """Raised when a file lacks the required marker trajectories; the text names those that it has."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class C3dPoints:
+    """All points of a file.
+
+    Attributes:
+        labels: of the first points; further ones have none.
+        data: (n, p, 3) in the file's axes and in ``scale`` metres (what is listed in ``computed``: in other units), NaN
+            where a point is not seen.
+        scale: metres per unit of length.
+        up: the axis that points up (POINT:Y_SCREEN), such as ``+Z``; empty where the file does not say.
+        rate: frames per second.
+        stamps: (n,) seconds.
+        computed: labels of points that are angles, forces, moments, powers or scalars.
+        angle_unit: radians per unit of an angle.
+        processing: the numbers in the group PROCESSING.
+    """
+
+    labels: tuple[str, ...]
+    data: FloatArray
+    scale: float
+    up: str
+    rate: float
+    stamps: FloatArray
+    computed: frozenset[str]
+    angle_unit: float
+    processing: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +73,65 @@ class Trial:
         return len(self.stamps)
 
 
+def read_points(path: Path) -> C3dPoints:
+    """All points of a C3D file.
+
+    Raises:
+        MarkerError: the file cannot be read, has no points, or an unknown unit of length.
+    """
+    frames = _announced_frames(path)
+    try:
+        ezc3d: Any = importlib.import_module("ezc3d")
+    except ImportError as error:
+        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
+    try:
+        file = ezc3d.c3d(str(path))
+        parameters = file["parameters"]
+        header = file["header"]["points"]
+        data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(2, 1, 0)
+        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0].T
+    # a damaged file raises any of these
+    except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
+        raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
+
+    def values(group: str, name: str) -> list[Any]:
+        return list(parameters[group][name]["value"]) if group in parameters and name in parameters[group] else []
+
+    def value(group: str, name: str, default: Any) -> Any:
+        return next(iter(values(group, name)), default)
+
+    def all_of(name: str) -> list[str]:
+        found = values("POINT", name)
+        for number in range(2, 100):  # a parameter holds at most 255 names
+            found += values("POINT", f"{name}{number}")
+        return [str(each).strip() for each in found]
+
+    labels = all_of("LABELS")[: data.shape[1]]
+    if not data.size:
+        raise MarkerError(f"{path}: {data.shape[1]} points in {len(data)} frames: there are no trajectories in it")
+    if len(data) < frames:
+        raise MarkerError(f"{path}: cut off after {len(data)} of {frames} frames")
+    rate = float(value("POINT", "RATE", header["frame_rate"]))
+    unit = value("POINT", "UNITS", "mm").strip()
+    if not rate > 0.0:
+        raise MarkerError(f"{path}: {rate} frames per second")
+    if unit not in _UNITS:
+        raise MarkerError(f"{path}: unit of length {unit!r}, expected one of {', '.join(_UNITS)}")
+    seen = np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1) & (residuals >= 0.0)
+    numbers = {name: value("PROCESSING", name, None) for name in parameters.get("PROCESSING", {}) if name[0] != "_"}
+    return C3dPoints(
+        tuple(labels),
+        np.where(seen[..., None], data, np.nan),
+        _UNITS[unit],
+        str(value("POINT", "Y_SCREEN", "")).strip().upper(),
+        rate,
+        (int(header["first_frame"]) + np.arange(len(data))) / rate,
+        frozenset(label for name in _COMPUTED for label in all_of(name)),
+        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
+        {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
+    )
+
+
 def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Trial:
     """One subject of a C3D file.
 
@@ -54,59 +143,19 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
     Raises:
         MarkerError: the file cannot be read, or lacks the subject.
     """
-    frames = _announced_frames(path)
-    try:
-        ezc3d: Any = importlib.import_module("ezc3d")
-    except ImportError as error:
-        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
-    try:
-        file = ezc3d.c3d(str(path))
-        parameters = file["parameters"]
-        header = file["header"]["points"]
-        data = np.asarray(file["data"]["points"], dtype=float)[:3].transpose(1, 2, 0)
-        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0]
-    # a damaged file raises any of these
-    except (OSError, RuntimeError, ValueError, LookupError, MemoryError, TypeError) as error:
-        raise MarkerError(f"{path}: not a C3D file that can be read ({error})") from error
-
-    def values(group: str, name: str) -> list[Any]:
-        return list(parameters[group][name]["value"]) if group in parameters and name in parameters[group] else []
-
-    def value(group: str, name: str, default: Any) -> Any:
-        return next(iter(values(group, name)), default)
-
-    labels = values("POINT", "LABELS")
-    for number in range(2, 100):  # a parameter holds at most 255 names
-        labels += values("POINT", f"LABELS{number}")
-    labels = [label.strip() for label in labels[: len(data)]]
-    if not labels or not data.shape[1]:
-        raise MarkerError(f"{path}: {len(labels)} points in {data.shape[1]} frames: there are no trajectories in it")
-    if data.shape[1] < frames:
-        raise MarkerError(f"{path}: cut off after {data.shape[1]} of {frames} frames")
-    rate = float(value("POINT", "RATE", header["frame_rate"]))
-    unit, up = value("POINT", "UNITS", "mm").strip(), value("POINT", "Y_SCREEN", "+Z").strip().upper()
-    if not rate > 0.0:
-        raise MarkerError(f"{path}: {rate} frames per second")
-    if unit not in _UNITS:
-        raise MarkerError(f"{path}: unit of length {unit!r}, expected one of {', '.join(_UNITS)}")
-    if up not in _UP_FIRST:
+    file = read_points(path)
+    if not file.labels:
+        raise MarkerError(f"{path}: no point has a label")
+    up = file.up or "+Z"
+    if up not in UP_FIRST:
         raise MarkerError(f"{path}: the axis that points up (POINT:Y_SCREEN) is {up!r}, expected +X, +Y or +Z")
-    seen = np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1) & (residuals >= 0.0)
-    data = np.where(seen[..., None], data, np.nan)
-    chosen = _of_subject(path, labels, subject, wanted)
-    angles = set(values("POINT", "ANGLES")) | {label for label in labels if label.endswith("Angles")}
+    chosen = _of_subject(path, list(file.labels), subject, wanted)
+    angles = file.computed | {label for label in file.labels if label.endswith("Angles")}
     points = {
-        name: data[index] if labels[index] in angles else _UNITS[unit] * data[index][:, _UP_FIRST[up]]
+        name: file.data[:, index] if file.labels[index] in angles else file.scale * file.data[:, index][:, UP_FIRST[up]]
         for name, index in chosen.items()
     }
-    numbers = {name: value("PROCESSING", name, None) for name in parameters.get("PROCESSING", {}) if name[0] != "_"}
-    return Trial(
-        points,
-        rate,
-        (int(header["first_frame"]) + np.arange(data.shape[1])) / rate,
-        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
-        {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
-    )
+    return Trial(points, file.rate, file.stamps, file.angle_unit, file.processing)
 
 
 def _announced_frames(path: Path) -> int:
