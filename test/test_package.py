@@ -32,6 +32,7 @@ LIBRARIES = {
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "filterpy": ("filterpy", "python3-filterpy-pip"),
     "vqf": ("vqf", None),
+    "numba": ("numba", None),
     "mcap": ("mcap", None),
     "lz4": ("lz4", None),
     "zstandard": ("zstandard", None),

@@ -1,0 +1,82 @@
+"""A depth buffer: what a depth camera would measure of a mesh."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.skeleton import FloatArray, SingleArray
+from body_tracking.mesh.compiled import compiled
+
+FaceArray = NDArray[np.int32]
+
+
+class DepthBuffer(NamedTuple):
+    """A rendered mesh.
+
+    Attributes:
+        depth: (height, width) float32 metres along the optical axis, 0 where no face is seen.
+        faces: (height, width) int32 number of the face that is seen; -1 for none.
+    """
+
+    depth: SingleArray
+    faces: FaceArray
+
+
+def render(vertices: FloatArray, faces: NDArray[np.integer], camera: Camera, scale: int = 1) -> DepthBuffer:
+    """Render a mesh by a z-buffer, both sides of its faces.
+
+    Lens distortion moves the vertices; the edges between them stay straight, which is exact enough for faces of
+    centimetres. A face with a vertex less than 1 cm in front of the camera is left out.
+
+    Args:
+        vertices: (n, 3) metres in the optical frame.
+        faces: (m, 3) numbers of vertices.
+        camera: whose image it is.
+        scale: pixels of the camera per pixel of the buffer, whose centres lie in the middle of theirs.
+    """
+    pixels = (camera.project(vertices) + 0.5) / scale - 0.5
+    shape = camera.height // scale, camera.width // scale
+    depth, seen = _fill(pixels, vertices[:, 2].copy(), np.ascontiguousarray(faces, dtype=np.int32), *shape)
+    return DepthBuffer(depth, seen)
+
+
+@compiled
+def _fill(
+    pixels: FloatArray, distances: FloatArray, faces: FaceArray, height: int, width: int
+) -> tuple[SingleArray, FaceArray]:
+    """1/z is linear in the image; it is interpolated with the signed areas opposite to the vertices."""
+    nearness = np.zeros((height, width), dtype=np.float64)
+    seen = np.full((height, width), -1, dtype=np.int32)
+    for k in range(len(faces)):
+        a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
+        # not greater: NaN too, which a vertex behind the camera or beyond the distortion's range projects to
+        if not (distances[a] > 0.01 and distances[b] > 0.01 and distances[c] > 0.01):
+            continue
+        xa, ya, xb, yb, xc, yc = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        if not abs(area) > 1e-12:
+            continue
+        left, right = max(np.ceil(min(xa, xb, xc)), 0.0), min(np.floor(max(xa, xb, xc)), width - 1.0)
+        top, bottom = max(np.ceil(min(ya, yb, yc)), 0.0), min(np.floor(max(ya, yb, yc)), height - 1.0)
+        wa, wb, wc = 1.0 / distances[a] / area, 1.0 / distances[b] / area, 1.0 / distances[c] / area
+        for row in range(int(top), int(bottom) + 1):
+            for column in range(int(left), int(right) + 1):
+                ea = (xb - column) * (yc - row) - (xc - column) * (yb - row)
+                eb = (xc - column) * (ya - row) - (xa - column) * (yc - row)
+                ec = area - ea - eb
+                if ea * area < 0.0 or eb * area < 0.0 or ec * area < 0.0:
+                    continue
+                near = ea * wa + eb * wb + ec * wc
+                if near > nearness[row, column]:
+                    nearness[row, column] = near
+                    seen[row, column] = k
+    depth = np.zeros((height, width), dtype=np.float32)
+    for row in range(height):
+        for column in range(width):
+            if nearness[row, column] > 0.0:
+                depth[row, column] = 1.0 / nearness[row, column]
+    return depth, seen
