@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from body_tracking.core import so3
+from body_tracking.core.camera import CameraError
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import projection
@@ -78,9 +79,12 @@ def minimise(
         equations = _normal_equations(here)
         change = 1.0
         while damping < _MAX_DAMPING:
-            candidate = moved(state, *_step(equations, damping))
-            there = linearise(candidate)
-            new = float(there.residuals @ there.residuals)
+            try:
+                candidate = moved(state, *_step(equations, damping))
+                there = linearise(candidate)
+                new = float(there.residuals @ there.residuals)
+            except CameraError:  # a step so large that a focal length is negative
+                new = float("nan")
             if new <= cost:  # False for NaN
                 change = (cost - new) / max(cost, 1e-300)
                 state, here, cost, damping = candidate, there, new, max(0.1 * damping, 1e-12)

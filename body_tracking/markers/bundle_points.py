@@ -7,6 +7,7 @@ edges, it is no plane. Where a board is not stiff this fits to the noise of its 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -76,11 +77,45 @@ class AdjustedPoints:
         return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is known of the lenses of cameras before an adjustment.
+
+    Attributes:
+        lenses: (p,) parameters of the rig; those of poses are not used.
+        known: (p,) which of them have a variance.
+        whitening: (k, k) W of these k, so that W^T W is the inverse of their covariance.
+    """
+
+    lenses: FloatArray
+    known: BoolArray
+    whitening: FloatArray
+
+    @classmethod
+    def of(cls, rig: Rig) -> Prior:
+        """The lenses of a rig with their covariance, whatever its poses are."""
+        known = projection.lenses_of(rig) & (np.diag(rig.covariance) > 0.0)
+        deviations = np.sqrt(np.diag(rig.covariance)[known])
+        # scaled to a unit diagonal: focal lengths and coefficients differ by orders of magnitude
+        correlations = rig.covariance[np.ix_(known, known)] / np.outer(deviations, deviations)
+        values, vectors = np.linalg.eigh(correlations)
+        whitening = (vectors / np.sqrt(np.maximum(values, _LEAST_VARIANCE))).T / deviations
+        return cls(projection.parameters(rig), known, whitening)
+
+
 _Points = tuple[Rig, FloatArray]
+_LEAST_VARIANCE: Final = 1e-9
+"""Of a combination of parameters, each in units of its own deviation: rounding in a file makes zero or less of it."""
 
 
 def adjust_points(
-    rig: Rig, points: FloatArray, seen: Sightings, lengths: Lengths, free: BoolArray, noise: float
+    rig: Rig,
+    points: FloatArray,
+    seen: Sightings,
+    lengths: Lengths,
+    free: BoolArray,
+    noise: float,
+    prior: Prior | None = None,
 ) -> AdjustedPoints:
     """Fit cameras and points to what is seen.
 
@@ -91,6 +126,7 @@ def adjust_points(
         lengths: of the object; they give the scale.
         free: (p,) which parameters of the rig are fitted; the others keep their value and have no variance.
         noise: expected standard deviation of a coordinate in an image, pixels; against the lengths' deviation.
+        prior: what is known of the cameras' lenses before.
 
     Raises:
         BundleError: pixels that are not finite, behind a camera, or fewer than determine the parameters.
@@ -101,7 +137,11 @@ def adjust_points(
     there[seen.views, seen.points] = True
     known = there[:, lengths.pairs].all(axis=-1)  # (v, e)
     at, pair = np.nonzero(known)
-    freedom = 2 * len(seen.pixels) + len(at) - 3 * int(there.sum()) - len(chosen)
+    weights = np.zeros((0, rig.size))
+    if prior is not None:
+        weights = np.zeros((len(prior.whitening), rig.size))
+        weights[:, prior.known] = prior.whitening
+    freedom = 2 * len(seen.pixels) + len(at) + len(weights) - 3 * int(there.sum()) - len(chosen)
     if freedom <= 0 or not len(at) or not np.isfinite(seen.pixels).all():
         raise BundleError(
             f"{len(seen.pixels)} sightings of {int(there.sum())} points and {len(at)} known lengths, "
@@ -112,7 +152,7 @@ def adjust_points(
     columns = 3 * seen.points[:, None] + np.arange(3)
     first, second = lengths.pairs[pair].T
     first_columns, second_columns = 3 * first[:, None] + np.arange(3), 3 * second[:, None] + np.arange(3)
-    blocks = np.concatenate([np.repeat(seen.views, 2), at])
+    blocks = np.concatenate([np.repeat(seen.views, 2), at, np.zeros(len(weights), dtype=np.intp)])
 
     def linearise(state: _Points) -> Linearised:
         cameras, places = state
@@ -135,10 +175,23 @@ def adjust_points(
         by_points = np.zeros((len(at), 3 * object_points))
         by_points[np.arange(len(at))[:, None], first_columns] = -direction
         by_points[np.arange(len(at))[:, None], second_columns] = direction
+        before = np.zeros(len(weights)) if prior is None else weights @ (projection.parameters(cameras) - prior.lenses)
         return Linearised(
-            np.concatenate([residuals.ravel() / noise, (distance - lengths.metres[pair]) / lengths.deviation]),
-            np.concatenate([shared.reshape(-1, rig.size)[:, chosen] / noise, np.zeros((len(at), len(chosen)))]),
-            np.concatenate([local.reshape(-1, 3 * object_points) / noise, by_points / lengths.deviation]),
+            np.concatenate([residuals.ravel() / noise, (distance - lengths.metres[pair]) / lengths.deviation, before]),
+            np.concatenate(
+                [
+                    shared.reshape(-1, rig.size)[:, chosen] / noise,
+                    np.zeros((len(at), len(chosen))),
+                    weights[:, chosen],
+                ]
+            ),
+            np.concatenate(
+                [
+                    local.reshape(-1, 3 * object_points) / noise,
+                    by_points / lengths.deviation,
+                    np.zeros((len(weights), 3 * object_points)),
+                ]
+            ),
             blocks,
             count,
         )
@@ -155,5 +208,5 @@ def adjust_points(
     whole = np.zeros((rig.size, rig.size))
     whole[np.ix_(chosen, chosen)] = variance * covariance
     errors = np.full((count, len(lengths.pairs)), np.nan)
-    errors[at, pair] = lengths.deviation * all_residuals[2 * len(seen.pixels) :]
+    errors[at, pair] = lengths.deviation * all_residuals[2 * len(seen.pixels) :][: len(at)]
     return AdjustedPoints(replace(fitted, covariance=whole), places, pixels, errors, float(noise * np.sqrt(variance)))

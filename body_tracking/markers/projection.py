@@ -12,7 +12,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.markers.rig import LENS, POSE, Rig
 
 
@@ -40,6 +40,24 @@ def offsets(rig: Rig) -> list[int]:
     """Index of the first parameter of each camera of a rig, and the number of all."""
     ends = np.cumsum([size(camera) for camera in rig.cameras])
     return [0, *ends.tolist()]
+
+
+def lenses_of(rig: Rig) -> BoolArray:
+    """(p,) which parameters of a rig are those of its cameras' lenses."""
+    lens = np.ones(rig.size, dtype=np.bool_)
+    for end in offsets(rig)[1:]:
+        lens[end - POSE : end] = False
+    return lens
+
+
+def parameters(rig: Rig) -> FloatArray:
+    """(p,) the lenses of a rig's cameras; zeros in place of their poses, which are changes."""
+    return np.concatenate(
+        [
+            np.concatenate([camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], camera.distortion, np.zeros(POSE)])
+            for camera in rig.cameras
+        ]
+    )
 
 
 def by_lens(camera: Camera, flat: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

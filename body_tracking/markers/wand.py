@@ -2,13 +2,15 @@
 
 The essential matrix of two cameras gives their poses to each other but for the scale, which the wand's length gives
 (Hartley and Zisserman 2004, section 9.6); a bundle adjustment over the cameras and the places of the balls fits
-everything together. The cameras' lenses are known, from boards, and may be refined.
+everything together. The cameras' lenses are known from boards, as well as their covariance says: the adjustment moves
+them within it, so that the poses' covariance contains their errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, Final
 
 import cv2
@@ -18,14 +20,19 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import bundle, projection
-from body_tracking.markers.bundle_points import AdjustedPoints, Lengths, Sightings, adjust_points
+from body_tracking.markers.bundle_points import AdjustedPoints, Lengths, Prior, Sightings, adjust_points
 from body_tracking.markers.rig import Rig
+from body_tracking.markers.spheres import sphere_centre_correction
 
+MOST_BALLS: Final = 8
+"""In an image in which a wand is looked for; it takes three of them at a time."""
 MIN_SHARED: Final = 20
 """Balls that two cameras see at the same time; eight determine the essential matrix."""
 _OUTLIER: Final = (5.0, 0.5)
 """A sighting is left out whose residual exceeds so many times the median and so many pixels."""
-_ROUNDS: Final = 3
+_ROUNDS: Final = 4
+_NOISE_GUESSED: Final = (0.7, 1.4)
+"""Estimated over expected noise, within which the adjustment is not repeated with the estimated one."""
 _RANSAC: Final = (0.9999, 2.0)
 """Probability of success, and pixels from an epipolar line."""
 _CV: Any = cv2
@@ -92,6 +99,28 @@ class Wand:
             ends.reverse()
         return np.array([ends[0], middle, ends[1]], dtype=np.intp)
 
+    def find(self, pixels: FloatArray) -> IntArray | None:
+        """The wand among the balls in an image.
+
+        Args:
+            pixels: (n, 2) in any order.
+
+        Returns:
+            (3,) indices of the balls in the order of the wand; None where no three balls are in a row, more than one
+            three are, or there are more than :data:`MOST_BALLS`.
+
+        Raises:
+            WandError: as of :meth:`order`.
+        """
+        if not 3 <= len(pixels) <= MOST_BALLS:
+            return None
+        rows = []
+        for chosen in combinations(range(len(pixels)), 3):
+            order = self.order(pixels[list(chosen)])
+            if order is not None:
+                rows.append(np.array(chosen, dtype=np.intp)[order])
+        return rows[0] if len(rows) == 1 else None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WandCalibration:
@@ -112,7 +141,7 @@ def calibrate_wand(
     cameras: Sequence[Camera],
     seen: Sightings,
     wand: Wand,
-    coefficients: tuple[int, ...] | None = None,
+    covariance: FloatArray | None = None,
     noise: float = 0.1,
 ) -> WandCalibration:
     """Calibrate the poses of cameras to each other.
@@ -121,38 +150,72 @@ def calibrate_wand(
         cameras: two or more, with known lenses; the first one's frame is the rig's.
         seen: balls of the wand, whose points are numbered along it.
         wand: the wand.
-        coefficients: of the distortion that are fitted again with the cameras' matrices; None keeps the lenses.
-        noise: expected standard deviation of a ball's coordinate in an image, pixels.
+        covariance: (p, p) of the cameras' parameters as in :class:`Rig`, of which those of the lenses are used; None
+            for lenses without error. With lenses 1 px off that are held fixed, the poses' errors are ten times the
+            stated deviations.
+        noise: first guess of the standard deviation of a ball's coordinate in an image, pixels.
 
     Raises:
+        BundleError: what is seen does not determine the poses.
         WandError: numbers that are not finite, unknown cameras or balls, cameras that share too few sightings.
     """
     _check(cameras, seen, wand)
     flat, lengths = _flat(cameras, seen), wand.lengths()
     rotations, translations = _camera_poses(cameras, seen, flat, lengths)
     size = sum(projection.size(camera) for camera in cameras)
-    rig = Rig(tuple(cameras), rotations, translations, np.zeros((size, size)))
-    free = bundle.free_parameters(rig, coefficients)
+    known = np.zeros((size, size)) if covariance is None else covariance
+    rig = Rig(tuple(cameras), rotations, translations, known)
+    prior, poses = Prior.of(rig), bundle.free_parameters(rig, None)
     used: BoolArray = np.asarray(np.isfinite(flat).all(axis=-1))
-    for last in (index == _ROUNDS - 1 for index in range(_ROUNDS)):
+    errors = _pixels(rig, seen, intersect(rig, seen.where(used), len(wand.places), flat[used])) - seen.pixels
+    used &= _inliers(np.linalg.norm(errors, axis=-1), used)
+    for number in range(_ROUNDS):
         used = used & (_counts(seen, used) >= 2)
         points = intersect(rig, seen.where(used), len(wand.places), flat[used])
-        in_front = np.isfinite(_pixels(rig, seen, points)).all(axis=-1)
-        used &= in_front
+        used &= np.isfinite(_pixels(rig, seen, points)).all(axis=-1)
         used &= _counts(seen, used) >= 2
-        adjusted = adjust_points(rig, points, seen.where(used), lengths, free, noise)
-        rig = adjusted.rig
-        errors = np.linalg.norm(adjusted.residuals, axis=-1)
-        wrong = errors > max(_OUTLIER[0] * float(np.median(errors)), _OUTLIER[1])
-        if not wrong.any() or last:
+        # lenses are held in the first round: wrong sightings that are still there would bend them
+        free = poses if number == 0 else poses | prior.known
+        adjusted = adjust_points(rig, points, seen.where(used), lengths, free, noise, prior)
+        guessed = _NOISE_GUESSED[0] < adjusted.noise / noise < _NOISE_GUESSED[1]
+        rig, noise = adjusted.rig, adjusted.noise
+        good = used.copy()
+        good[used] = _inliers(np.linalg.norm(adjusted.residuals, axis=-1))
+        done = number > 0 or not prior.known.any()
+        if number == _ROUNDS - 1 or (done and guessed and good.sum() == used.sum()):
             break
-        used[np.flatnonzero(used)[wrong]] = False
+        used = good
     # what the wand's length is wrong by is the same in all images, and scales the rig
     scaled = np.zeros(rig.size)
     for index, end in enumerate(projection.offsets(rig)[1:]):
         scaled[end - 3 : end] = rig.translations[index] * wand.deviation / wand.places[-1]
     rig = replace(rig, covariance=rig.covariance + np.outer(scaled, scaled))
     return WandCalibration(rig, adjusted, used)
+
+
+def centred(found: WandCalibration, seen: Sightings, diameter: float) -> Sightings:
+    """The sightings, moved from the centroids of the balls' images to the projections of the balls' centres.
+
+    Args:
+        found: a first calibration by these sightings, for the depths of the balls; sightings that it left out stay.
+        seen: as they were found.
+        diameter: of the balls, metres.
+    """
+    rig, pixels = found.rig, np.array(seen.pixels)
+    for index, camera in enumerate(rig.cameras):
+        rows = np.flatnonzero(found.used & (seen.cameras == index))
+        points = found.adjusted.points[seen.views[rows], seen.points[rows]]
+        depths = points @ rig.rotations[index][2] + rig.translations[index][2]
+        pixels[rows] += sphere_centre_correction(camera, pixels[rows], depths, 0.5 * diameter)
+    return replace(seen, pixels=pixels)
+
+
+def _inliers(errors: FloatArray, used: BoolArray | bool = True) -> BoolArray:
+    """Which of these distances (n,) in pixels are no outliers; the median is that of those in use."""
+    chosen = errors[np.isfinite(errors) & used]
+    limit = max(_OUTLIER[0] * float(np.median(chosen)), _OUTLIER[1]) if len(chosen) else 0.0
+    inliers: BoolArray = errors <= limit
+    return inliers
 
 
 def intersect(rig: Rig, seen: Sightings, points: int, flat: FloatArray | None = None) -> FloatArray:

@@ -1,7 +1,7 @@
 """``body_tracking markers``: the cameras, the targets and the chain of the marker system, and its angles offline.
 
-A folder holds what the nodes need: ``calibrate`` writes its ``rig.yaml``, ``target`` its ``targets.yaml``, ``fit`` its
-``chain.yaml``.
+A folder holds what the nodes need: ``calibrate`` and ``wand`` write its ``rig.yaml``, ``target`` its ``targets.yaml``,
+``fit`` its ``chain.yaml``.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.stage import Port, Stage
 from body_tracking.pipeline.system import load
+from body_tracking.recording import marker_wand
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
@@ -356,6 +357,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--columns", type=int, required=True, metavar="N", help="inner corners in a row")
     parser.add_argument("--rows", type=int, required=True, metavar="N", help="rows of inner corners")
     parser.add_argument("--square", type=float, required=True, metavar="METRES", help="width of a square")
+
+    marker_wand.add_parser(commands)
 
     parser = command("target", target, "Measure a target that is turned before the cameras alone; into targets.yaml.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of the target")

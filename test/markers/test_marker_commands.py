@@ -7,20 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import images, rig
 
 from body_tracking import cli
 from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.qos import RELIABLE
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
-from body_tracking.markers.codecs import SpacePoints
-from body_tracking.markers.rig_storage import save_rig
+from body_tracking.markers.codecs import Balls, SpacePoints
+from body_tracking.markers.rig import Rig
+from body_tracking.markers.rig_storage import load_rig, save_rig
 from body_tracking.markers.targets import Target
 from body_tracking.markers.targets_file import load_targets, save_targets
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 from body_tracking.simulation.marker_scene import stereo_rig
 from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation
 
+WAND = (0.0, 0.1, 0.3)
 START_NS, PERIOD_NS = 1_750_000_000_000_000_000, 16_666_667
 
 
@@ -55,6 +58,64 @@ def test_a_target_is_measured_from_a_recording(turned: Path, capsys: pytest.Capt
     assert cli.main(["markers", *words]) == 0
     assert cli.main(["markers", *[word if word != "hand" else "twin" for word in words]]) == 2
     assert [each.name for each in load_targets(turned / setup.TARGETS)] == ["hand"]
+
+
+@pytest.fixture(scope="module")
+def waved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the balls of a wand in the images of three cameras, and the lenses in two folders."""
+    folder, truth, rng = tmp_path_factory.mktemp("wand"), rig(3), np.random.default_rng(0)
+    for name, cameras in (("first", truth.cameras[:2]), ("second", truth.cameras[2:])):
+        (folder / name).mkdir()
+        count = len(cameras)
+        alone = Rig(cameras, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((15 * count,) * 2))
+        save_rig(alone, folder / name / setup.RIG)
+    with BagWriter(folder / "bag") as bag:
+        for camera in truth.cameras:
+            bag.add_topic(setup.balls_topic(camera.frame_id), POINT_CLOUD, RELIABLE)
+        for number in range(60):
+            stamp_ns = START_NS + number * PERIOD_NS
+            along = random_rotation(rng)[0]
+            places = rng.uniform([0.1, -0.2, 0.9], [0.4, 0.2, 1.5]) + np.array(WAND)[:, None] * along
+            balls, _ = images(truth, [places] * 3, rng, 0.05, stamp_ns)
+            for each in balls:
+                bag.write(setup.balls_topic(each.camera), Balls().encode(each, BAG_WIRE), stamp_ns)
+    return folder
+
+
+def test_a_wand_calibrates_three_cameras(waved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lenses = [word for name in ("first", "second") for word in ("--lenses", str(waved / name))]
+    words = ["wand", str(waved / "bag"), "--setup", str(tmp_path / "lab"), "--places", "0,0.1,0.3", *lenses]
+    assert cli.main(["markers", *words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    truth, found = rig(3), load_rig(tmp_path / "lab" / setup.RIG)
+    assert [camera.frame_id for camera in found.cameras] == list(report["cameras"]) == ["a", "b", "c"]
+    # 0.05 px at 1.2 m are 0.07 mm across a ray; of 60 places some millimetres along it are left
+    np.testing.assert_allclose(found.translations, truth.translations, atol=3e-3)
+    for index, each in enumerate(report["cameras"].values()):
+        expected = -1e3 * truth.rotations[index].T @ truth.translations[index]
+        assert np.linalg.norm(expected - each["position_mm"]) <= 4.0 * each["translation_stddev_mm"] + 1e-9
+        assert each["images"] == 60 and each["with_wand"] > 30 and each["rms_px"] < 0.1
+    assert cli.main(["markers", *words]) == 0
+    out = capsys.readouterr().out
+    assert "b: at " in out and " mm (± " in out and " deg (± " in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--places", "0,a"], "--places '0,a': expected metres along the wand"),
+        (["--places", "0,0.1,0.2"], "balls of the wand at even distances have no order"),
+        (["--places", "0,0.1,0.3", "--lenses", "{waved}/first"], "camera a is in another folder too"),
+    ],
+)
+def test_a_wand_that_does_not_serve_is_refused_in_one_line(
+    waved: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [word.format(waved=waved) for word in words]
+    base = ["markers", "wand", str(waved / "bag"), "--setup", str(waved / "first"), "--lenses", str(waved / "first")]
+    assert cli.main([*base, *given]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rigs import rig
@@ -47,6 +49,46 @@ def test_errors_of_poses_are_within_their_stated_deviations(count: int) -> None:
         assert np.linalg.norm(error[:, 3:], axis=1).max() < 1.5e-3 and made.adjusted.rms() < 0.2
     assert np.mean(np.abs(standard) < 1.96) > 0.85
     assert np.mean(np.square(standard)) > 0.3
+
+
+LENS = np.array([1.0, 1.0, 1.0, 1.0, 4e-3, 2e-2])
+"""Standard deviations of fx, fy, cx, cy and the radial distortion, as of a calibration by few boards."""
+
+
+def with_wrong_lenses(truth: Rig, rng: np.random.Generator) -> Rig:
+    """The rig with lenses that are as wrong as its covariance says."""
+    size = len(truth.cameras)
+    error = np.zeros((size, 15))
+    error[:, :6] = LENS * rng.normal(size=(size, 6))
+    covariance = np.diag(np.tile(np.concatenate([LENS, np.zeros(9)]) ** 2, size))
+    return replace(truth.changed(error.ravel()), covariance=covariance)
+
+
+def test_errors_of_the_lenses_are_in_the_deviations_of_the_poses() -> None:
+    truth, standard = rig(4), []
+    for seed in range(draws(2, 12)):
+        rng = np.random.default_rng(seed)
+        wrong = with_wrong_lenses(truth, rng)
+        made = calibrate_wand(wrong.cameras, waved(truth, rng), WAND, wrong.covariance)
+        turn = so3.rotation_vectors(truth.rotations @ made.rig.rotations.transpose(0, 2, 1))[1:]
+        error = np.concatenate([turn, (truth.translations - made.rig.translations)[1:]], axis=1)
+        deviation = np.sqrt(np.diag(made.rig.covariance)).reshape(4, 15)
+        standard.append(error / deviation[1:, 9:])
+        # the wand tells more of the lenses than the boards did
+        assert (deviation[:, :4] < LENS[:4]).all()
+    # 1 is expected; lenses that are held where they are give 10
+    assert np.sqrt(np.mean(np.square(standard))) < 2.0
+
+
+def test_a_wand_is_found_among_other_balls_or_not_at_all() -> None:
+    wand = np.array([200.0, 100.0]) + np.array([0.0, 1.0, 3.0])[:, None] * np.array([30.0, 40.0])
+    others = np.array([[400.0, 60.0], [90.0, 300.0]])
+    found = WAND.find(np.concatenate([others, wand[[2, 0, 1]]]))
+    assert found is not None
+    np.testing.assert_array_equal(found, [3, 4, 2])
+    assert WAND.find(wand[:2]) is None
+    assert WAND.find(np.concatenate([wand, wand + 100.0])) is None  # which of both it is cannot be told
+    assert WAND.find(np.random.default_rng(0).uniform(0.0, 480.0, (40, 2))) is None
 
 
 def test_three_balls_are_put_in_the_order_of_the_wand() -> None:
