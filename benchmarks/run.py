@@ -126,7 +126,10 @@ BENCHMARKS = (
         4,
     ),
     Benchmark(
-        "markers_detection", "centroids of rendered balls, by distance, overlap, saturation and blur", NOTHING, 2
+        "markers_detection",
+        "centroids of rendered balls: apart, touching, overlapping, cut by the border, hidden",
+        NOTHING,
+        2,
     ),
     Benchmark("markers_targets", "poses, recognition and tracking of targets among simulated points", NOTHING, 3),
     Benchmark(

@@ -39,12 +39,31 @@ def apart(seed: int, low: float, high: float, sensor: Sensor, count: int = 15, g
 
 
 def overlapping(seed: int, depth: float, behind: float, sensor: Sensor, offset: float = 0.81) -> Rendered:
-    """Two balls, the second behind the first; the offset of their centres in radii: 0.81 hides half."""
+    """Two balls, the second behind the first; offset of their centres in radii: 0.81 hides half, at 2 they touch."""
     random = np.random.default_rng(seed)
     angle = random.uniform(0.0, 2.0 * np.pi)
     step = offset * 834.0 * 0.5 * DIAMETER / depth * np.array([np.cos(angle), np.sin(angle)])
     pixels = np.array([300.0, 200.0]) + random.uniform(-0.5, 0.5, 2) + np.array([[0.0], [1.0]]) * step
     return render(CAMERA, *HERE, at(pixels, depth + np.array([0.0, behind])), DIAMETER, sensor, seed)
+
+
+def three_touching(seed: int, depth: float, sensor: Sensor) -> Rendered:
+    """Three balls, each touching the other two, 20 mm behind one another."""
+    random = np.random.default_rng(seed)
+    angle = random.uniform(0.0, 2.0 * np.pi) + np.arange(3) * 2.0 * np.pi / 3.0
+    side = DIAMETER / np.sqrt(3.0) * 834.0 / depth
+    middle = np.array([300.0, 200.0]) + random.uniform(-0.5, 0.5, 2)
+    points = at(middle + side * np.stack([np.cos(angle), np.sin(angle)], axis=1), depth + np.array([0.0, 0.02, 0.04]))
+    return render(CAMERA, *HERE, points, DIAMETER, sensor, seed)
+
+
+def cut_by_border(seed: int, depth: float, sensor: Sensor) -> Rendered:
+    """A ball whose centre is up to 0.7 radii inside the image's border."""
+    random = np.random.default_rng(seed)
+    radius = 834.0 * 0.5 * DIAMETER / depth
+    along, into = random.uniform(100.0, 380.0), random.uniform(0.0, 0.7) * radius
+    place = [(along, into), (into, along), (along, 479.0 - into), (639.0 - into, along)][int(random.integers(4))]
+    return render(CAMERA, *HERE, at(np.array([place]), np.array([depth])), DIAMETER, sensor, seed)
 
 
 def half_hidden(seed: int, depth: float, sensor: Sensor) -> Rendered:

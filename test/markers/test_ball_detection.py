@@ -7,7 +7,17 @@ import pytest
 
 from body_tracking.markers.detection import DetectionSettings, ImageError, detect
 from body_tracking.markers.rendering import Sensor, render
-from body_tracking.simulation.ball_images import CAMERA, DIAMETER, HERE, apart, at, found, half_hidden, overlapping
+from body_tracking.simulation.ball_images import (
+    CAMERA,
+    DIAMETER,
+    HERE,
+    apart,
+    at,
+    found,
+    half_hidden,
+    overlapping,
+    three_touching,
+)
 from draws import draws
 
 
@@ -65,11 +75,7 @@ def test_balls_that_nearly_touch_do_not_disturb_each_other() -> None:
 def test_three_balls_that_touch_are_three() -> None:
     for seed in range(draws(3, 15)):
         for depth in (0.8, 1.2, 1.8):
-            angle = seed + np.arange(3) * 2.0 * np.pi / 3.0
-            side = DIAMETER / np.sqrt(3.0) * 834.0 / depth
-            pixels = np.array([300.0, 200.0]) + side * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            points = at(pixels, depth + np.array([0.0, 0.02, 0.04]))
-            errors, _, missed, extra = found([render(CAMERA, *HERE, points, DIAMETER, Sensor(), seed)])
+            errors, _, missed, extra = found([three_touching(seed, depth, Sensor())])
             assert missed == extra == 0
             assert np.abs(errors).max() < 0.1
 
