@@ -137,18 +137,18 @@ def _numbers(values: Any, what: str, count: int) -> FloatArray:
     return result
 
 
-def to_urdf(chain: Chain, name: str) -> str:
+def to_urdf(chain: Chain, body: str) -> str:
     """The chain as an XML text: a link for each target, in the target's own frame, the root target first.
 
-    A revolute joint for each angle, named as in :attr:`Chain.angle_names`: a ``joint_states`` message of the chain's
-    angles moves it. Between the joints of one are empty links, ``<angle>_link``; a fixed joint, ``<joint>_mounting``,
-    leads from the last one to the child target. There are no masses, which nobody measured.
+    A revolute joint for each angle, ``<angle>_<body>`` as in the ``joint_states`` of :data:`setup.BODY`, which move it.
+    Between the joints of one are empty links, ``<angle>_link``; a fixed joint, ``<joint>_mounting``, leads from the
+    last one to the child target. There are no masses, which nobody measured.
 
     Raises:
         ChainFileError: a name with other characters than letters, digits and underscores, or one that two links or
             joints would have.
     """
-    robot = ElementTree.Element("robot", name=name)
+    robot = ElementTree.Element("robot", name=body)
     for target in chain.targets:
         ElementTree.SubElement(robot, "link", name=target)
     quarter = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -156,7 +156,7 @@ def to_urdf(chain: Chain, name: str) -> str:
         link, centre, rotation = joint.parent, joint.parent_centre, joint.parent_rotation
         axes = np.eye(3) if joint.kind is JointKind.BALL else np.tile([0.0, 0.0, 1.0], (joint.kind.coordinates, 1))
         for angle, axis in zip(joint.angle_names, axes, strict=True):
-            element = _connect(robot, angle, "revolute", link, f"{angle}_link", centre, rotation)
+            element = _connect(robot, f"{angle}_{body}", "revolute", link, f"{angle}_link", centre, rotation)
             ElementTree.SubElement(element, "axis", xyz=_text(axis))
             limits = {"lower": -2.0 * np.pi, "upper": 2.0 * np.pi, "effort": GREATEST_TORQUE, "velocity": GREATEST_RATE}
             ElementTree.SubElement(element, "limit", {key: repr(float(value)) for key, value in limits.items()})
@@ -167,7 +167,7 @@ def to_urdf(chain: Chain, name: str) -> str:
         _connect(robot, f"{joint.name}_mounting", "fixed", link, joint.child, -back @ joint.child_centre, back)
     for kind in ("link", "joint"):
         found = [element.attrib["name"] for element in robot.iter(kind)]
-        wrong = [each for each in [name, *found] if not re.fullmatch(r"\w+", each, re.ASCII)]
+        wrong = [each for each in [body, *found] if not re.fullmatch(r"\w+", each, re.ASCII)]
         wrong += [each for each in found if found.count(each) > 1]
         if wrong:
             raise ChainFileError(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
+from body_tracking.core import so3
 from body_tracking.core.camera import Camera
-from body_tracking.core.message_types import IMAGE, POINT_CLOUD
+from body_tracking.core.message_types import IMAGE, POINT_CLOUD, TF, TRANSFORM
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.messages import (
     POSE,
     balls_to_cloud,
@@ -18,6 +21,7 @@ from body_tracking.markers.messages import (
     target_pose_to_message,
 )
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
+from body_tracking.messages.base import to_header, to_transform
 from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
 from body_tracking.messages.codecs import Codec, Wire
 from body_tracking.messages.images import array_to_image, image_to_array
@@ -79,6 +83,27 @@ class SpacePoints(Codec):
 
     def stamp_ns(self, payload: Points) -> int:
         return payload.stamp_ns
+
+
+class Frames(Codec):
+    """Frames in another one, for ``tf2``: stamp in nanoseconds, that frame; of each frame its name, (3, 3) its rotation
+    and (3,) its origin in the other.
+    """
+
+    type_name = TF
+
+    def encode(self, payload: tuple[int, str, Sequence[tuple[str, FloatArray, FloatArray]]], wire: Wire) -> bytes:
+        stamp_ns, parent, frames = payload
+        transforms = [
+            wire.types.make(
+                TRANSFORM,
+                header=to_header(stamp_ns, parent, wire.types),
+                child_frame_id=name,
+                transform=to_transform(origin, so3.matrix_to_quat(rotation), wire.types),
+            )
+            for name, rotation, origin in frames
+        ]
+        return wire.serialize(TF, wire.types.make(TF, transforms=transforms))
 
 
 class PoseOfTarget(Codec):

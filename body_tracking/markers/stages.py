@@ -12,12 +12,12 @@ import numpy as np
 
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
-from body_tracking.core.qos import RELIABLE, Qos
+from body_tracking.core.qos import LATCHED, RELIABLE, Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.markers import setup
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
-from body_tracking.markers.codecs import Balls, CameraImage, PoseOfTarget, SpacePoints
+from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
 from body_tracking.markers.corrections import centred, pose_sensitivities
 from body_tracking.markers.detection import DetectionSettings, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
@@ -99,6 +99,11 @@ class TriangulationStage(Stage):
         ),
         Parameter("tolerance", 0.002, "by which the stamps of one set of images may differ", "s", 0.0, 0.1),
         Parameter("max_wait", 0.03, "how long a set of images waits for a missing one", "s", 0.0, 1.0),
+        Parameter(
+            "tf",
+            True,
+            "publish the frames of the cameras, in that of the first one, on /tf_static; false where their driver does",
+        ),
         *parameters_from(TriangulationSettings, only=_TRIANGULATION, live=True),
         TRANSPORT,
     )
@@ -115,6 +120,17 @@ class TriangulationStage(Stage):
         self._frames = {setup.balls_topic(frame): frame for frame in frames}
         self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True) for topic in self._frames)
         self.outputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, measured=True),)
+        if values["tf"]:
+            self.outputs += (Port(graph.TF_STATIC, Frames(), LATCHED, optional=True),)
+
+    def start(self, now: Now) -> Iterable[Output]:
+        if self.values["tf"]:
+            first, *others = (camera.frame_id for camera in self.rig.cameras)
+            into, shifts = self.rig.rotations.swapaxes(1, 2), self.rig.translations
+            frames = [
+                (frame, turn, -turn @ shift) for frame, turn, shift in zip(others, into[1:], shifts[1:], strict=True)
+            ]
+            yield Output(graph.TF_STATIC, (now.ros_ns, first, frames))
 
     def change(self, values: Mapping[str, Value]) -> None:
         """From the next images on."""
@@ -164,6 +180,13 @@ class TrackerStage(Stage):
         Parameter(
             "deadline", 0.02, "time for one frame, after which the search for targets is given up", "s", 0.001, 1.0
         ),
+        Parameter(
+            "tf",
+            "targets",
+            "which targets become frames on /tf: all; only the root of the chain, as robot_state_publisher with "
+            "chain.urdf needs it; none",
+            choices=("targets", "root", "none"),
+        ),
         TRANSPORT,
     )
 
@@ -176,10 +199,19 @@ class TrackerStage(Stage):
             Port(setup.pose_topic(target.name), PoseOfTarget(target.name), RELIABLE, measured=True)
             for target in self.targets
         )
+        self._framed = {target.name for target in self.targets} if values["tf"] == "targets" else set()
+        if values["tf"] == "root":
+            self._framed = {load_chain(setup.file_of(values["setup"], setup.CHAIN, "fit")).targets[0]}
+        if self._framed:
+            self.outputs += (Port(graph.TF, Frames(), RELIABLE, optional=True),)
 
     def take(self, topic: str, payload: Points, now: Now) -> Iterable[Output]:
-        for pose in self.tracker.update(payload):
+        poses = self.tracker.update(payload)
+        for pose in poses:
             yield Output(setup.pose_topic(pose.name), pose, pose.stamp_ns)
+        frames = [(pose.name, pose.rotation, pose.translation) for pose in poses if pose.name in self._framed]
+        if frames:
+            yield Output(graph.TF, (payload.stamp_ns, payload.frame_id, frames), payload.stamp_ns)
 
     def reset(self, topic: str) -> None:
         self.tracker.reset()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from body_tracking.core.message_types import POINT_CLOUD
-from body_tracking.core.qos import RELIABLE
+from body_tracking.core.message_types import POINT_CLOUD, TF
+from body_tracking.core.qos import LATCHED, RELIABLE
 from body_tracking.markers import setup
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
@@ -87,6 +87,20 @@ SYSTEM = System(
             RELIABLE,
             "rigid_body_tracker",
             "the pose of a target, in the same frame",
+        ),
+        TopicSpec(
+            graph.TF,
+            TF,
+            RELIABLE,
+            "rigid_body_tracker",
+            "the targets in the frame of the rig's first camera, where tf2_msgs is installed",
+        ),
+        TopicSpec(
+            graph.TF_STATIC,
+            TF,
+            LATCHED,
+            "marker_triangulation",
+            "the other cameras in the same frame, where tf2_msgs is installed",
         ),
     ),
     commands=(

@@ -99,3 +99,13 @@ def to_vector(values: FloatArray, types: MessageTypes) -> Any:
     """``geometry_msgs/Vector3`` of (3,)."""
     x, y, z = (float(value) for value in values)
     return types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def to_transform(translation: FloatArray, quat_xyzw: FloatArray, types: MessageTypes) -> Any:
+    """``geometry_msgs/Transform`` of (3,) metres and a unit quaternion (4,)."""
+    x, y, z, w = (float(value) for value in quat_xyzw)
+    return types.make(
+        "geometry_msgs/msg/Transform",
+        translation=to_vector(translation, types),
+        rotation=types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )

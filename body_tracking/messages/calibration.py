@@ -10,22 +10,16 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.message_types import TIME_REFERENCE, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import MAX_RANGE, MAX_STAMP_NS, NANOSECONDS
-from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_time
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_time, to_transform
 
 
 def pose_to_transform(pose: SensorPose, world: str, types: MessageTypes) -> Any:
     """``geometry_msgs/TransformStamped`` of a sensor's optical frame in ``world``; the stamp is ``valid_from_ns``."""
-    x, y, z = (float(value) for value in pose.translation)
-    qx, qy, qz, qw = (float(value) for value in pose.quat_xyzw)
     return types.make(
         TRANSFORM,
         header=to_header(pose.valid_from_ns, world, types),
         child_frame_id=f"{pose.sensor}_optical_frame",
-        transform=types.make(
-            "geometry_msgs/msg/Transform",
-            translation=types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-        ),
+        transform=to_transform(pose.translation, pose.quat_xyzw, types),
     )
 
 

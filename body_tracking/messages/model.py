@@ -11,7 +11,7 @@ from body_tracking.core.body_model import BodyModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.message_types import IMAGE, JOINT_STATE, SEGMENTS
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_transform
 
 
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
@@ -156,12 +156,7 @@ def segments_to_joint_state(
         header=to_header(estimate.stamp_ns, estimate.frame_id, types),
         joint_names=list(names),
         transforms=[
-            types.make(
-                "geometry_msgs/msg/Transform",
-                translation=types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                rotation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-            )
-            for (x, y, z), (qx, qy, qz, qw) in zip(origins.tolist(), quats_xyzw.tolist(), strict=True)
+            to_transform(origin, quat_xyzw, types) for origin, quat_xyzw in zip(origins, quats_xyzw, strict=True)
         ],
         twist=[],
         wrench=[],

@@ -247,7 +247,7 @@ def fit(args: argparse.Namespace) -> int:
     found = fit_recording(args.bag, args.setup, joints, args.diameter)
     path = args.setup / setup.CHAIN
     save_chain(found.chain, path)
-    path.with_suffix(".urdf").write_text(to_urdf(found.chain, "markers"), encoding="utf-8")
+    path.with_suffix(".urdf").write_text(to_urdf(found.chain, setup.BODY), encoding="utf-8")
     report = {
         "chain": str(path),
         "scale": found.chain.scale,

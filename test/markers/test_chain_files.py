@@ -11,11 +11,17 @@ import yaml
 from marker_people import random_joint, random_posture
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers import setup
 from body_tracking.markers.chain import Chain
 from body_tracking.markers.chain_files import ChainFileError, load_chain, save_chain, to_urdf
 from body_tracking.markers.joint_model import JointKind, turn_angles
 from body_tracking.markers.joint_tree import place, tree_of
+from body_tracking.markers.stages import CONVENTION
+from body_tracking.messages.codecs import Angles
+from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 
 
 def a_chain(rng: np.random.Generator) -> Chain:
@@ -108,13 +114,23 @@ def test_the_urdf_moves_as_the_chain_does() -> None:
                 values = Rotation.from_matrix(turn[0]).as_euler("XYZ")
             else:
                 values = turn_angles(joint.kind, turn)[0]
-            angles |= dict(zip(joint.angle_names, values, strict=True))
+            angles |= dict(zip((f"{name}_person" for name in joint.angle_names), values, strict=True))
         links = urdf_places(to_urdf(chain, "person"), angles)
         for index, target in enumerate(chain.targets):
             inverse = rotations[frame, 0].T
             assert np.allclose(links[target][:3, :3], inverse @ rotations[frame, index], atol=1e-9)
             arm = translations[frame, index] - translations[frame, 0]
             assert np.allclose(links[target][:3, 3], inverse @ arm, atol=1e-9)
+
+
+def test_the_published_joint_states_move_the_urdf() -> None:
+    chain = a_chain(np.random.default_rng(5))
+    count = len(chain.angle_names)
+    angles = JointAngles(0, chain.angle_names, *np.zeros((4, count)))
+    message = deserialize(JOINT_STATE, Angles(setup.BODY, 0, lambda: CONVENTION).encode(angles, BAG_WIRE))
+    robot = ElementTree.fromstring(to_urdf(chain, setup.BODY))
+    moving = [joint.attrib["name"] for joint in robot.iter("joint") if joint.attrib["type"] == "revolute"]
+    assert moving == list(message.name)
 
 
 def test_no_urdf_of_a_name_that_ros_would_not_take() -> None:
