@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
 from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
@@ -22,6 +21,7 @@ from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_m
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
+from body_tracking.core import so3
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
@@ -290,6 +290,11 @@ def _clock_source(sensor: _Sensor) -> str:
     if sensor.clock_locked:
         return "motion"
     return "saved" if sensor.clock_saved else "receipt"
+
+
+def _angle_between(a: FloatArray, b: FloatArray) -> float:
+    """Radians between two rotations (3, 3)."""
+    return float(np.linalg.norm(so3.rotation_vectors(a @ b.T)))
 
 
 class OnlineCalibration:
@@ -639,7 +644,7 @@ class OnlineCalibration:
     def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
         """Whether published pose and estimate differ by more than their uncertainties explain."""
         assert other.rotation is not None
-        apart = Rotation.from_matrix(found.rotation @ other.rotation.T).magnitude()
+        apart = _angle_between(found.rotation, other.rotation)
         place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
         shift = np.linalg.norm(place - found.centre)
         return bool(
@@ -660,7 +665,7 @@ class OnlineCalibration:
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)
-        if midline is not None and Rotation.from_matrix(midline[0] @ other.started[0].T).magnitude() > 0.5:
+        if midline is not None and _angle_between(midline[0], other.started[0]) > 0.5:
             starts.append(midline)
         opposite = half_turn_from(pairs, other.started[0])
         if opposite is not None:
@@ -669,7 +674,7 @@ class OnlineCalibration:
 
     def _set_target(self, other: _Sensor, rotation: FloatArray, translation: FloatArray, centre: FloatArray) -> None:
         other.target = rotation, translation, centre
-        if other.rotation is None or Rotation.from_matrix(rotation @ other.rotation.T).magnitude() > JUMP_ANGLE:
+        if other.rotation is None or _angle_between(rotation, other.rotation) > JUMP_ANGLE:
             other.rotation, other.translation = rotation, translation
             self._changed = True
 
@@ -681,14 +686,14 @@ class OnlineCalibration:
         if other.target is None or other.rotation is None:
             return False
         rotation, translation, centre = other.target
-        turn = Rotation.from_matrix(rotation @ other.rotation.T)
+        turn = so3.rotation_vectors(rotation @ other.rotation.T)
         own_centre = rotation.T @ (centre - translation)
         place = other.rotation @ own_centre + other.translation
-        angle, distance = float(turn.magnitude()), float(np.linalg.norm(centre - place))
+        angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(centre - place))
         if angle < 1e-9 and distance < 1e-9:
             return False
         share = min(1.0, self.parameters.slew_rotation * elapsed / max(angle, 1e-12))
-        other.rotation = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix() @ other.rotation
+        other.rotation = so3.quat_to_matrix(so3.exp(share * turn)) @ other.rotation
         place += (centre - place) * min(1.0, self.parameters.slew_translation * elapsed / max(distance, 1e-12))
         other.translation = place - other.rotation @ own_centre
         return True
@@ -707,7 +712,7 @@ class OnlineCalibration:
             poses[name] = SensorPose(
                 name,
                 base_rotation @ translation + self._base.translation,
-                Rotation.from_matrix(base_rotation @ rotation).as_quat(),
+                so3.matrix_to_quat(base_rotation @ rotation),
                 valid_from_ns,
             )
             clocks[name] = other.clock

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from body_tracking.core import so3
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.skeleton import FloatArray
 
@@ -30,11 +31,7 @@ class SensorPose:
     @cached_property
     def rotation(self) -> FloatArray:
         """(3, 3) rotation matrix, optical to world."""
-        # Imported here because it takes a third of a second, and most nodes need no rotation.
-        from scipy.spatial.transform import Rotation
-
-        matrix: FloatArray = Rotation.from_quat(self.quat_xyzw).as_matrix()
-        return matrix
+        return so3.quat_to_matrix(self.quat_xyzw / np.linalg.norm(self.quat_xyzw))
 
     def apply(self, points: FloatArray) -> FloatArray:
         """(..., 3) optical coordinates into world."""
@@ -50,12 +47,9 @@ def level_pose(sensor: str, height: float = 0.0, pitch: float = 0.0, roll: float
         pitch: radians by which it looks down.
         roll: radians by which it is turned clockwise about its view, seen from behind it.
     """
-    from scipy.spatial.transform import Rotation
-
-    optical_to_level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    tilt = Rotation.from_euler("YX", [pitch, roll])
-    rotation = tilt * Rotation.from_matrix(optical_to_level)
-    return SensorPose(sensor, np.array([0.0, 0.0, height]), rotation.as_quat())
+    optical_to_level = so3.matrix_to_quat(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+    tilt = so3.quat_multiply(so3.exp(np.array([0.0, pitch, 0.0])), so3.exp(np.array([roll, 0.0, 0.0])))
+    return SensorPose(sensor, np.array([0.0, 0.0, height]), so3.quat_multiply(tilt, optical_to_level))
 
 
 @dataclass(frozen=True, slots=True)
