@@ -50,7 +50,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     expression = str(config.getoption("markexpr"))
     if collection_path.suffix != ".py" or "processes" not in expression:
         return None
-    return True if _starts_processes(collection_path) == ("not processes" in expression) else None
+    if _starts_processes(collection_path) == ("not processes" in expression):
+        return True
+    text = collection_path.read_text(encoding="utf-8")
+    if "not alone" in expression:
+        return True if "\npytestmark = pytest.mark.alone" in text else None
+    return True if "alone" in expression and "mark.alone" not in text else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
