@@ -3,8 +3,8 @@
 A camera of 640x480 pixels, f 834 px, balls of 14 mm. ``sd`` is the root mean square of the stated standard deviation,
 ``inside`` the share of errors within 1.96 of it, ``missed`` and ``extra`` are numbers of balls that were not found and
 of those that are none, ``ms`` is the median CPU time of an image. The categories pool distances of 0.6 to 2.5 m.
-Half overlap: one of two balls hides half of the other. The border cuts off 15 to 50 % of a ball's diameter. A limb hides
-half of a ball. ``of 1 m`` is the brightness of a ball 1 m away, of what saturates the sensor.
+Half overlap: one of two balls hides half of the other. The border cuts off 15 to 50 % of a ball's diameter. A limb
+hides half of a ball. ``of 1 m`` is the brightness of a ball 1 m away, of what saturates the sensor.
 
 The exit code is 1 where a bar is missed.
 """
