@@ -62,7 +62,9 @@ class KinectErrors:
     turn_loss: float = number_field(
         0.3, "share of the yaw of shoulders and hips that is missing at 90 deg", "1", 0.0, 1.0
     )
-    straightening: float = number_field(0.3, "share of the trunk's bend that is missing", "1", 0.0, 1.0)
+    straightening: float = number_field(
+        1.0, "share of the way by which SpineMid is moved to the line from SpineBase to SpineShoulder", "1", 0.0, 1.0
+    )
     lift_damping: float = number_field(0.4, "share of a shoulder's lift that is missing", "1", 0.0, 1.0)
     hidden_from: float = number_field(
         0.5, "cover from which a joint is inferred: 0 at a rim, 1 in the middle", "1", 0.01, 1.0
