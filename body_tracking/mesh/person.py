@@ -1,0 +1,395 @@
+"""The pixels of a person in a depth image, without a trained classifier.
+
+Three cues, each of which may be missing: the still background is farther away, the floor lies below, and the person is
+near the mesh that the last frames predict. What is left falls apart into surfaces at jumps of depth; without a
+prediction the nearest one of a person's size is taken, and the smaller ones beside it. Furniture may be as large as a
+person: the next candidate can be asked for where the body model does not fit the first one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
+from body_tracking.mesh.compiled import compiled
+from body_tracking.mesh.depth import DepthCamera, DepthError
+
+_CLEARANCE: Final = 0.05
+"""Metres by which a person is nearer than the background, or above the floor; 12 standard deviations at 4.8 m."""
+_REVEALED, _ABSORBED = 3, 300
+"""Frames after which a pixel's background is replaced by a farther surface, and by a nearer one that is no person."""
+_GRAZING: Final = 5.7
+"""Largest slope of a surface against the image plane: 80 degrees. Steeper than that are jumps between surfaces."""
+_REACH: Final = 0.25
+"""Metres about the predicted mesh in which the person is looked for: 7.5 m/s at 30 Hz."""
+_PERSON_AREA: Final = (0.12, 1.6)
+"""Square metres that the camera sees of a person: of a child from the side, and of a large man with his arms out."""
+_PERSON_EXTENT: Final = (0.45, 2.3)
+"""Metres of the longest side of the box about a person."""
+_LEAST_AREA: Final = 0.0015
+"""Square metres of a surface that is more than noise: a part of a hand."""
+_FRAGMENT: Final = 0.15
+"""Metres from the box about a person within which smaller surfaces are the person's own, as a hand before the chest."""
+_COVERED: Final = 0.02
+"""Share of pixels with a distance below which a lens is covered."""
+NO_BODY: Final = 255
+"""Pixel of a body-index image that belongs to nobody (Kinect SDK 2.0)."""
+
+COVERED = "hardly any pixel has a distance: is the lens covered?"
+NOBODY = "nobody is seen"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Floor:
+    """A plane; ``up . point + height`` is the height of a point above it.
+
+    Attributes:
+        up: (3,) unit normal in the optical frame.
+        height: metres of the camera above it.
+    """
+
+    up: FloatArray
+    height: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The person in one image.
+
+    Attributes:
+        mask: (height, width) pixels of the person.
+        people: how many surfaces of a person's size there are; 1 with a prediction, where the person is seen.
+        reason: why the mask is empty; "" where it is not.
+    """
+
+    mask: BoolArray
+    people: int
+    reason: str = ""
+
+
+class PersonFinder:
+    """Finds the pixels of one person in the images of a camera that stands still.
+
+    Args:
+        view: the camera.
+        floor: its floor where known; else it is looked for in the first images.
+    """
+
+    def __init__(self, view: DepthCamera, floor: Floor | None = None) -> None:
+        self._view, self._given = view, floor
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the background, as after a backward jump of time or where the camera was moved."""
+        shape = self._view.camera.height, self._view.camera.width
+        self._background: SingleArray = np.zeros(shape, np.float32)
+        self._other: SingleArray = np.zeros(shape, np.float32)
+        self._stays = np.zeros(shape, np.int16)
+        self.floor = self._given
+        self._looks = 0
+
+    def find(self, depth: SingleArray, predicted: FloatArray | None = None, choice: int = 0) -> Found:
+        """The person in an image; learns the background from the rest.
+
+        Args:
+            depth: (height, width) metres, 0 where missing.
+            predicted: (n, 3) vertices where the person is expected, metres in the optical frame; None where nobody was
+                tracked.
+            choice: without a prediction, which of the surfaces of a person's size to take, the nearest first; counted
+                on from the first one after the last.
+
+        Raises:
+            DepthError: another size than the camera's.
+        """
+        self._view.check(depth)
+        if np.count_nonzero(depth) < _COVERED * depth.size:
+            return Found(np.zeros(depth.shape, np.bool_), 0, COVERED)
+        if self.floor is None and self._looks < 30:
+            self._looks += 1
+            self.floor = find_floor(self._view, depth)
+        up, height = (np.zeros(3), 1.0) if self.floor is None else (self.floor.up, self.floor.height)
+        candidates = _candidates(depth, self._view.rays, self._background, up, height, _CLEARANCE)
+        if predicted is not None:
+            candidates &= near(predicted, depth, self._view.camera, _REACH)
+        mask, kept, people = self._chosen(depth, candidates, predicted is not None, choice)
+        still = _REVEALED, _ABSORBED if predicted is None else 0
+        _learn(self._background, self._other, self._stays, depth, kept, _CLEARANCE, *still)
+        return Found(mask, people, "" if people else NOBODY)
+
+    def _chosen(
+        self, depth: SingleArray, candidates: BoolArray, tracked: bool, choice: int
+    ) -> tuple[BoolArray, BoolArray, int]:
+        """The person's pixels, those that may be a person's and so are not yet background, and the number of people."""
+        labels, count = _surfaces(depth, candidates, 2.0 * _GRAZING / self._view.camera.matrix[0, 0])
+        areas, boxes = _measure(depth, self._view.rays, labels, count)
+        chosen = areas > _LEAST_AREA
+        if tracked:
+            people = int(areas[chosen].sum() > _PERSON_AREA[0])
+            return _of_surfaces(labels, chosen & bool(people)), candidates, people
+        longest = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0.0)
+        alike = (areas > _PERSON_AREA[0]) & (areas < _PERSON_AREA[1])
+        alike &= (longest > _PERSON_EXTENT[0]) & (longest < _PERSON_EXTENT[1])
+        numbers = np.flatnonzero(alike)
+        if len(numbers):
+            nearest = numbers[np.argsort(boxes[numbers].mean(axis=1)[:, 2])][choice % len(numbers)]
+            low, high = boxes[nearest, 0] - _FRAGMENT, boxes[nearest, 1] + _FRAGMENT
+            chosen &= (boxes[:, 0] > low).all(axis=1) & (boxes[:, 1] < high).all(axis=1) & ~alike
+            chosen[nearest] = True
+            alike |= chosen
+        else:
+            chosen[:] = False
+        return _of_surfaces(labels, chosen), _of_surfaces(labels, alike), len(numbers)
+
+
+def of_body_index(
+    index: NDArray[np.uint8], depth: SingleArray, body: int | None = None
+) -> tuple[BoolArray, int | None]:
+    """The person of a body-index image, as the Kinect SDK gives it, and the number in it.
+
+    Args:
+        index: (height, width) number of the body at each pixel, 255 for none.
+        depth: (height, width) metres, 0 where missing.
+        body: the number that was tracked so far, kept while it is seen; else the nearest body is taken.
+
+    Returns:
+        The mask, and the number; None where nobody is seen.
+
+    Raises:
+        DepthError: the two images differ in size.
+    """
+    if index.shape != depth.shape:
+        raise DepthError(f"body-index image of {index.shape} for a depth image of {depth.shape}")
+    there = (index != NO_BODY) & (depth > 0.0)
+    counts = np.bincount(index[there], minlength=NO_BODY)
+    if not counts.any():
+        return np.zeros(depth.shape, np.bool_), None
+    if body is None or not counts[body]:
+        distances = np.bincount(index[there], weights=depth[there], minlength=NO_BODY) / np.maximum(counts, 1)
+        # some hundred stray pixels are no body
+        distances[counts < 0.05 * counts.max()] = np.inf
+        body = int(np.argmin(distances))
+    return there & (index == body), body
+
+
+def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, tolerance: float = 0.02) -> Floor | None:
+    """The largest plane that faces upwards and has nothing below it; None where there is none.
+
+    Random sample consensus (Fischler and Bolles 1981) over 200 triples of the lower half of the image, with a fixed
+    generator; then a least-squares plane through its points.
+
+    Args:
+        view: the camera, upright within ``tilt``.
+        depth: (height, width) metres, 0 where missing.
+        tilt: largest angle between the plane's normal and the image's upward direction, radians.
+        tolerance: largest distance of a point of the plane, metres.
+    """
+    points = view.points(depth)[depth.shape[0] // 2 :: 2, ::16].reshape(-1, 3).astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 100:
+        return None
+    rng = np.random.default_rng(0)
+    a, b, c = points[rng.integers(len(points), size=(3, 200))]
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    known = lengths > 1e-4
+    normals = normals[known] / lengths[known, None]
+    normals *= np.where(normals[:, 1] > 0.0, -1.0, 1.0)[:, None]
+    origins = a[known][-normals[:, 1] > np.cos(tilt)]
+    normals = normals[-normals[:, 1] > np.cos(tilt)]
+    heights = points @ normals.T - (origins * normals).sum(axis=1)
+    on, below = (np.abs(heights) < tolerance).mean(axis=0), (heights < -2.0 * tolerance).mean(axis=0)
+    on = np.where(below < 0.02, on, 0.0)
+    if not on.size or on.max() < 0.1:
+        return None
+    distances = heights[:, np.argmax(on)]
+    for within in (tolerance, 0.6 * tolerance):
+        # ever closer, as a wall's lowest points are near the floor too
+        chosen = points[np.abs(distances) < within]
+        middle = chosen.mean(axis=0)
+        up = np.linalg.svd(chosen - middle, full_matrices=False)[2][2]
+        up *= -np.sign(up[1])
+        distances = (points - middle) @ up
+    return Floor(up, float(-up @ middle))
+
+
+def near(vertices: FloatArray, depth: SingleArray, camera: Camera, reach: float) -> BoolArray:
+    """(height, width) pixels whose points are within about ``reach`` metres of a mesh.
+
+    On every fourth pixel a box of ``reach`` about each vertex spans an interval of distances; a pixel is near where its
+    distance lies in the interval.
+    """
+    with np.errstate(invalid="ignore"):
+        pixels = camera.project(vertices)
+    return _near(pixels, vertices[:, 2].copy(), depth, reach, 0.5 * (camera.matrix[0, 0] + camera.matrix[1, 1]))
+
+
+@compiled
+def _near(pixels: FloatArray, distances: FloatArray, depth: SingleArray, reach: float, focal: float) -> BoolArray:
+    height, width = depth.shape
+    rows, columns = (height + 3) // 4, (width + 3) // 4
+    low, high = np.full((rows, columns), np.inf), np.full((rows, columns), -np.inf)
+    for k in range(len(distances)):
+        z = distances[k]
+        if not (z > 0.1 and abs(pixels[k, 0]) < 1e6 and abs(pixels[k, 1]) < 1e6):
+            continue
+        radius = int(0.25 * reach * focal / z) + 1
+        column, row = int(pixels[k, 0] / 4.0), int(pixels[k, 1] / 4.0)
+        for i in range(max(row - radius, 0), min(row + radius + 1, rows)):
+            for j in range(max(column - radius, 0), min(column + radius + 1, columns)):
+                low[i, j] = min(low[i, j], z)
+                high[i, j] = max(high[i, j], z)
+    found = np.zeros((height, width), dtype=np.bool_)
+    for i in range(height):
+        for j in range(width):
+            z = depth[i, j]
+            found[i, j] = z > 0.0 and low[i // 4, j // 4] - reach <= z <= high[i // 4, j // 4] + reach
+    return found
+
+
+@compiled
+def _candidates(
+    depth: SingleArray, rays: SingleArray, background: SingleArray, up: FloatArray, height: float, clearance: float
+) -> BoolArray:
+    """Pixels nearer than the background, or without one, and above the floor."""
+    rows, columns = depth.shape
+    found = np.zeros((rows, columns), dtype=np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            z = depth[i, j]
+            if z <= 0.0 or (background[i, j] > 0.0 and z > background[i, j] - clearance):
+                continue
+            above = z * (up[0] * rays[i, j, 0] + up[1] * rays[i, j, 1] + up[2]) + height
+            found[i, j] = above > clearance
+    return found
+
+
+@compiled
+def _learn(
+    background: SingleArray,
+    other: SingleArray,
+    stays: NDArray[np.int16],
+    depth: SingleArray,
+    kept: BoolArray,
+    clearance: float,
+    revealed: int,
+    absorbed: int,
+) -> None:
+    """Update the background of each pixel, in place.
+
+    Another surface than the background replaces it after it has stayed for ``revealed`` frames where it is farther, and
+    for ``absorbed`` where it is nearer or may be a person's (``kept``); never for 0. ``other`` is its distance, and
+    ``stays`` counts the frames.
+    """
+    rows, columns = depth.shape
+    for i in range(rows):
+        for j in range(columns):
+            z, known = depth[i, j], background[i, j]
+            if z <= 0.0:
+                continue
+            if known > 0.0 and abs(z - known) <= clearance:
+                background[i, j] = known + (z - known) / 16.0
+                stays[i, j] = 0
+                continue
+            frames = absorbed if known > 0.0 or kept[i, j] else 1
+            if known > 0.0 and z > known:
+                frames = revealed
+            if abs(z - other[i, j]) > clearance or frames == 0:
+                other[i, j], stays[i, j] = z, 0
+            stays[i, j] += 1
+            if frames > 0 and stays[i, j] >= frames:
+                background[i, j], stays[i, j] = z, 0
+
+
+@compiled
+def _surfaces(depth: SingleArray, candidates: BoolArray, jump: float) -> tuple[NDArray[np.int32], int]:
+    """Connected surfaces on every second pixel, by union-find: labels (height, width) from 1 on, and their number.
+
+    A candidate between these pixels takes the label of the first of the four around it on whose surface it is.
+    """
+    height, width = depth.shape
+    rows, columns = height // 2, width // 2
+    parent = np.zeros(rows * columns + 1, dtype=np.int32)
+    small = np.zeros((rows, columns), dtype=np.int32)
+    for i in range(rows):
+        for j in range(columns):
+            if not candidates[2 * i, 2 * j]:
+                continue
+            z = depth[2 * i, 2 * j]
+            own = i * columns + j + 1
+            parent[own] = own
+            small[i, j] = own
+            for a, b in ((i, j - 1), (i - 1, j - 1), (i - 1, j), (i - 1, j + 1)):
+                if a < 0 or b < 0 or b >= columns or small[a, b] == 0:
+                    continue
+                if abs(depth[2 * a, 2 * b] - z) > jump * z:
+                    continue
+                first, second = small[a, b], own
+                while parent[first] != first:
+                    parent[first] = parent[parent[first]]
+                    first = parent[first]
+                while parent[second] != second:
+                    parent[second] = parent[parent[second]]
+                    second = parent[second]
+                parent[max(first, second)] = min(first, second)
+    count = 0
+    numbers = np.zeros(rows * columns + 1, dtype=np.int32)
+    for own in range(1, len(parent)):
+        if parent[own] == own:
+            count += 1
+            numbers[own] = count
+        elif parent[own] > 0:
+            # a parent comes before its child
+            numbers[own] = numbers[parent[own]]
+    labels = np.zeros((height, width), dtype=np.int32)
+    for i in range(height):
+        for j in range(width):
+            if not candidates[i, j]:
+                continue
+            z = depth[i, j]
+            for a, b in ((i // 2, j // 2), (i // 2, j // 2 + 1), (i // 2 + 1, j // 2), (i // 2 + 1, j // 2 + 1)):
+                if a < rows and b < columns and small[a, b] > 0 and abs(depth[2 * a, 2 * b] - z) <= jump * z:
+                    labels[i, j] = numbers[small[a, b]]
+                    break
+    return labels, count
+
+
+@compiled
+def _of_surfaces(labels: NDArray[np.int32], chosen: BoolArray) -> BoolArray:
+    """The pixels of the chosen surfaces."""
+    found = np.zeros(labels.shape, dtype=np.bool_)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            found[i, j] = labels[i, j] > 0 and chosen[labels[i, j] - 1]
+    return found
+
+
+@compiled
+def _measure(
+    depth: SingleArray, rays: SingleArray, labels: NDArray[np.int32], count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Area in square metres (count,), and the corners (count, 2, 3) of the box about each surface."""
+    areas = np.zeros(count)
+    boxes = np.zeros((count, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+    height, width = depth.shape
+    # rays of neighbours: one over the focal length
+    across = abs(rays[height // 2, width // 2, 0] - rays[height // 2, width // 2 - 1, 0])
+    down = abs(rays[height // 2, width // 2, 1] - rays[height // 2 - 1, width // 2, 1])
+    point = np.zeros(3)
+    for i in range(height):
+        for j in range(width):
+            label = labels[i, j] - 1
+            if label < 0:
+                continue
+            z = depth[i, j]
+            areas[label] += z * z * across * down
+            point[0], point[1], point[2] = rays[i, j, 0] * z, rays[i, j, 1] * z, z
+            for k in range(3):
+                boxes[label, 0, k] = min(boxes[label, 0, k], point[k])
+                boxes[label, 1, k] = max(boxes[label, 1, k], point[k])
+    return areas, boxes
