@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from body_tracking.core.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.system import NodeSpec, Options, Place, System, load
+from body_tracking.pipeline.system import NodeSpec, Options, Place, System, asked, load
 
 if TYPE_CHECKING:
     from body_tracking.pipeline.stage import Stage
@@ -51,6 +51,7 @@ TOPICS: Final = tuple(topic for system in SYSTEMS for topic in system.topics)
 SERVICES: Final = tuple(service for system in SYSTEMS for service in system.services)
 COMMANDS: Final = {command.name: command for system in SYSTEMS for command in system.commands}
 LAYERS: Final = tuple(layer for system in SYSTEMS for layer in system.layers)
+VIEWS: Final = tuple(view for system in SYSTEMS for view in system.views)
 _PLACED: Final = sorted(NODES.values(), key=lambda node: node.place)
 STAGES: Final = tuple(node.name for node in _PLACED if node.stage)
 """The nodes that host a stage, in the order in which messages go through them."""
@@ -185,13 +186,18 @@ def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     if not any(NODES[spec.executable].place < Place.CONSUMER and not is_player(spec) for spec in specs):
         raise graph.GraphError("no sensors")
     specs.sort(key=lambda spec: -NODES[spec.executable].place)
+    viewed = asked(options, **{view.option: view.option for view in VIEWS})
     return tuple(
         replace(
             spec,
             namespace=str(options["namespace"]),
             parameters=spec.parameters
             if is_player(spec)
-            else {**spec.parameters, "use_sim_time": bool(options["bag"])},
+            else {
+                **spec.parameters,
+                **(viewed if spec.executable == "viewer" else {}),
+                "use_sim_time": bool(options["bag"]),
+            },
         )
         for spec in specs
     )

@@ -256,6 +256,15 @@ def test_sensors_are_found_among_topics() -> None:
     assert graph.sensors_among(topics) == ("a", "b")
 
 
+def test_the_viewer_shows_the_marker_system_where_there_is_one() -> None:
+    given = options_of(sensors=(), marker_setup="lab", viewer=True)
+    specs = {spec.name: spec for spec in nodes_for(given)}
+    assert specs["viewer"].parameters["marker_setup"] == "lab"
+    assert "marker_setup" not in specs["rigid_body_tracker"].parameters
+    without = {spec.name: spec for spec in nodes_for(options_of(viewer=True))}
+    assert "marker_setup" not in without["viewer"].parameters
+
+
 def test_topics_have_known_types_and_publishers() -> None:
     assert len({(topic.name, topic.publisher) for topic in TOPICS}) == len(TOPICS)  # several nodes share /tf
     for topic in TOPICS:

@@ -18,6 +18,7 @@ from body_tracking.pipeline.system import (
     Place,
     System,
     TopicSpec,
+    View,
     transport,
 )
 
@@ -103,6 +104,7 @@ SYSTEM = System(
             "the other cameras in the same frame, where tf2_msgs is installed",
         ),
     ),
+    views=(View("marker_setup", "body_tracking.viewing.marker_view:MarkerView"),),
     commands=(
         Command("markers", "body_tracking.recording.marker_commands", "calibrate and use infrared cameras and markers"),
     ),

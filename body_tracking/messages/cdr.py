@@ -158,6 +158,14 @@ def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
     return tuple(skeletons)
 
 
+def stamp_of(cdr: bytes) -> int:
+    """Stamp in nanoseconds of a serialised message whose first field is a header; 0 where there is none."""
+    if len(cdr) < 12:
+        return 0
+    seconds, nanoseconds = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
 def _header(stamp_ns: int, frame_id: str) -> bytes:
     """Encapsulation and ``std_msgs/Header``, padded to 4."""
     return _ENCAPSULATION + struct.pack("<iI", *divmod(stamp_ns, NANOSECONDS)) + _padded(_string(frame_id))

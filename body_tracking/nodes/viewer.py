@@ -39,6 +39,7 @@ from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.codecs import Codec
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
 from body_tracking.messages.node_status import NodeStatus, update_statuses
@@ -47,10 +48,10 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import load
 from body_tracking.ros.bag_topics import message_class, to_profile
-from body_tracking.ros.node import BODY, SENSORS, GraphNode, deserialized, run
+from body_tracking.ros.node import BODY, SENSORS, STEADY, GraphNode, deserialized, run
 from body_tracking.ros.wire import WIRE
 from body_tracking.viewing.curves import AngleHistory
-from body_tracking.viewing.snapshot import PageError, Seen, Snapshot
+from body_tracking.viewing.snapshot import PageError, Seen, Snapshot, SystemView
 
 PARAMETERS = (
     Parameter(
@@ -64,6 +65,7 @@ PARAMETERS = (
     Parameter("window", 15.0, "how much of the joint angles is shown", unit="s", min=1.0, max=120.0),
     SENSORS,
     BODY,
+    *(Parameter(view.option, "", f"to show it: {systems.OPTIONS[view.option].text}") for view in systems.VIEWS),
 )
 
 _STALE_S = 1.0
@@ -79,6 +81,10 @@ _SHARE = 0.25
 _FAILURES = 10
 """Consecutive failed drawings after which the node ends."""
 _NICE = 10
+_RECENT = 16
+"""Messages of a view's topic that are kept, to find those of one time."""
+_CONNECT_S = 1.0
+"""Seconds between two checks whether a view needs its topics."""
 
 
 IMPORTED_AT_START: Final = ("body_tracking.viewing.page",)
@@ -109,6 +115,9 @@ class ViewerNode(GraphNode):
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
             for name in ("skeleton_filter", "joint_angles")
         }
+        self.recent: dict[str, deque[tuple[bytes, float]]] = {}
+        self.viewed: dict[str, Any] = {}
+        """Subscriptions of the views' topics."""
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
             self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
@@ -120,7 +129,10 @@ class ViewerNode(GraphNode):
         self.subscribe(graph.DIAGNOSTICS_TOPIC, DiagnosticArray, to_profile(RELIABLE), self.on_diagnostics)
         self.of_body: list[Any] = []
         self.body = ""
-        self.choose_body(graph.check_body(given["body"]))
+        bodies = [view.body for view in self.views if view.body and not self.sensors]
+        self.choose_body(graph.check_body(bodies[0] if bodies else given["body"]))
+        if self.views:
+            self.create_timer(_CONNECT_S, self.connect_views, clock=STEADY)
         give_way()
         self.thread = threading.Thread(target=self.keep_drawing, daemon=True)
         self.thread.start()
@@ -131,6 +143,9 @@ class ViewerNode(GraphNode):
             from body_tracking.viewing.page import Page
         except ImportError as error:
             raise PageError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
+        self.views: list[SystemView] = [
+            load(each.make)(given[each.option]) for each in systems.VIEWS if given[each.option]
+        ]
         page = Page(
             given["host"],
             given["port"],
@@ -140,6 +155,7 @@ class ViewerNode(GraphNode):
             tuple(ALL_CONVENTIONS),
             given["window"],
             systems.LAYERS,
+            self.views,
         )
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
@@ -152,6 +168,27 @@ class ViewerNode(GraphNode):
     def on_latest(self, topic: str, cdr: bytes, sent_ns: int) -> None:
         self.monitor.totals["received"] += 1
         self.latest[topic] = cdr, time.monotonic()
+
+    def connect_views(self) -> None:
+        """Subscribe to the topics of the views, such as images, only while a browser shows their layers."""
+        wanted: dict[str, Codec] = {}
+        if self.page.watched:
+            for view in self.views:
+                wanted.update(view.topics(self.page.visible))
+        for topic in self.viewed.keys() - wanted.keys():
+            self.destroy_subscription(self.viewed.pop(topic))
+            self.recent.pop(topic, None)
+        for topic in wanted.keys() - self.viewed.keys():
+            self.codecs[topic] = wanted[topic]
+            kind = message_class(wanted[topic].type_name)
+            self.recent[topic] = deque(maxlen=_RECENT)
+            self.viewed[topic] = self.subscribe(
+                topic, kind, to_profile(LATEST), partial(self.on_recent, topic), raw=True
+            )
+
+    def on_recent(self, topic: str, cdr: bytes, sent_ns: int) -> None:
+        self.monitor.totals["received"] += 1
+        self.recent[topic].append((cdr, time.monotonic()))
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         pose = transform_to_pose(message)
@@ -198,6 +235,13 @@ class ViewerNode(GraphNode):
     def draw(self, now: float) -> None:
         """Draw the scene, and curves and status if they are due."""
         self.page.draw(self.snapshot())
+        if self.views:
+            kept = dict(self.recent)  # the other thread changes it
+            fresh = {
+                topic: [cdr for cdr, received in list(each) if now - received <= _STALE_S]
+                for topic, each in kept.items()
+            }
+            self.page.draw_views(fresh, self.decoded)
         if now - self.plotted >= 1.0 / float(str(self.values["plot_rate"])):
             self.plotted = now
             self.collect_angles()
@@ -250,8 +294,10 @@ class ViewerNode(GraphNode):
     def payload(self, topic: str) -> Any:
         """The latest message of a layer's topic; None where it is absent or old."""
         cdr, received = self.latest.get(topic, (b"", -np.inf))
-        if time.monotonic() - received > _STALE_S:
-            return None
+        return None if time.monotonic() - received > _STALE_S else self.decoded(topic, cdr)
+
+    def decoded(self, topic: str, cdr: bytes) -> Any:
+        """The payload of a message of a layer or a view; None for one that is malformed."""
         try:
             return self.codecs[topic].decode(cdr, WIRE)
         except BodyTrackingError as error:

@@ -163,6 +163,20 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """What the viewer shows of a system from several topics, or beside the scene.
+
+    Attributes:
+        option: name of the system's option that it is made with, which becomes a parameter of the viewer; without a
+            value there is no view.
+        make: ``module:Class`` of a :class:`body_tracking.viewing.snapshot.SystemView`, which is given that value.
+    """
+
+    option: str
+    make: str
+
+
+@dataclass(frozen=True, slots=True)
 class Command:
     """A subcommand of ``body_tracking``: name, module with ``add_parser(subparsers)``, one line for the help."""
 
@@ -182,7 +196,7 @@ class System:
         specs: returns the nodes that it runs for given options, without their namespace.
         played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
             none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
-        options, topics, services, commands, layers: that it adds.
+        options, topics, services, commands, layers, views: that it adds.
     """
 
     name: str
@@ -195,6 +209,7 @@ class System:
     services: tuple[Service, ...] = ()
     commands: tuple[Command, ...] = ()
     layers: tuple[Layer, ...] = ()
+    views: tuple[View, ...] = ()
 
 
 def sensors_and_transport(options: Options) -> dict[str, Value]:

@@ -41,7 +41,7 @@ from body_tracking.viewing.shapes import (
     floor_height,
     in_world,
 )
-from body_tracking.viewing.snapshot import Controls, PageError, Seen, Snapshot
+from body_tracking.viewing.snapshot import Controls, Decode, PageError, Seen, Snapshot, SystemView
 from body_tracking.viewing.status import table
 
 PLOTS: Final = 4
@@ -89,6 +89,10 @@ class Page:
         conventions: options.
         window: seconds that the plots show.
         layers: further layers of the scene, by other systems.
+        views: likewise, those of several topics.
+
+    Attributes:
+        visible: which layers are switched on, by name.
 
     Raises:
         PageError: the address is not one of this machine, or the same-origin check could not be installed.
@@ -104,18 +108,23 @@ class Page:
         conventions: Sequence[str],
         window: float,
         layers: Sequence[Layer] = (),
+        views: Sequence[SystemView] = (),
     ) -> None:
         _check_address(host)
         with same_origin(), redirect_stdout(StringIO()):  # viser prints a banner
             self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
         self._controls = controls
         self._choices = {**LAYERS, **{each.name: (each.text, each.shown) for each in layers}}
-        self._layers = [(each.name, load(each.draw)) for each in layers]
-        self._visible = {name: shown for name, (_, shown) in self._choices.items()}
+        for view in views:
+            self._choices |= view.layers
+        self._layers, self._views = [(each.name, load(each.draw)) for each in layers], views
+        self.visible = {name: shown for name, (_, shown) in self._choices.items()}
         self._floor: float | None = None
         self._target = _INITIAL_TARGET
         self._scene(sensors)
         self._panels(filters, conventions, window)
+        for view in views:
+            view.start(self._server)
         self._server.on_client_connect(self._look_at_person)
 
     @property
@@ -194,32 +203,40 @@ class Page:
             for sensor, seen in snapshot.sensors.items():
                 pose = snapshot.poses.get(sensor)
                 camera, drawn = self._cameras[sensor], self._drawn[sensor]
-                show(camera, self._visible["frustums"] and pose is not None)
+                show(camera, self.visible["frustums"] and pose is not None)
                 if pose is None:
                     drawn.hide()
                     continue
                 camera.position, camera.wxyz = pose.translation, np.roll(pose.quat_xyzw, 1)
                 placed = tuple(in_world(skeleton, pose) for skeleton in seen.skeletons)
                 standing += placed if not seen.stale else ()
-                drawn.draw(Seen(placed, seen.stale), self._visible["sensors"])
-            self._drawn["fused"].draw(snapshot.fused, self._visible["fused"])
-            self._drawn["filtered"].draw(snapshot.filtered, self._visible["filtered"])
+                drawn.draw(Seen(placed, seen.stale), self.visible["sensors"])
+            self._drawn["fused"].draw(snapshot.fused, self.visible["fused"])
+            self._drawn["filtered"].draw(snapshot.filtered, self.visible["filtered"])
             self._draw_body(snapshot.filtered)
             self._draw_uncertainty(snapshot)
             self._draw_frames(snapshot)
             self._floor = floor_height([*standing, *snapshot.filtered.skeletons], self._floor)
             self._grid.position = (2.0, 0.0, -1.0 if self._floor is None else self._floor)
-            show(self._grid, self._visible["floor"])
+            show(self._grid, self.visible["floor"])
             for name, draw_layer in self._layers:
-                draw_layer(scene, f"/layers/{name}", snapshot.layers.get(name) if self._visible[name] else None)
+                draw_layer(scene, f"/layers/{name}", snapshot.layers.get(name) if self.visible[name] else None)
         bodies = snapshot.filtered.skeletons or tuple(standing)
         if bodies:
             points = np.concatenate([each.positions[each.valid] for each in bodies])
             if len(points):
                 self._target = np.median(points, axis=0)
 
+    def draw_views(self, recent: Mapping[str, Sequence[bytes]], decode: Decode) -> None:
+        """Update what other systems show from several topics, given the latest messages of each."""
+        with self._server.atomic():
+            for view in self._views:
+                where = view.draw(recent, decode, self.visible)
+                if where is not None:
+                    self._target = where
+
     def _draw_body(self, seen: Seen) -> None:
-        shapes = capsules(seen.skeletons if self._visible["body"] else ())
+        shapes = capsules(seen.skeletons if self.visible["body"] else ())
         colour = STALE if seen.stale else BODY
         radii = shapes.radii
         self._limbs.draw(
@@ -229,12 +246,12 @@ class Page:
 
     def _draw_uncertainty(self, snapshot: Snapshot) -> None:
         """Ellipsoids of the filtered skeleton, or of the fused one if only that is visible."""
-        seen = snapshot.filtered if self._visible["filtered"] or not self._visible["fused"] else snapshot.fused
-        shapes = ellipsoids(seen.skeletons if self._visible["uncertainty"] and not seen.stale else ())
+        seen = snapshot.filtered if self.visible["filtered"] or not self.visible["fused"] else snapshot.fused
+        shapes = ellipsoids(seen.skeletons if self.visible["uncertainty"] and not seen.stale else ())
         self._clouds.draw(shapes.centres, so3.matrix_to_quat(shapes.rotations), shapes.radii)
 
     def _draw_frames(self, snapshot: Snapshot) -> None:
-        there = len(snapshot.origins) if self._visible["frames"] else 0
+        there = len(snapshot.origins) if self.visible["frames"] else 0
         if there and len(self._axes.batched_positions) != there:
             scales, still = np.ones(there), np.tile([1.0, 0.0, 0.0, 0.0], (there, 1))
             self._axes.batched_scales, self._axes.batched_wxyzs = scales.astype(np.float32), still.astype(np.float32)
@@ -306,7 +323,7 @@ class Page:
 
         @checkbox.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            self._visible[layer] = checkbox.value
+            self.visible[layer] = checkbox.value
 
     def _answer(self, what: str, ask: Callable[[], str]) -> None:
         """Show all clients the request, and then its answer or the reason of its refusal."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.messages.codecs import Codec
 
 
 class PageError(BodyTrackingError):
@@ -33,6 +34,33 @@ class Controls(Protocol):
 
     def choose_body(self, name: str) -> str:
         """Switch to another person's angles."""
+
+
+Decode: TypeAlias = Callable[[str, bytes], Any]
+"""Returns the payload of a message, given its topic and CDR; None for one that is malformed."""
+
+
+class SystemView(Protocol):
+    """What a system shows from several topics; :class:`~body_tracking.pipeline.system.View` names its class.
+
+    Attributes:
+        layers: what can be switched on and off: label, and whether it is on at first, by name.
+        body: the person whose angles are shown where there are no sensors of skeletons; empty for none.
+    """
+
+    layers: Mapping[str, tuple[str, bool]]
+    body: str
+
+    def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
+        """The topics that it takes while these layers are on, and the codecs of their messages."""
+
+    def start(self, server: Any) -> None:
+        """Make its parts in viser's scene and panels."""
+
+    def draw(
+        self, recent: Mapping[str, Sequence[bytes]], decode: Decode, visible: Mapping[str, bool]
+    ) -> FloatArray | None:
+        """Draw the latest messages; returns (3,) where to look, metres in world, or None."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

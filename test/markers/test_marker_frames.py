@@ -22,7 +22,7 @@ from body_tracking.messages.base import to_nanoseconds
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now, Stage
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
-from body_tracking.simulation.marker_scene import marker_scene
+from body_tracking.simulation.marker_scene import MarkerScene, marker_scene
 from body_tracking.simulation.target_points import measure
 
 NOW = Now(1_750_000_000_000_000_000, 5)
@@ -59,9 +59,13 @@ def test_cameras_stand_where_the_rig_has_them(tmp_path: Path) -> None:
     assert not list(silent.start(NOW)) and graph.TF_STATIC not in [port.topic for port in silent.outputs]
 
 
+@pytest.fixture(scope="module")
+def scene() -> MarkerScene:
+    return marker_scene("slow_down", seed=1, rate=30.0, seconds=0.1)
+
+
 @pytest.mark.parametrize(("tf", "framed"), [("targets", 3), ("root", 1), ("none", 0)])
-def test_targets_are_where_their_poses_are(tmp_path: Path, tf: str, framed: int) -> None:
-    scene = marker_scene("slow_down", seed=1, rate=30.0, seconds=0.1)
+def test_targets_are_where_their_poses_are(scene: MarkerScene, tmp_path: Path, tf: str, framed: int) -> None:
     save_targets(scene.targets, tmp_path / setup.TARGETS)
     save_chain(scene.chain, tmp_path / setup.CHAIN)
     stage = TrackerStage(check_all(TrackerStage.PARAMETERS, {"setup": str(tmp_path), "tf": tf, "deadline": 1.0}))
