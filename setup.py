@@ -32,7 +32,7 @@ setup(
     author="body_tracking maintainers",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "ros/fastdds/*.xml"]},
+    package_data={NAME: ["py.typed", "ros/fastdds/*.xml", "mesh/data/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
