@@ -148,6 +148,8 @@ def through(chain: Sequence[Stage], pairs: Pairs, index: int, stamp_ns: int) -> 
     ]
     spent = np.zeros((len(chain) + 1, 2))
     for number, stage in enumerate(chain):
+        taken = {port.topic for port in stage.inputs}
+        payloads = [each for each in payloads if each[0] in taken]
         begin, outputs = clocks(), []
         for topic, payload in payloads:
             given = clocks()

@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 
-HEAVY = {"numpy", "scipy", "rclpy", "matplotlib", "rosbags"}
+HEAVY = {"numba", "numpy", "scipy", "rclpy", "matplotlib", "rosbags"}
 ABSENT = {
     "cli": HEAVY,
     "ros.up": {"scipy", "matplotlib", "rclpy"},

@@ -19,7 +19,7 @@ from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
 from body_tracking.markers.corrections import centred, pose_sensitivities
-from body_tracking.markers.detection import DetectionSettings, detect
+from body_tracking.markers.detection import DetectionSettings, detect, prepare
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
 from body_tracking.markers.rig_monitor import RigMonitor
@@ -68,6 +68,7 @@ class DetectorStage(Stage):
         cameras = names_in(values["cameras"]) or setup.camera_names(Path(str(values["setup"])))
         self._topics = {setup.image_topic(camera): setup.balls_topic(camera) for camera in cameras}
         self._counters: Counter[str] = Counter()
+        prepare()
         self.inputs = tuple(Port(topic, CameraImage(), _IMAGES, perishable=True) for topic in self._topics)
         self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
 

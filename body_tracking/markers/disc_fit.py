@@ -1,0 +1,349 @@
+"""Fits of discs with blurred edges to the pixels of a bright region, by the method of Levenberg and Marquardt.
+
+A ball is a disc of one brightness with a blurred edge, A N((r - distance) / s) with N the normal distribution function.
+What hides a part of it is another disc or a straight edge, blurred by the same s: the share of a pixel that is inside
+both edges is the bivariate normal distribution function. The derivatives are analytic.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.compiled import compiled
+from body_tracking.core.skeleton import FloatArray, IntArray
+
+OVERLAPPING: Final = 0
+"""Discs, the larger, which are nearer, before the smaller; parameters x, y, radius, brightness of each."""
+CUT: Final = 1
+"""A disc hidden on one side of a line; x, y, radius, brightness, angle of the line's normal, its distance."""
+MOVING: Final = 2
+"""A disc that moves while the shutter is open; x, y, radius, brightness, and the way in x and y."""
+
+_ITERATIONS: Final = 30
+_EXPECTED_EDGE: Final = 0.8
+"""Standard deviation of the edge's blur, pixels: the expected value and"""
+_EDGE_RANGE: Final = 0.4
+"""what it may differ by."""
+_LEAST_EDGE: Final = 0.2
+_MOST_EDGE: Final = 4.0
+_LEAST_RADIUS: Final = 0.7
+_LEAST_BRIGHT: Final = 0.05
+_MOST_BRIGHT: Final = 30.0
+"""Brightness of a ball, in that of the region, which saturates."""
+_INSTANTS: Final = 7
+"""Of the time that the shutter is open."""
+_BLURRED: Final = 4.0
+"""Standard deviations of the blur by which discs must be apart not to hide each other."""
+_FAR: Final = 7.0
+"""Standard deviations beyond which the normal distribution function is 0 or 1, within 1e-11."""
+_STRAIGHT: Final = 0.999
+"""Correlation of two edges at most."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+_ROOT_HALF: Final = math.sqrt(0.5)
+_ROOT_2PI: Final = math.sqrt(2.0 * math.pi)
+
+
+@compiled
+def normal(u: float) -> float:
+    """The normal distribution function."""
+    return 0.5 * math.erfc(-u * _ROOT_HALF)
+
+
+@compiled
+def _clear(values: FloatArray) -> None:
+    for i in range(len(values)):
+        values[i] = 0.0
+
+
+@compiled
+def _density(u: float) -> float:
+    return math.exp(-0.5 * u * u) / _ROOT_2PI
+
+
+@compiled
+def both(u: float, v: float, correlation: float) -> tuple[float, float, float, float]:
+    """Share of a blurred point that is within two straight edges: the bivariate normal distribution function.
+
+    By the integral of Drezner and Wesolowsky (1990) over the angle whose sine is the correlation.
+
+    Returns:
+        The share, and its derivatives by u, v and the correlation.
+    """
+    correlation = min(max(correlation, -_STRAIGHT), _STRAIGHT)
+    angle = math.asin(correlation)
+    squares, product = u * u + v * v, 2.0 * u * v
+    total = 0.0
+    for k in range(len(_NODES)):
+        sine = math.sin(0.5 * (1.0 + _NODES[k]) * angle)
+        total += _WEIGHTS[k] * math.exp(-0.5 * (squares - product * sine) / (1.0 - sine * sine))
+    cosine = math.sqrt(1.0 - correlation * correlation)
+    by_u = _density(u) * normal((v - correlation * u) / cosine)
+    by_v = _density(v) * normal((u - correlation * v) / cosine)
+    by_correlation = math.exp(-0.5 * (squares - product * correlation) / (cosine * cosine)) / (2.0 * math.pi * cosine)
+    return normal(u) * normal(v) + angle / (4.0 * math.pi) * total, by_u, by_v, by_correlation
+
+
+@compiled
+def _by_edge(
+    slope: float, disc: int, inside: float, normal_x: float, normal_y: float, edge: float, to: FloatArray
+) -> None:
+    """Add a slope times the derivatives of a disc's distance within its edge, by its parameters and the edge's log."""
+    to[4 * disc] += slope * normal_x / edge
+    to[4 * disc + 1] += slope * normal_y / edge
+    to[4 * disc + 2] += slope / edge
+    to[-1] -= slope * inside
+
+
+@compiled
+def _by_cosine(
+    slope: float,
+    disc: int,
+    distance: float,
+    normal_x: float,
+    normal_y: float,
+    other_x: float,
+    other_y: float,
+    to: FloatArray,
+) -> None:
+    """Add a slope times the derivatives of the cosine between a disc's normal and another, by the disc's centre."""
+    cross = normal_x * other_y - normal_y * other_x
+    to[4 * disc] += slope * normal_y * cross / distance
+    to[4 * disc + 1] -= slope * normal_x * cross / distance
+
+
+@compiled
+def _overlapping(
+    x: float, y: float, p: FloatArray, order: IntArray, places: FloatArray, own: FloatArray, gradient: FloatArray
+) -> float:
+    """Brightness at a pixel, and its gradient (p,); places (k, 4) and own (p,) are room to work in."""
+    edge, total = math.exp(p[-1]), 0.0
+    _clear(gradient)
+    for rank in range(len(order)):
+        i = order[rank]
+        dx, dy = x - p[4 * i], y - p[4 * i + 1]
+        distance = max(math.hypot(dx, dy), 1e-9)
+        inside, normal_x, normal_y = (p[4 * i + 2] - distance) / edge, dx / distance, dy / distance
+        places[i, 0], places[i, 1], places[i, 2], places[i, 3] = inside, normal_x, normal_y, distance
+        if inside < -_FAR:
+            continue
+        share = shown = normal(inside)
+        density = _density(inside)
+        _clear(own)
+        _by_edge(density, i, inside, normal_x, normal_y, edge, own)
+        for before in range(rank):
+            j = order[before]
+            other, other_x, other_y = places[j, 0], places[j, 1], places[j, 2]
+            gap = math.hypot(p[4 * i] - p[4 * j], p[4 * i + 1] - p[4 * j + 1]) - p[4 * i + 2] - p[4 * j + 2]
+            if other < -_FAR or gap > _BLURRED * edge:
+                continue
+            hidden, by_inside, by_other, by_cosine = both(inside, other, normal_x * other_x + normal_y * other_y)
+            left = 1.0 - hidden / share
+            if left <= 0.0:
+                shown = 0.0
+                break
+            # shown becomes shown * left
+            for k in range(len(own)):
+                own[k] *= left
+            each = -shown / share
+            _by_edge(each * (by_inside - hidden / share * density), i, inside, normal_x, normal_y, edge, own)
+            _by_edge(each * by_other, j, other, other_x, other_y, edge, own)
+            _by_cosine(each * by_cosine, i, distance, normal_x, normal_y, other_x, other_y, own)
+            _by_cosine(each * by_cosine, j, places[j, 3], other_x, other_y, normal_x, normal_y, own)
+            shown *= left
+        if shown > 0.0:
+            bright = p[4 * i + 3]
+            total += bright * shown
+            for k in range(len(own)):
+                gradient[k] += bright * own[k]
+            gradient[4 * i + 3] = shown
+    return total
+
+
+@compiled
+def _cut(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
+    """Brightness at a pixel, and its gradient (p,)."""
+    edge, bright = math.exp(p[6]), float(p[3])
+    line_x, line_y = math.cos(p[4]), math.sin(p[4])
+    dx, dy = x - p[0], y - p[1]
+    distance = max(math.hypot(dx, dy), 1e-9)
+    normal_x, normal_y, inside = dx / distance, dy / distance, (p[2] - distance) / edge
+    across = (p[5] - dx * line_x - dy * line_y) / edge
+    _clear(gradient)
+    if inside < -_FAR or across < -_FAR:
+        return 0.0
+    shown, by_inside, by_across, by_cosine = both(inside, across, normal_x * line_x + normal_y * line_y)
+    _by_edge(bright * by_inside, 0, inside, normal_x, normal_y, edge, gradient)
+    _by_cosine(bright * by_cosine, 0, distance, normal_x, normal_y, line_x, line_y, gradient)
+    slope = bright * by_across / edge
+    gradient[0] += slope * line_x
+    gradient[1] += slope * line_y
+    gradient[3] = shown
+    gradient[4] = slope * (dx * line_y - dy * line_x) + bright * by_cosine * (normal_y * line_x - normal_x * line_y)
+    gradient[5] = slope
+    gradient[6] -= slope * edge * across
+    return bright * shown
+
+
+@compiled
+def _moving(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
+    """Brightness at a pixel, and its gradient (p,)."""
+    edge, total, bright = math.exp(p[6]), 0.0, float(p[3])
+    _clear(gradient)
+    for instant in range(_INSTANTS):
+        when = instant / (_INSTANTS - 1.0) - 0.5
+        dx, dy = x - p[0] - when * p[4], y - p[1] - when * p[5]
+        distance = max(math.hypot(dx, dy), 1e-9)
+        inside = (p[2] - distance) / edge
+        if inside < -_FAR:
+            continue
+        total += normal(inside) / _INSTANTS
+        slope = bright / _INSTANTS * _density(inside)
+        _by_edge(slope, 0, inside, dx / distance, dy / distance, edge, gradient)
+        gradient[4] += slope * when * dx / (distance * edge)
+        gradient[5] += slope * when * dy / (distance * edge)
+    gradient[3] = total
+    return bright * total
+
+
+@compiled
+def brightness(
+    kind: int, x: float, y: float, p: FloatArray, order: IntArray, work: FloatArray, gradient: FloatArray
+) -> float:
+    """Brightness of a model at a pixel, and its gradient.
+
+    Args:
+        kind: of the model.
+        x: of the pixel.
+        y: of the pixel.
+        p: (p,) parameters of the model, the last of which is the log of the edge.
+        order: (k,) discs of an overlapping model, the nearest first.
+        work: (max(4 k, p),) room to work in, two rows of it.
+        gradient: (p,) derivatives by the parameters, which are written here.
+    """
+    if kind == OVERLAPPING:
+        return _overlapping(x, y, p, order, work[0, : 4 * len(order)].reshape(-1, 4), work[1, : len(p)], gradient)
+    return _cut(x, y, p, gradient) if kind == CUT else _moving(x, y, p, gradient)
+
+
+@compiled
+def _linear(
+    kind: int,
+    p: FloatArray,
+    pixels: FloatArray,
+    ceiling: float,
+    work: FloatArray,
+    information: FloatArray,
+    pull: FloatArray,
+) -> tuple[float, float]:
+    """Weighted and plain sums of squared differences; information (p, p) and pull (p,) are written."""
+    size = len(p)
+    order = np.zeros(size // 4, dtype=np.int64)
+    for i in range(1, len(order)):
+        rank = i
+        while rank > 0 and p[4 * order[rank - 1] + 2] < p[4 * i + 2]:
+            order[rank] = order[rank - 1]
+            rank -= 1
+        order[rank] = i
+    gradient = np.empty(size)
+    for i in range(size):
+        pull[i] = 0.0
+        for j in range(size):
+            information[i, j] = 0.0
+    prior = (math.log(_EXPECTED_EDGE) - p[-1]) * (_EXPECTED_EDGE / _EDGE_RANGE)
+    information[-1, -1] = (_EXPECTED_EDGE / _EDGE_RANGE) ** 2
+    pull[-1] = prior * (_EXPECTED_EDGE / _EDGE_RANGE)
+    squares, plain = prior * prior, 0.0
+    for n in range(pixels.shape[1]):
+        made = brightness(kind, pixels[0, n], pixels[1, n], p, order, work, gradient)
+        difference, weight = pixels[2, n] - min(made, ceiling), 1.0 / pixels[3, n]
+        plain += difference * difference
+        squares += difference * difference * weight
+        if made > ceiling:
+            continue
+        for i in range(size):
+            if gradient[i] != 0.0:
+                slope = gradient[i] * weight
+                pull[i] += slope * difference
+                for j in range(i + 1):
+                    information[i, j] += slope * gradient[j]
+    for i in range(size):
+        for j in range(i):
+            information[j, i] = information[i, j]
+    return squares, plain
+
+
+@compiled
+def _solve(information: FloatArray, damping: float, pull: FloatArray, lower: FloatArray, step: FloatArray) -> None:
+    """Write the step of a damped Gauss-Newton method, by Cholesky's factor, which is written too."""
+    size = len(pull)
+    for i in range(size):
+        step[i] = pull[i]
+        for j in range(i + 1):
+            value = information[i, j]
+            for k in range(j):
+                value -= lower[i, k] * lower[j, k]
+            if i == j:
+                lower[i, i] = math.sqrt(max(value + damping * (information[i, i] + 1e-6), 1e-30))
+            else:
+                lower[i, j] = value / lower[j, j]
+        for k in range(i):
+            step[i] -= lower[i, k] * step[k]
+        step[i] /= lower[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            step[i] -= lower[k, i] * step[k]
+        step[i] /= lower[i, i]
+
+
+@compiled
+def fit(
+    kind: int, start: FloatArray, pixels: FloatArray, ceiling: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """The most likely parameters of a model.
+
+    Args:
+        kind: of the model.
+        start: (p - 1,) its parameters but for the edge's.
+        pixels: (4, n) x, y, brightness and its variance, of each pixel.
+        ceiling: brightness at which the sensor saturates.
+
+    Returns:
+        The parameters (p,), their information (p, p), the weighted sum of squared differences and the plain one.
+    """
+    size = len(start) + 1
+    found = np.empty(size)
+    for i in range(size - 1):
+        found[i] = start[i]
+    found[-1] = math.log(_EXPECTED_EDGE)
+    work, lower = np.empty((2, size)), np.empty((size, size))
+    information, pull = np.empty((size, size)), np.empty(size)
+    tried_information, tried_pull = np.empty((size, size)), np.empty(size)
+    damping = 1e-3
+    squares, plain = _linear(kind, found, pixels, ceiling, work, information, pull)
+    for _ in range(_ITERATIONS):
+        tried = np.empty(size)
+        _solve(information, damping, pull, lower, tried)
+        for i in range(size):
+            tried[i] += found[i]
+        tried[2] = max(tried[2], _LEAST_RADIUS)
+        if kind == OVERLAPPING:
+            for first in range(0, size - 1, 4):
+                tried[first + 2] = max(tried[first + 2], _LEAST_RADIUS)
+                tried[first + 3] = min(max(tried[first + 3], _LEAST_BRIGHT), _MOST_BRIGHT)
+        tried[-1] = min(max(tried[-1], math.log(_LEAST_EDGE)), math.log(_MOST_EDGE))
+        now, now_plain = _linear(kind, tried, pixels, ceiling, work, tried_information, tried_pull)
+        if now < squares:
+            done = squares - now < 1e-3 * max(squares, 1.0)
+            found, squares, plain, damping = tried, now, now_plain, max(0.2 * damping, 1e-7)
+            information, tried_information = tried_information, information
+            pull, tried_pull = tried_pull, pull
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+    return found, information, squares, plain
