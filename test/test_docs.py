@@ -1,10 +1,10 @@
 """README.md and the pages in ``docs/``: every command in them runs, or says at its top why not.
 
-The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of the
-repository (and nothing of the page before), and must all end with exit code 0. A block that needs a device, ROS's own
-``ros2``, or more time than a test has begins with the line ``# needs hardware: ...``, ``# needs ROS: ...`` or ``# takes
-long: ...``. A block of another language that begins with ``# name.ext`` is written to that file first, so that commands
-can use it.
+The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of
+the repository (and nothing of the page before; of one recording, its first 7 s), and must all end with exit code 0. A
+block that needs a device, ROS's own ``ros2``, or more time than a test has begins with the line ``# needs hardware:
+...``, ``# needs ROS: ...`` or ``# takes long: ...``. A block of another language that begins with ``# name.ext`` is
+written to that file first, so that commands can use it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from domains import domain
+from draws import ALL
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
@@ -56,10 +57,14 @@ SLOW = dict.fromkeys(("first_ten_minutes", "reading_uncertainty", "choosing_a_fi
         if commands(page)
     ],
 )
-def test_commands_of_the_documentation_work(page: Path, tmp_path: Path) -> None:
+def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, wave: Path) -> None:
     for item in ROOT.iterdir():
-        if not item.name.startswith("."):
+        if not item.name.startswith(".") and item.name != "bags":
             (tmp_path / item.name).symlink_to(item)
+    (tmp_path / "bags").mkdir()
+    for bag in (ROOT / "bags").iterdir():
+        short = bag.name == "tpose_wave" and not ALL
+        (tmp_path / "bags" / bag.name).symlink_to(wave if short else bag)
     for language, text in blocks(page):
         name = FILE.match(text)
         if language != "sh" and name:
