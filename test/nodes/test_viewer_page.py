@@ -6,12 +6,9 @@ With ``BODY_TRACKING_SCREENSHOTS=docs/images`` it writes the pictures of the doc
 from __future__ import annotations
 
 import contextlib
-import os
 import re
-import shutil
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +16,10 @@ import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
 
+from browser import PICTURES, Browser, browsing, need_chromium  # noqa: E402
 from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from running import Running, stop  # noqa: E402
@@ -34,76 +32,15 @@ from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.viewing.shapes import figure  # noqa: E402
 
 BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_torso_twist"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
-PICTURES = os.environ.get("BODY_TRACKING_SCREENSHOTS")
 EVERY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-PATIENCE = 120.0
-"""Seconds: software draws a frame in one of them where processors are shared."""
-
-JOINTS = """name => {
-  const node = window.__viserSceneTree?.getState()[name];
-  if (!node || !node.message.props.batched_positions) return null;
-  const bytes = node.message.props.batched_positions;
-  return Array.from(new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4));
-}"""
 CURVES = """() => Object.values(window.__viserTestpoints?.uplots ?? {})
   .map(plot => plot.chart.data.map(series => Array.from(series)))"""
-
-
-class Browser:
-    """A page and the graph that it shows, whose messages are received in a thread of their own."""
-
-    def __init__(self, running: Running, page: Any, clouds: list[PointCloud2]) -> None:
-        self.running, self.page, self.clouds = running, page, clouds
-
-    def until(self, condition: Callable[[], Any], what: str) -> Any:
-        """Wait for a condition; a timeout fails the test."""
-        end = time.monotonic() + PATIENCE
-        while not (found := condition()):
-            assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log('viewer')}"
-            self.page.wait_for_timeout(100)
-        return found
-
-    def joints(self, name: str) -> np.ndarray | None:
-        """(n, 3) points that the page draws there."""
-        numbers = self.page.evaluate(JOINTS, name)
-        return None if numbers is None else np.array(numbers).reshape(-1, 3)
-
-    def press(self, button: str) -> None:
-        self.page.get_by_role("button", name=button, exact=True).dispatch_event("click")
-
-    def answer(self, pattern: str) -> str:
-        """The notification that matches."""
-        text = re.compile(pattern)
-        return str(self.until(lambda: self._found(text), f"an answer like {pattern!r}"))
-
-    def _found(self, pattern: re.Pattern[str]) -> str:
-        texts = self.page.locator("[role=alert], .mantine-Notification-root").all_inner_texts()
-        return next((text for text in texts if pattern.search(text) and "waits for an answer" not in text), "")
-
-    def picture(self) -> bytes:
-        """The middle of the scene, where the person stands."""
-        size = self.page.viewport_size
-        clip = {"x": 0.42 * size["width"], "y": 0.3 * size["height"], "width": 0.2 * size["width"], "height": 200}
-        return bytes(self.page.screenshot(clip=clip, timeout=1e3 * PATIENCE))
-
-    def save(self, name: str) -> None:
-        """A picture for the documentation, if these are asked for."""
-        if PICTURES:
-            file = Path(PICTURES) / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            for note in self.page.locator(".mantine-Notification-closeButton").all():
-                note.dispatch_event("click")
-            self.page.wait_for_timeout(5e3)
-            self.page.screenshot(path=file, timeout=1e3 * PATIENCE)
 
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Browser]:
     """The whole graph over a bag that plays again and again, and a browser that shows it."""
-    if CHROMIUM is None:
-        pytest.skip("no chromium here: apt-get install chromium")
+    need_chromium()
     with Running(tmp_path) as running:
         # The picture shows the filter that knows a body; it takes six times as long.
         name = "ekf" if PICTURES else "lkf_constant_velocity"
@@ -119,23 +56,11 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
         waited = f"['/kinect1/skeleton:{count}', '/kinect2/skeleton:{count}']"
         clouds = running.collect(PointCloud2, graph.FILTERED, EVERY)
         running.start("bag_player", bag=BAG, topics=topics, loop=True, clock_rate=20.0, wait_for_subscribers=waited)
-        assert running.until(lambda: "open http" in running.log("viewer"), PATIENCE), running.log("viewer")
-        address = re.search(r"http://\S+", running.log("viewer"))
-        assert address is not None and address[0].startswith("http://127.0.0.1:")
-        with playwright.sync_playwright() as driver:
-            # Software draws as fast as it can; what it draws comes first.
-            gentle = tmp_path / "chromium"
-            gentle.write_text(f'#!/bin/sh\nexec nice -n 19 {CHROMIUM} "$@"\n')
-            gentle.chmod(0o755)
-            chromium = driver.chromium.launch(executable_path=gentle, args=list(SOFTWARE), timeout=1e3 * PATIENCE)
-            width, height, sharpness = (1360, 820, 1.0) if PICTURES else (900, 560, 0.4)
-            page = chromium.new_page(viewport={"width": width, "height": height})
-            page.set_default_timeout(1e3 * PATIENCE)
-            page.goto(f"{address[0]}/?fixedDpr={sharpness}")
+        size, sharpness = ((1360, 820), 1.0) if PICTURES else ((900, 560), 0.4)
+        with browsing(running, tmp_path, size, sharpness) as page:
             listener = threading.Thread(target=_spin, args=(running.executor,), daemon=True)
             listener.start()
             yield Browser(running, page, clouds)
-            chromium.close()
             running.executor.shutdown()
             listener.join(10.0)
 

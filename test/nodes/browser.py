@@ -1,0 +1,115 @@
+"""A real browser that shows the viewer's page, for tests; it draws in software."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from running import Running
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+PICTURES = os.environ.get("BODY_TRACKING_SCREENSHOTS")
+"""A folder, to which tests write the pictures of the documentation."""
+PATIENCE = 120.0
+"""Seconds: software draws a frame in one of them where processors are shared."""
+
+JOINTS = """name => {
+  const node = window.__viserSceneTree?.getState()[name];
+  if (!node || !node.message.props.batched_positions) return null;
+  const bytes = node.message.props.batched_positions;
+  return Array.from(new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4));
+}"""
+
+
+def need_chromium() -> None:
+    """Skip the test where there is no browser."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+
+
+class Browser:
+    """A page and the graph that it shows, whose filtered skeletons are received in a thread of their own."""
+
+    def __init__(self, running: Running, page: Any, clouds: list[Any]) -> None:
+        self.running, self.page, self.clouds = running, page, clouds
+
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Wait for a condition; a timeout fails the test."""
+        end = time.monotonic() + PATIENCE
+        while not (found := condition()):
+            assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log('viewer')}"
+            self.page.wait_for_timeout(100)
+        return found
+
+    def joints(self, name: str) -> np.ndarray | None:
+        """(n, 3) points that the page draws there."""
+        numbers = self.page.evaluate(JOINTS, name)
+        return None if numbers is None else np.array(numbers).reshape(-1, 3)
+
+    def press(self, button: str) -> None:
+        self.page.get_by_role("button", name=button, exact=True).dispatch_event("click")
+
+    def answer(self, pattern: str) -> str:
+        """The notification that matches."""
+        text = re.compile(pattern)
+        return str(self.until(lambda: self._found(text), f"an answer like {pattern!r}"))
+
+    def _found(self, pattern: re.Pattern[str]) -> str:
+        texts = self.page.locator("[role=alert], .mantine-Notification-root").all_inner_texts()
+        return next((text for text in texts if pattern.search(text) and "waits for an answer" not in text), "")
+
+    def picture(self) -> bytes:
+        """The middle of the scene, where the person stands."""
+        size = self.page.viewport_size
+        clip = {"x": 0.42 * size["width"], "y": 0.3 * size["height"], "width": 0.2 * size["width"], "height": 200}
+        return bytes(self.page.screenshot(clip=clip, timeout=1e3 * PATIENCE))
+
+    def save(self, name: str) -> None:
+        """A picture for the documentation, if these are asked for."""
+        if PICTURES:
+            file = Path(PICTURES) / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            for note in self.page.locator(".mantine-Notification-closeButton").all():
+                note.dispatch_event("click")
+            self.page.wait_for_timeout(5e3)
+            self.page.screenshot(path=file, timeout=1e3 * PATIENCE)
+
+
+@contextmanager
+def browsing(running: Running, folder: Path, size: tuple[int, int], sharpness: float) -> Iterator[Any]:
+    """The page of a running viewer, in playwright.
+
+    Args:
+        running: with a node ``viewer``.
+        folder: for temporary files.
+        size: of the window, pixels.
+        sharpness: pixels that are drawn per pixel of the window.
+    """
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+    def opened() -> bool:
+        return (running.folder / "viewer.log").exists() and "open http" in running.log("viewer")
+
+    assert running.until(opened, PATIENCE), running.log("viewer")
+    address = re.search(r"http://\S+", running.log("viewer"))
+    assert address is not None and address[0].startswith("http://127.0.0.1:")
+    with playwright.sync_playwright() as driver:
+        # Software draws as fast as it can; what it draws comes first.
+        gentle = folder / "chromium"
+        gentle.write_text(f'#!/bin/sh\nexec nice -n 19 {CHROMIUM} "$@"\n')
+        gentle.chmod(0o755)
+        chromium = driver.chromium.launch(executable_path=gentle, args=list(SOFTWARE), timeout=1e3 * PATIENCE)
+        page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
+        page.set_default_timeout(1e3 * PATIENCE)
+        page.goto(f"{address[0]}/?fixedDpr={sharpness}")
+        yield page
+        chromium.close()
