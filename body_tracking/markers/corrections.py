@@ -65,10 +65,27 @@ def pose_sensitivities(rig: Rig, targets: Mapping[str, Target], poses: Sequence[
     return {pose.name: each for pose, each in zip(poses, moves, strict=True)}
 
 
-def shape_effects(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
+def calibration_effects(
+    rig: Rig | None, targets: Mapping[str, Target], poses: Sequence[TargetPose]
+) -> dict[str, FloatArray] | None:
+    """:func:`pose_sensitivities`; None without a rig, zeros for poses of points that the rig did not measure."""
+    if rig is None:
+        return None
+    if measured_by(rig, poses):
+        return pose_sensitivities(rig, targets, poses)
+    return {pose.name: np.zeros((6, rig.size)) for pose in poses}
+
+
+def measured_by(rig: Rig | None, poses: Sequence[TargetPose]) -> bool:
+    """Whether poses of one time are in the frame of the rig; those of another system's points are not."""
+    return rig is not None and all(pose.frame_id == rig.cameras[0].frame_id for pose in poses)
+
+
+def shape_effects(rig: Rig | None, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
     """What the errors of the targets' own geometry add to their poses, the same unknowns in all frames.
 
-    As :func:`pose_sensitivity`, for the pose that fits the pixels best.
+    As :func:`pose_sensitivity`, for the pose that fits the pixels best; without a rig, or for poses of points that it
+    did not measure, for the pose that fits the points best, each coordinate as good as the other.
 
     Returns:
         Of each target (6, 3k) in the order of :attr:`TargetPose.covariance`: what independent unknowns of variance 1,
@@ -76,8 +93,11 @@ def shape_effects(rig: Rig, targets: Mapping[str, Target], poses: Sequence[Targe
     """
     starts, by_pose, points = _balls(targets, poses)
     information, pull = np.zeros((len(poses), 6, 6)), np.zeros((len(points), 6, 3))
-    for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
-        by_point = projection.project(camera, rotation, translation, points).by_point
+    measured = [np.broadcast_to(np.eye(3), (len(points), 3, 3))]
+    if rig is not None and measured_by(rig, poses):
+        cameras = zip(rig.cameras, rig.rotations, rig.translations, strict=True)
+        measured = [projection.project(*camera, points).by_point for camera in cameras]
+    for by_point in measured:
         by_ball = by_point @ by_pose
         information += np.add.reduceat(by_ball.swapaxes(1, 2) @ by_ball, starts)
         pull += by_ball.swapaxes(1, 2) @ by_point

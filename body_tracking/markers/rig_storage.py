@@ -12,6 +12,7 @@ from body_tracking.core import files, so3
 from body_tracking.core.camera import MODELS, Camera
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers import setup
 from body_tracking.markers.rig import LENS, POSE, Rig
 
 MAX_CAMERAS: Final = 16
@@ -27,6 +28,16 @@ _HEADER: Final = """\
 
 class RigFileError(BodyTrackingError):
     """A rig's file cannot be read or written."""
+
+
+def rig_in(folder: object) -> Rig | None:
+    """The rig of a setup; None where it has none, as the points are another motion capture system's.
+
+    Raises:
+        RigFileError: as :func:`load_rig`.
+    """
+    path = Path(str(folder)).expanduser() / setup.RIG
+    return load_rig(path) if path.is_file() else None
 
 
 def save_rig(rig: Rig, path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -79,6 +78,15 @@ def pose_topic(target: str) -> str:
     return f"/markers/{target}/pose"
 
 
-def sources(cameras: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """The topics from which everything else follows: of images, or of balls, or of points."""
+def sources(folder: Path) -> tuple[tuple[str, ...], ...]:
+    """The topics from which everything else follows: of images, or of balls, or of points.
+
+    Without a rig, only those of points, which another motion capture system measured then.
+
+    Raises:
+        SetupError: as :func:`camera_names`.
+    """
+    if not (folder.expanduser() / RIG).is_file():
+        return ((POINTS,),)
+    cameras = camera_names(folder)
     return tuple(map(image_topic, cameras)), tuple(map(balls_topic, cameras)), (POINTS,)

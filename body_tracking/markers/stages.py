@@ -18,12 +18,12 @@ from body_tracking.markers import setup
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import centred, pose_sensitivities
+from body_tracking.markers.corrections import calibration_effects, centred
 from body_tracking.markers.detection import DetectionSettings, detect, prepare
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
 from body_tracking.markers.rig_monitor import RigMonitor
-from body_tracking.markers.rig_storage import load_rig
+from body_tracking.markers.rig_storage import load_rig, rig_in
 from body_tracking.markers.targets_file import load_targets
 from body_tracking.markers.tracking import TargetTracker
 from body_tracking.markers.triangulation import TriangulationSettings, triangulate
@@ -235,7 +235,7 @@ class AnglesOfTargetsStage(Stage):
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
         chain = load_chain(setup.file_of(values["setup"], setup.CHAIN, "fit"))
-        self._rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
+        self._rig = rig_in(values["setup"])
         targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
         self._shapes = {target.name: target for target in targets}
         self._angles = AngleEstimator(chain)
@@ -270,8 +270,9 @@ class AnglesOfTargetsStage(Stage):
 
     def _found(self, sets: Iterable[Mapping[str, TargetPose]]) -> Iterator[Output]:
         for poses in sets:
-            sensitivities = pose_sensitivities(self._rig, self._shapes, list(poses.values()))
-            found = self._angles.estimate(tuple(poses.values()), sensitivities, self._rig.covariance)
+            sensitivities = calibration_effects(self._rig, self._shapes, list(poses.values()))
+            calibration = None if self._rig is None else self._rig.covariance
+            found = self._angles.estimate(tuple(poses.values()), sensitivities, calibration)
             angles = with_rates(found, self._last)
             self._last = angles
             for port in self.outputs:

@@ -28,20 +28,26 @@ _STAGES = "body_tracking.markers.stages"
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["marker_setup"]:
         given = {"setup": options["marker_setup"], **transport(options)}
-        yield NodeSpec("marker_detector", "marker_detector", parameters=given)
-        yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
+        if setup.POINTS not in _played_topics(options):
+            yield NodeSpec("marker_detector", "marker_detector", parameters=given)
+            yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
         yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
         yield NodeSpec("marker_joint_angles", "marker_joint_angles", parameters=given)
+
+
+def _played_topics(options: Options) -> tuple[str, ...]:
+    played = options["played"]
+    return played if isinstance(played, tuple) else ()
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     if not options["marker_setup"]:
         return ()
-    cameras = setup.camera_names(Path(str(options["marker_setup"])))
-    for source in setup.sources(cameras):
+    sources = setup.sources(Path(str(options["marker_setup"])))
+    for source in sources:
         if all(topic in topics for topic in source):
             return source
-    raise graph.GraphError(f"no topic {' or '.join(source[0] for source in setup.sources(cameras))}")
+    raise graph.GraphError(f"no topic {' or '.join(source[0] for source in sources)}")
 
 
 SYSTEM = System(
@@ -59,7 +65,8 @@ SYSTEM = System(
         Option(
             "marker_setup",
             "",
-            "track infrared markers, with the rig.yaml, targets.yaml and chain.yaml in this folder",
+            "track infrared markers, with the rig.yaml, targets.yaml and chain.yaml in this folder (no rig.yaml where "
+            "another motion capture system measures the points)",
             "FOLDER",
             path=True,
             example="setup",

@@ -65,6 +65,11 @@ class Trajectories:
         return self.positions[:, [self.labels.index(label) for label in labels]]
 
 
+def labels_in(text: str) -> tuple[str, ...]:
+    """The labels in a list with commas."""
+    return tuple(each.strip() for each in text.split(",") if each.strip())
+
+
 def is_trajectory_file(path: Path) -> bool:
     """Whether a file holds points of another motion capture system: ``.c3d``, or an export of Motive.
 

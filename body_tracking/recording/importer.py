@@ -38,6 +38,7 @@ from body_tracking.markers.trajectories import (
     RecordedPoints,
     TrajectoryRecording,
     is_trajectory_file,
+    labels_in,
 )
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.imus import sample_to_messages
@@ -367,7 +368,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--labels",
-        type=lambda text: tuple(each.strip() for each in text.split(",") if each.strip()),
+        type=labels_in,
         default=(),
         metavar="LABEL,...",
         help="import only these points of a .c3d file or of an export of Motive (default: all)",

@@ -20,29 +20,33 @@ from numpy.typing import NDArray
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Value, check_all
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.boards import Chessboard
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
 from body_tracking.markers.chain_files import save_chain, to_urdf
 from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
-from body_tracking.markers.corrections import pose_sensitivities, shape_effects
+from body_tracking.markers.corrections import calibration_effects, shape_effects
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
-from body_tracking.markers.rig_storage import load_rig, save_rig
+from body_tracking.markers.rig_storage import rig_in, save_rig
 from body_tracking.markers.stages import AnglesOfTargetsStage, DetectorStage, TrackerStage, TriangulationStage
-from body_tracking.markers.target_calibration import calibrate_target, ordered_views
+from body_tracking.markers.target_calibration import FEWEST, calibrate_target, ordered_views
 from body_tracking.markers.targets_file import load_targets, save_targets
+from body_tracking.markers.trajectories import TrajectoryError, is_trajectory_file, labels_in, read_trajectories
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.pipeline.stage import Port, Stage
+from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import load
 from body_tracking.recording import marker_wand
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
 
+_VIEWS = 600
+"""Of a labelled target; more hardly say more."""
 _RENDER = "body_tracking.simulation.marker_bags"
 
 
@@ -67,11 +71,11 @@ def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
     Raises:
         MarkerCommandError: none of them is there.
     """
-    cameras = setup.camera_names(folder)
-    for topics in setup.sources(cameras):
+    sources = setup.sources(folder)
+    for topics in sources:
         if all(topic in bag.topics for topic in topics):
             return topics
-    wanted = " or ".join(topics[0] for topics in setup.sources(cameras))
+    wanted = " or ".join(topics[0] for topics in sources)
     raise MarkerCommandError(f"{bag.path}: no topic {wanted}; it has {', '.join(sorted(bag.topics))}")
 
 
@@ -94,8 +98,10 @@ def track(
     Raises:
         BodyTrackingError: the recording or the setup cannot be used.
     """
-    made = []
-    for stage in stages:
+    made: list[Stage] = []
+    with RigReader(bag_path) as bag:
+        topics = sources_of(bag, folder)
+    for stage in _after(topics, stages):
         known = {item.name for item in stage.PARAMETERS}
         given = {"setup": str(folder), **{name: value for name, value in values.items() if name in known}}
         made.append(stage(check_all(stage.PARAMETERS, given)))
@@ -107,7 +113,6 @@ def track(
 
     runner = OfflineRunner(made, BAG_WIRE, keep)
     with RigReader(bag_path) as bag:
-        topics = sources_of(bag, folder)
         progress = Progress(bag.start_ns, bag.end_ns)
         runner.start(bag.start_ns)
         for raw in bag.messages(topics):
@@ -147,19 +152,19 @@ def fit_recording(bag_path: Path, folder: Path, joints: Sequence[JointDescriptio
 
     Args:
         bag_path: with images, balls or points.
-        folder: the setup, of which ``rig.yaml`` and ``targets.yaml`` are read.
+        folder: the setup, of which ``targets.yaml`` is read, and ``rig.yaml`` if it is there.
         joints: of the chain.
         diameter: of the balls, metres, or 0.
 
     Raises:
         BodyTrackingError: the recording or the setup cannot be used, or the joints cannot be fitted.
     """
-    rig = load_rig(setup.file_of(folder, setup.RIG, "calibrate"))
+    rig = rig_in(folder)
     targets = {each.name: each for each in load_targets(setup.file_of(folder, setup.TARGETS, "target"))}
     frames = poses_of(bag_path, folder, diameter)
-    sensitivities = [pose_sensitivities(rig, targets, poses) for poses in frames]
+    sensitivities = [effects for poses in frames if (effects := calibration_effects(rig, targets, poses)) is not None]
     shapes = [shape_effects(rig, targets, poses) for poses in frames]
-    return fit_chain(frames, joints, sensitivities, shapes)
+    return fit_chain(frames, joints, sensitivities or None, shapes)
 
 
 # --- commands
@@ -207,19 +212,15 @@ def calibrate(args: argparse.Namespace) -> int:
 
 def target(args: argparse.Namespace) -> int:
     """``markers target``."""
-    frames = points_of(args.bag, args.setup, args.diameter)
-    first = next((k for k, points in enumerate(frames) if len(points.positions) == args.balls), None)
-    if first is None:
-        counts = Counter(len(points.positions) for points in frames)
-        seen = ", ".join(f"{count} in {number} frames" for count, number in sorted(counts.items())) or "no frame at all"
-        raise MarkerCommandError(f"{args.bag}: no frame with {args.balls} points; {seen}")
-    views, covariance = ordered_views(frames, np.arange(args.balls), first)
-    found = calibrate_target(args.name, views, covariance, args.diameter)
+    views, covariance, whole = _views(args)
+    found = calibrate_target(args.name, views, covariance, args.diameter, flexible=bool(args.labels))
     path = args.setup / setup.TARGETS
     others = [each for each in (load_targets(path) if path.exists() else []) if each.name != args.name]
     check_distinct([*others, found.target], max(found.noise, 2e-4))
+    args.setup.mkdir(parents=True, exist_ok=True)
     save_targets([*others, found.target], path)
-    stddev = float(np.sqrt(np.trace(found.target.covariance) / args.balls))
+    balls = len(found.target.points)
+    stddev = float(np.sqrt(np.trace(found.target.covariance) / balls))
     report = {
         "targets": str(path),
         "name": args.name,
@@ -229,11 +230,34 @@ def target(args: argparse.Namespace) -> int:
         "reduced_chi_square": found.reduced_chi_square,
     }
     lines = [
-        f"{args.name}: {args.balls} balls from {report['views']} of {len(frames)} frames, noise "
+        f"{args.name}: {balls} balls from {report['views']} of {whole} frames, noise "
         f"{report['noise_mm']:.3f} mm, each ball known to {report['stddev_mm']:.3f} mm",
         f"written to {path}",
     ]
     return _say(args, report, lines)
+
+
+def _views(args: argparse.Namespace) -> tuple[FloatArray, FloatArray | None, int]:
+    """(f, k, 3) views of a target, their covariance (None for labelled trajectories), and the number of frames."""
+    if args.labels:
+        if not is_trajectory_file(args.bag):
+            raise MarkerCommandError(f"{args.bag}: labels are in C3D files and in exports of Motive only")
+        try:
+            views = read_trajectories(args.bag).chosen(args.labels)
+        except TrajectoryError as error:
+            raise MarkerCommandError(f"{args.bag}: {error}") from error
+        seen = np.flatnonzero(np.isfinite(views).all(axis=2).sum(axis=1) >= FEWEST)
+        return views[seen[:: max(1, len(seen) // _VIEWS)]], None, len(views)
+    if args.balls is None:
+        raise MarkerCommandError("balls: their number is needed, or the labels of the target in a C3D file")
+    frames = points_of(args.bag, args.setup, args.diameter)
+    first = next((k for k, points in enumerate(frames) if len(points.positions) == args.balls), None)
+    if first is None:
+        counts = Counter(len(points.positions) for points in frames)
+        seen = ", ".join(f"{count} in {number} frames" for count, number in sorted(counts.items())) or "no frame at all"
+        raise MarkerCommandError(f"{args.bag}: no frame with {args.balls} points; {seen}")
+    views, covariance = ordered_views(frames, np.arange(args.balls), first)
+    return views, covariance, len(frames)
 
 
 def fit(args: argparse.Namespace) -> int:
@@ -274,7 +298,13 @@ def fit(args: argparse.Namespace) -> int:
 def angles(args: argparse.Namespace) -> int:
     """``markers angles``."""
     stages = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
-    types = _types(args.setup)  # raises before anything is written
+    with RigReader(args.bag) as bag:
+        needed = _after(sources_of(bag, args.setup), stages)
+    outputs = [
+        port for stage in needed for port in stage(check_all(stage.PARAMETERS, {"setup": str(args.setup)})).outputs
+    ]
+    # raises before anything is written
+    types = {port.topic: port.codec.type_name for port in outputs}
     with BagWriter(args.output, overwrite=args.overwrite, flush_interval_s=float("inf")) as writer:
         with RigReader(args.bag) as bag:
             for topic in (*sources_of(bag, args.setup), *(t for t in bag.topics if t.startswith("/ground_truth/"))):
@@ -300,26 +330,23 @@ def angles(args: argparse.Namespace) -> int:
 
 def check(args: argparse.Namespace) -> int:
     """``markers check``."""
-    rig = load_rig(setup.file_of(args.setup, setup.RIG, "calibrate"))
+    rig = rig_in(args.setup)
     targets = load_targets(setup.file_of(args.setup, setup.TARGETS, "target"))
     check_distinct(targets, args.noise)
     report = {
-        "cameras": [camera.frame_id for camera in rig.cameras],
+        "cameras": [] if rig is None else [camera.frame_id for camera in rig.cameras],
         "targets": {each.name: len(each.points) for each in targets},
     }
     lines = [
-        f"cameras: {', '.join(report['cameras'])}",
+        f"cameras: {', '.join(report['cameras']) or 'none, points of another system only'}",
         f"targets: {', '.join(f'{each.name} ({len(each.points)} balls)' for each in targets)}; no two are alike",
     ]
     return _say(args, report, lines)
 
 
-def _types(folder: Path) -> dict[str, str]:
-    """Type names of what the stages publish."""
-    outputs: list[Port] = []
-    for stage in (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage):
-        outputs += stage(check_all(stage.PARAMETERS, {"setup": str(folder)})).outputs
-    return {port.topic: port.codec.type_name for port in outputs}
+def _after(topics: Sequence[str], stages: Sequence[type[Stage]]) -> list[type[Stage]]:
+    """The stages that a recording with these sources needs: points need no cameras."""
+    return [stage for stage in stages if topics != (setup.POINTS,) or stage not in (DetectorStage, TriangulationStage)]
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -361,9 +388,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     marker_wand.add_parser(commands)
 
     parser = command("target", target, "Measure a target that is turned before the cameras alone; into targets.yaml.")
-    parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of the target")
+    parser.add_argument(
+        "bag",
+        type=Path,
+        metavar="BAG",
+        help="a recording of the target, or with --labels a C3D file or an export of Motive",
+    )
     parser.add_argument("--name", required=True, metavar="NAME", help="of the target")
-    parser.add_argument("--balls", type=int, required=True, metavar="N", help="number of its balls")
+    parser.add_argument("--balls", type=int, metavar="N", help="number of its balls")
+    parser.add_argument(
+        "--labels",
+        type=labels_in,
+        default=(),
+        metavar="LABEL,...",
+        help="measure it by these trajectories of a file with labels, in which there may be others",
+    )
 
     parser = command("fit", fit, "Estimate the joints between targets from their motion; writes chain.yaml and a URDF.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording in which every joint moves")
