@@ -7,6 +7,7 @@ the documentation.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import sys
 from collections import Counter
@@ -217,8 +218,14 @@ def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     """The nodes of a graph, and all that it could have: live, with a bag, and with all optional nodes."""
     examples = {each.name: options[each.name] or each.example for each in OPTIONS.values() if each.example is not None}
     more: Options = {**options, **examples}
-    variants = [options] + [{**more, "bag": bag} for bag in ("", options["bag"] or "bag")]
-    return tuple({spec.name: spec for variant in reversed(variants) for spec in nodes_for(variant)}.values())
+    # an option may replace nodes, too: so each is left out once
+    fewer = [{**more, "bag": "", name: OPTIONS[name].default} for name in examples]
+    variants = [{**more, "bag": bag} for bag in (options["bag"] or "bag", "")]
+    found = {spec.name: spec for variant in variants for spec in nodes_for(variant)}
+    for variant in fewer:
+        with contextlib.suppress(graph.GraphError):  # another option may need this one
+            found |= {spec.name: spec for spec in nodes_for(variant) if spec.name not in found}
+    return tuple((found | {spec.name: spec for spec in nodes_for(options)}).values())
 
 
 def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, Stage]:

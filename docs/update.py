@@ -41,7 +41,7 @@ GROUPS = {
     "Angles and commands": ("joint_angles", "robot_commands"),
     "The filtered person": ("skeleton_filter",),
     "Sensors": ("kinect_skeleton", "skeleton_adapter", "imu_skeleton"),
-    "Infrared markers": ("marker_detector", "marker_triangulation", "rigid_body_tracker"),
+    "Infrared markers": ("marker_points", "marker_detector", "marker_triangulation", "rigid_body_tracker"),
     "Calibration and fusion": ("calibration", "fusion"),
     "Recordings": ("bag_player", "bag_recorder"),
     "Views": ("body_markers", "viewer"),

@@ -22,17 +22,38 @@ from body_tracking.pipeline.system import (
     transport,
 )
 
+FOREIGN_TYPES = ("PointCloud2", "MarkerArray")
+"""Types of another system's points."""
 _STAGES = "body_tracking.markers.stages"
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
+    foreign = _foreign(options) if options["marker_points"] else None
     if options["marker_setup"]:
-        given = {"setup": options["marker_setup"], **transport(options)}
-        if setup.POINTS not in _played_topics(options):
+        sent = transport(options)
+        given = {"setup": options["marker_setup"], **sent}
+        if foreign is not None:
+            topic, message = foreign
+            yield NodeSpec("marker_points", "marker_points", parameters={"topic": topic, "message": message, **sent})
+        elif setup.POINTS not in _played_topics(options):
             yield NodeSpec("marker_detector", "marker_detector", parameters=given)
             yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
         yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
         yield NodeSpec("marker_joint_angles", "marker_joint_angles", parameters=given)
+
+
+def _foreign(options: Options) -> tuple[str, str]:
+    """Topic and type of another system's points.
+
+    Raises:
+        GraphError: no setup, or an unknown type.
+    """
+    topic, _, message = str(options["marker_points"]).partition(":")
+    if not options["marker_setup"]:
+        raise graph.GraphError("marker points: the targets are missing; give a marker setup, too")
+    if message not in ("", *FOREIGN_TYPES):
+        raise graph.GraphError(f"marker points: {message!r}, expected one of {', '.join(FOREIGN_TYPES)}")
+    return topic, message or FOREIGN_TYPES[0]
 
 
 def _played_topics(options: Options) -> tuple[str, ...]:
@@ -43,6 +64,11 @@ def _played_topics(options: Options) -> tuple[str, ...]:
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     if not options["marker_setup"]:
         return ()
+    if options["marker_points"]:
+        topic = f"/{_foreign(options)[0].lstrip('/')}"
+        if topic not in topics:
+            raise graph.GraphError(f"no topic {topic}")
+        return (topic,)
     sources = setup.sources(Path(str(options["marker_setup"])))
     for source in sources:
         if all(topic in topics for topic in source):
@@ -54,6 +80,7 @@ SYSTEM = System(
     "markers",
     order=1,
     nodes=(
+        NodeType("marker_points", Place.SENSING, "body_tracking.markers.point_topic:PointTopicStage"),
         NodeType("marker_detector", Place.SENSING, f"{_STAGES}:DetectorStage"),
         NodeType("marker_triangulation", Place.SENSING, f"{_STAGES}:TriangulationStage"),
         NodeType("rigid_body_tracker", Place.SENSING, f"{_STAGES}:TrackerStage"),
@@ -70,6 +97,14 @@ SYSTEM = System(
             "FOLDER",
             path=True,
             example="setup",
+        ),
+        Option(
+            "marker_points",
+            "",
+            "take the points of another motion capture system from this topic, in place of cameras; TYPE is "
+            f"{' (default) or '.join(FOREIGN_TYPES)}",
+            "TOPIC[:TYPE]",
+            example="/mocap/points",
         ),
     ),
     topics=(
