@@ -260,7 +260,7 @@ def subscribers(specs: Sequence[NodeSpec], parameters: Mapping[str, Mapping[str,
         given = parameters[spec.name]
         if is_player(spec) and isinstance(played := given["topics"], tuple):
             published.update(played)
-        elif is_source(spec):
+        elif is_source(spec) and spec.name not in stages:
             published.add(graph.skeleton_topic(str(given["sensor"])))
     for spec in specs:
         if (takes := NODES[spec.executable].takes) is not None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Final, Generic, TypeVar
 
 Frame = TypeVar("Frame")
 _KEPT: Final = 64
 """Incomplete sets; older ones are given up."""
+_RECENT, _MANY = 30, 10
+"""Sets from which :meth:`FrameSets.problem` judges, and how many of them must lack a camera."""
 
 
 class FrameSets(Generic[Frame]):
@@ -29,9 +32,12 @@ class FrameSets(Generic[Frame]):
         self._open: list[tuple[int, int, dict[str, Frame]]] = []  # stamp, arrival of the first, frames
         self._last_ns: int | None = None
         self.incomplete = self.late = 0
+        self._recent: deque[tuple[str, ...]] = deque(maxlen=_RECENT)  # the cameras that each set lacked
+        self._newest: dict[str, int] = {}
 
     def push(self, camera: str, stamp_ns: int, frame: Frame, now_ns: int) -> list[dict[str, Frame]]:
         """Take a frame; the sets that are complete with it, in the order of their stamps."""
+        self._newest[camera] = stamp_ns
         if self._last_ns is not None and stamp_ns <= self._last_ns + self._tolerance_ns:
             self.late += 1
             return []
@@ -58,14 +64,31 @@ class FrameSets(Generic[Frame]):
             return None
         return min(arrival for _, arrival, _ in self._open) + self._max_wait_ns
 
+    def problem(self) -> str:
+        """Which camera lacks in many of the latest sets, and how far its stamps are off; empty for none."""
+        lacking = Counter(camera for cameras in self._recent for camera in cameras)
+        often = [camera for camera in self._cameras if lacking[camera] >= _MANY]
+        if not often:
+            return ""
+        late = often[-1]  # where each lacks the other, the first is the reference
+        count = f"{late} lacks in {lacking[late]} of {len(self._recent)} sets of images"
+        other = next((camera for camera in self._cameras if camera != late and camera in self._newest), None)
+        if late not in self._newest or other is None:
+            return f"{count}: nothing comes from it"
+        apart = (self._newest[late] - self._newest[other]) / 1e6
+        return f"{count}: its stamps are {abs(apart):.1f} ms {'after' if apart > 0 else 'before'} those of {other}"
+
     def reset(self) -> None:
         """Forget all frames."""
         self._open.clear()
+        self._recent.clear()
+        self._newest.clear()
         self._last_ns = None
 
     def _give(self, count: int) -> list[dict[str, Frame]]:
         given, self._open = self._open[:count], self._open[count:]
         if given:
             self._last_ns = given[-1][0]
+        self._recent.extend(tuple(c for c in self._cameras if c not in frames) for _, _, frames in given)
         self.incomplete += sum(len(frames) < len(self._cameras) for _, _, frames in given)
         return [frames for _, _, frames in given if len(frames) > 1]

@@ -37,7 +37,7 @@ def rig_in(folder: object) -> Rig | None:
         RigFileError: as :func:`load_rig`.
     """
     path = Path(str(folder)).expanduser() / setup.RIG
-    return load_rig(path) if path.is_file() else None
+    return load_rig(path) if folder and path.is_file() else None
 
 
 def save_rig(rig: Rig, path: Path) -> None:

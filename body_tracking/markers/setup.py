@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -78,8 +79,13 @@ def pose_topic(target: str) -> str:
     return f"/markers/{target}/pose"
 
 
-def sources(folder: Path) -> tuple[tuple[str, ...], ...]:
-    """The topics from which everything else follows: of images, or of balls, or of points.
+def sources(cameras: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    """The topics from which everything else follows: of images, or of balls, or of points."""
+    return tuple(map(image_topic, cameras)), tuple(map(balls_topic, cameras)), (POINTS,)
+
+
+def sources_in(folder: Path) -> tuple[tuple[str, ...], ...]:
+    """:func:`sources` of a setup.
 
     Without a rig, only those of points, which another motion capture system measured then.
 
@@ -88,5 +94,4 @@ def sources(folder: Path) -> tuple[tuple[str, ...], ...]:
     """
     if not (folder.expanduser() / RIG).is_file():
         return ((POINTS,),)
-    cameras = camera_names(folder)
-    return tuple(map(image_topic, cameras)), tuple(map(balls_topic, cameras)), (POINTS,)
+    return sources(camera_names(folder))

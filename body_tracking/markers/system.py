@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from body_tracking.core.message_types import POINT_CLOUD, TF
-from body_tracking.core.qos import LATCHED, RELIABLE
+from body_tracking.core.message_types import IMAGE, POINT_CLOUD, TF
+from body_tracking.core.qos import LATCHED, RELIABLE, Qos
 from body_tracking.markers import setup
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
@@ -36,6 +36,12 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
             topic, message = foreign
             yield NodeSpec("marker_points", "marker_points", parameters={"topic": topic, "message": message, **sent})
         elif setup.POINTS not in _played_topics(options):
+            if options["marker_images"] and not options["bag"]:
+                yield NodeSpec(
+                    "marker_cameras",
+                    "marker_cameras",
+                    parameters={"setup": options["marker_setup"], "images": options["marker_images"]},
+                )
             yield NodeSpec("marker_detector", "marker_detector", parameters=given)
             yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
         yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
@@ -69,7 +75,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
         if topic not in topics:
             raise graph.GraphError(f"no topic {topic}")
         return (topic,)
-    sources = setup.sources(Path(str(options["marker_setup"])))
+    sources = setup.sources_in(Path(str(options["marker_setup"])))
     for source in sources:
         if all(topic in topics for topic in source):
             return source
@@ -80,6 +86,7 @@ SYSTEM = System(
     "markers",
     order=1,
     nodes=(
+        NodeType("marker_cameras", Place.SOURCE, "body_tracking.markers.camera_images:CameraImagesStage"),
         NodeType("marker_points", Place.SENSING, "body_tracking.markers.point_topic:PointTopicStage"),
         NodeType("marker_detector", Place.SENSING, f"{_STAGES}:DetectorStage"),
         NodeType("marker_triangulation", Place.SENSING, f"{_STAGES}:TriangulationStage"),
@@ -99,6 +106,14 @@ SYSTEM = System(
             example="setup",
         ),
         Option(
+            "marker_images",
+            "",
+            "take the images from these topics of drivers, one per camera, in place of /<camera>/image_raw; or from "
+            "folder:PATH, a folder of files per camera; or render the simulated arm of config/marker_setup",
+            "TOPIC,TOPIC",
+            example="render",
+        ),
+        Option(
             "marker_points",
             "",
             "take the points of another motion capture system from this topic, in place of cameras; TYPE is "
@@ -108,6 +123,20 @@ SYSTEM = System(
         ),
     ),
     topics=(
+        TopicSpec(
+            setup.image_topic("<camera>"),
+            IMAGE,
+            Qos(reliability="reliable", depth=10),
+            "marker_cameras",
+            "sets of images with equal stamps, `mono8` or `mono16`; or of a driver",
+        ),
+        TopicSpec(
+            setup.info_topic("<camera>"),
+            "sensor_msgs/msg/CameraInfo",
+            LATCHED,
+            "marker_cameras",
+            "the calibration of the camera, from the setup",
+        ),
         TopicSpec(
             setup.balls_topic("<camera>"),
             POINT_CLOUD,

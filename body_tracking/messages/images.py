@@ -15,6 +15,30 @@ MAX_PIXELS: Final = 1 << 26
 """An image with more is malformed."""
 
 
+_COLOURS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
+"""Channels of colour encodings."""
+
+
+def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
+    """Stamp in nanoseconds, (height, width) brightness, and whether the image was in colour.
+
+    Of a colour image the mean of the channels: an infrared camera that states one has three equal ones.
+
+    Raises:
+        MessageError: another encoding, sizes that contradict each other.
+    """
+    channels = _COLOURS.get(str(message.encoding))
+    if channels is None:
+        stamp_ns, _, pixels = image_to_array(message)
+        return stamp_ns, pixels, False
+    height, width, step, size = int(message.height), int(message.width), int(message.step), len(message.data)
+    if not 0 < height * width <= MAX_PIXELS or step < width * channels or size != step * height:
+        raise MessageError(f"{width} x {height} pixels of {message.encoding}, {step} bytes a row and {size} in all")
+    rows = np.frombuffer(memoryview(message.data), np.uint8).reshape(height, step)[:, : width * channels]
+    total = rows.reshape(height, width, channels)[..., :3].sum(axis=2, dtype=np.uint16)
+    return to_nanoseconds(message.header.stamp), ((total + 1) // 3).astype(np.uint8), True
+
+
 def image_to_array(message: Any) -> tuple[int, str, NDArray[Any]]:
     """Stamp in nanoseconds, frame, and the (height, width) ``uint8`` or ``uint16`` pixels of a ``mono8`` or ``mono16``.
 

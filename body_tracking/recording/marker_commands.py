@@ -31,9 +31,10 @@ from body_tracking.markers.corrections import calibration_effects, shape_effects
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
+from body_tracking.markers.pose import FEWEST
 from body_tracking.markers.rig_storage import rig_in, save_rig
 from body_tracking.markers.stages import AnglesOfTargetsStage, DetectorStage, TrackerStage, TriangulationStage
-from body_tracking.markers.target_calibration import FEWEST, calibrate_target, ordered_views
+from body_tracking.markers.target_calibration import calibrate_target, ordered_views
 from body_tracking.markers.targets_file import load_targets, save_targets
 from body_tracking.markers.trajectories import TrajectoryError, is_trajectory_file, labels_in, read_trajectories
 from body_tracking.pipeline import graph
@@ -71,7 +72,7 @@ def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
     Raises:
         MarkerCommandError: none of them is there.
     """
-    sources = setup.sources(folder)
+    sources = setup.sources_in(folder)
     for topics in sources:
         if all(topic in bag.topics for topic in topics):
             return topics
@@ -246,8 +247,8 @@ def _views(args: argparse.Namespace) -> tuple[FloatArray, FloatArray | None, int
             views = read_trajectories(args.bag).chosen(args.labels)
         except TrajectoryError as error:
             raise MarkerCommandError(f"{args.bag}: {error}") from error
-        seen = np.flatnonzero(np.isfinite(views).all(axis=2).sum(axis=1) >= FEWEST)
-        return views[seen[:: max(1, len(seen) // _VIEWS)]], None, len(views)
+        rows = np.flatnonzero(np.isfinite(views).all(axis=2).sum(axis=1) >= FEWEST)
+        return views[rows[:: max(1, len(rows) // _VIEWS)]], None, len(views)
     if args.balls is None:
         raise MarkerCommandError("balls: their number is needed, or the labels of the target in a C3D file")
     frames = points_of(args.bag, args.setup, args.diameter)

@@ -60,6 +60,7 @@ class StageNode(GraphNode):
         if type(self.stage).save is not Stage.save:
             self.create_timer(_SAVE_S, self.stage.save, clock=STEADY)
         self.publish(self.stage.start(Now(self.now_ns(), self.waiting_ns())))
+        self.poll()  # a stage that needs no message has its first output due
 
     def connect(self) -> None:
         """Make and destroy publishers and subscriptions so that they match the stage's outputs and inputs."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +23,7 @@ from body_tracking.markers.boards import Chessboard, Image
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain_files import save_chain
 from body_tracking.markers.codecs import CameraImage, Info
-from body_tracking.markers.rendering import Sensor, render, render_chessboard
+from body_tracking.markers.rendering import RenderingError, Sensor, render, render_chessboard
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_storage import save_rig
 from body_tracking.markers.targets_file import save_targets
@@ -33,7 +33,7 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter
-from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene
+from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene, stereo_rig
 from body_tracking.simulation.repertoire import MOTIONS
 
 START_NS = 1_750_000_000 * NANOSECONDS
@@ -99,6 +99,36 @@ def images(scene: MarkerScene, index: int, sensor: Sensor, seed: int) -> list[Im
             scene.rig.cameras, scene.rig.rotations, scene.rig.translations, strict=True
         )
     ]
+
+
+class RenderedImages:
+    """The images of the shipped recording's motion, rendered when they are asked for first (0.2 s a pair).
+
+    Args:
+        frames: of the cameras of a rig.
+
+    Raises:
+        RenderingError: they are not those of the scene.
+    """
+
+    unpaired = 0
+
+    def __init__(self, frames: Sequence[str]) -> None:
+        self._scene: MarkerScene | None = None
+        self._made: dict[int, list[Image]] = {}
+        own = [camera.frame_id for camera in stereo_rig().cameras]
+        if list(frames) != own:
+            raise RenderingError(f"the simulated scene has the cameras {', '.join(own)}, not {', '.join(frames)}")
+
+    def __len__(self) -> int:
+        return round(_RATE * _SECONDS)
+
+    def images(self, index: int) -> list[Image]:
+        """The image of each camera."""
+        self._scene = self._scene or shipped_scene()
+        if index not in self._made:
+            self._made[index] = images(self._scene, index, DARK, SEED)
+        return self._made[index]
 
 
 def _angles(stamp_ns: int, frame_id: str, names: tuple[str, ...], angles: FloatArray) -> bytes:

@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 
 from body_tracking.core.message_types import IMAGE, JOINT_STATE
+from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.evaluation.reading import read, true_at
 from body_tracking.markers import setup
+from body_tracking.markers.camera_images import CameraImagesStage
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import CameraImage
 from body_tracking.markers.joint_model import free_directions
 from body_tracking.markers.rig_storage import load_rig
 from body_tracking.markers.targets_file import load_targets
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.pipeline.stage import Now
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, deserialize
+from body_tracking.simulation import marker_bags
 from body_tracking.simulation.marker_bags import DARK, SEED, SHIPPED, START_NS, TRUE_ANGLES, images, shipped_scene
 from body_tracking.simulation.marker_scene import MarkerScene
 
@@ -79,6 +83,20 @@ def test_the_setup_is_the_scenes_within_its_deviations(scene: MarkerScene) -> No
         free = free_directions(joint)
         away = free.T @ joint.difference(other)
         assert (np.abs(away) < 4.0 * np.sqrt(np.diag(free.T @ covariance[own, own] @ free))).all()
+
+
+def test_rendered_cameras_show_the_recordings_motion(scene: MarkerScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(marker_bags, "shipped_scene", lambda: scene)
+    stage = CameraImagesStage(check_all(CameraImagesStage.PARAMETERS, {"setup": str(SETUP), "images": "render"}))
+    list(stage.start(Now(START_NS, 0)))
+    outputs = {output.topic: output.payload for output in stage.poll(0)}
+    with BagReader(BAG) as bag:
+        for camera in CAMERAS:
+            topic = setup.image_topic(camera)
+            raw = next(iter(bag.messages([topic])))
+            stamp_ns, frame_id, pixels = CameraImage().decode(raw.cdr, BAG_WIRE)
+            assert outputs[topic][:2] == (stamp_ns, frame_id)
+            assert np.abs(pixels.astype(int) - outputs[topic][2]).max() <= 1
 
 
 @pytest.mark.slow
