@@ -21,7 +21,13 @@ from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
 
-MARKER_NODES = ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles")
+MARKER_NODES = (
+    "marker_cameras",
+    "marker_detector",
+    "marker_triangulation",
+    "rigid_body_tracker",
+    "marker_joint_angles",
+)
 NEEDED: dict[str, dict[str, object]] = {
     "kinect_skeleton": {"file": BAG},
     "imu_skeleton": {"segments": "[forearm_left]"},

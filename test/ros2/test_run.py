@@ -10,7 +10,13 @@ from tools import Tool, Tools
 from body_tracking import systems
 from draws import some
 
-MARKER_NODES = ("marker_detector", "marker_triangulation", "rigid_body_tracker", "marker_joint_angles")
+MARKER_NODES = (
+    "marker_cameras",
+    "marker_detector",
+    "marker_triangulation",
+    "rigid_body_tracker",
+    "marker_joint_angles",
+)
 LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
 """Nodes that do nothing without a parameter."""
 
