@@ -47,8 +47,9 @@ $(STAMP): setup.py setup.cfg
 	  echo "make: $$python has no venv module; on Debian or Ubuntu: apt install python3-venv" >&2; exit 1; \
 	fi; \
 	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
-	@echo "installing into $(VENV) (the first time it takes a minute or two, and 1.5 GB)"
+	@echo "installing into $(VENV) (the first time it takes two or three minutes, and 1.5 GB)"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,viewer,test,bench]'
+	@$(BIN)/body_tracking compile
 	@touch $@
 
 demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording

@@ -12,6 +12,9 @@ import numba
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+LOOPS: list[Any] = []
+"""All compiled functions of the modules that have been imported."""
+
 
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; its types stay those of the Python function.
@@ -20,6 +23,8 @@ def compiled(function: _Function) -> _Function:
     Where neither can, each process compiles anew.
     """
     try:
-        return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
+        loop = numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # numba's: "no locator available"
-        return cast("_Function", numba.njit(error_model="numpy")(function))
+        loop = numba.njit(error_model="numpy")(function)
+    LOOPS.append(loop)
+    return cast("_Function", loop)

@@ -197,6 +197,7 @@ class System:
         played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
             none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
         options, topics, services, commands, layers, views: that it adds.
+        prepare: ``module:function`` that runs every compiled loop of the system once; empty where it has none.
     """
 
     name: str
@@ -210,6 +211,7 @@ class System:
     commands: tuple[Command, ...] = ()
     layers: tuple[Layer, ...] = ()
     views: tuple[View, ...] = ()
+    prepare: str = ""
 
 
 def sensors_and_transport(options: Options) -> dict[str, Value]:

@@ -30,5 +30,6 @@ SYSTEM = System(
             "body_tracking.ros.doctor.command",
             "why nothing comes: what is wrong with the shell, the graph or a bag, and what to do",
         ),
+        Command("compile", "body_tracking.compilation", "compile the loops over images ahead of the first one"),
     ),
 )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from body_tracking.markers.detection import DetectionSettings, ImageError, detect
+from body_tracking.core.compiled import LOOPS
+from body_tracking.markers.detection import DetectionSettings, ImageError, detect, prepare
 from body_tracking.markers.rendering import Sensor, render
 from body_tracking.simulation.ball_images import (
     CAMERA,
@@ -27,6 +28,14 @@ def rms(errors: np.ndarray) -> float:
 
 def inside(errors: np.ndarray, deviations: np.ndarray) -> float:
     return float((np.abs(errors) < 1.96 * deviations).mean())
+
+
+def test_no_image_after_the_preparation_waits_for_the_compiler() -> None:
+    prepare()
+    before = [len(loop.signatures) for loop in LOOPS]
+    assert any(before)
+    found([overlapping(1, 1.0, 0.02, Sensor(bits=bits)) for bits in (8, 16)])
+    assert [len(loop.signatures) for loop in LOOPS] == before
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,29 @@
+"""``body_tracking compile``: compiles the loops over pixels and candidates, which else happens at the first image."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from body_tracking.pipeline.system import load
+from body_tracking.systems import SYSTEMS
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand ``compile``."""
+    text = (
+        "Compiles the loops over pixels and candidates, and keeps the machine code beside the package or in the user's "
+        "cache folder. A node would do so when it starts, and take half a minute."
+    )
+    subparsers.add_parser("compile", help=text, description=text).set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """The subcommand."""
+    for system in SYSTEMS:
+        if system.prepare:
+            began = time.perf_counter()
+            print(f"{system.name} ...", end=" ", flush=True)
+            load(system.prepare)()
+            print(f"{time.perf_counter() - began:.1f} s", flush=True)
+    return 0
