@@ -8,11 +8,14 @@ frames at rest are columns in the model's axes (SMPL's: x left, y up, z forward)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core import so3
+from body_tracking.core.skeleton import FloatArray, IntArray
+from body_tracking.kinematics.ranges import RANGES, SHOULDER_SWING, SHOULDER_TWIST
 
 SIDES: Final = ("left", "right")
 UPRIGHT: Final[FloatArray] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -58,3 +61,131 @@ def _frame(up: FloatArray, forward: FloatArray) -> FloatArray:
     y = np.cross(z, forward)
     y /= np.linalg.norm(y)
     return np.column_stack([np.cross(y, z), y, z])
+
+
+# Degrees about (y, x, z) of the frame, in this order: flexion, bend to the right, turn to the left. Lower bounds, upper
+# bounds, mean and standard deviation of ordinary postures. The bounds of joints that ranges.py has are its; the spine's
+# are shared between the model's joints, lumbar: spine1 and spine2, thoracic: spine3, the neck's between neck and head.
+# Mean and deviation only matter where nothing is seen: clinical zero, and a third of the range, less where a joint of
+# the model turns about an axis that the anatomical one does not have.
+def _of(kind: str, share: float = 1.0, sign: float = 1.0) -> tuple[float, float]:
+    low, high = (share * bound for bound in RANGES[kind])
+    return (low, high) if sign > 0.0 else (-high, -low)
+
+
+_NONE = (-5.0, 5.0)
+"""An axis about which the joint does not turn: what the model's axes are off by."""
+
+
+def _bounds(name: str) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    side, _, joint = name.rpartition("_")
+    left = 1.0 if side == "left" else -1.0
+    if name in ("spine1", "spine2"):
+        return _of("lumbar_flexion", 0.5), _of("lumbar_lateral", 0.5), _of("lumbar_axial", 0.5)
+    if name == "spine3":
+        return _of("thoracic_flexion"), _of("thoracic_lateral"), _of("thoracic_axial")
+    if name in ("neck", "head"):
+        return _of("neck_flexion", 0.5), _of("neck_lateral", 0.5), (-40.0, 40.0)
+    if joint == "collar":
+        return (-15.0, 15.0), _of("clavicle_elevation", sign=left), _of("clavicle_protraction", sign=-left)
+    if joint == "elbow":
+        return _of("elbow_flexion", sign=-1.0), (-15.0, 15.0), _of("forearm_pronation", sign=-left)
+    if joint == "wrist":
+        return _of("wrist_deviation", sign=-1.0), _of("wrist_flexion", sign=-left), _NONE
+    # AAOS (1965), as in ranges.py, rounded outwards
+    if joint == "hip":
+        return (-125.0, 30.0), ((-30.0, 50.0) if left > 0.0 else (-50.0, 30.0)), (-45.0, 45.0)
+    if joint == "knee":
+        return (-5.0, 140.0), _NONE, _NONE
+    if joint == "ankle":
+        return (-30.0, 50.0), (-20.0, 20.0), (-20.0, 20.0)
+    return (-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)  # fingers, toes, jaw and eyes of SMPL's files stay as they are
+
+
+_POSTURE: Final = {"elbow": (-30.0, 45.0), "hip": (-10.0, 30.0), "knee": (15.0, 30.0)}
+"""Degrees: mean and deviation of the flexion of joints that do not hang straight in ordinary postures."""
+_TO_CENTRE: Final = {
+    side: so3.quat_to_matrix(
+        so3.quat_inverse(so3.exp(0.5 * np.pi * np.cross([0.0, 0.0, -1.0], [np.sqrt(0.5), sign * np.sqrt(0.5), 0.0])))
+    )
+    for side, sign in (("left", 1.0), ("right", -1.0))
+}
+"""To the centre of a shoulder's reach, as in :mod:`body_tracking.kinematics.ranges`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Angles:
+    """Joint angles of one pose.
+
+    Attributes:
+        values: (J, 3) radians about (y, x, z) of the segment's frame, in this order; for a shoulder the rotation vector
+            from the centre of its reach. Zero for the first joint.
+        gradients: (J, 3, 3) by a small rotation of the segment about the axes of its frame.
+    """
+
+    values: FloatArray
+    gradients: FloatArray
+
+
+class Anatomy:
+    """Angles, ranges and ordinary postures of the joints of a body model.
+
+    Args:
+        names: of the joints, SMPL's.
+        parents: (J,).
+        frames: (J, 3, 3) at rest.
+
+    Attributes:
+        low, high: (J, 3) radians: soft limits of :attr:`Angles.values`; infinite for the first joint.
+        mean, stddev: (J, 3) radians: of ordinary postures; infinite deviation for the first joint.
+    """
+
+    def __init__(self, names: Sequence[str], parents: IntArray, frames: FloatArray) -> None:
+        self._frames = frames
+        self._parent_frames = frames[np.maximum(parents, 0)]
+        degrees = np.array([_bounds(name) for name in names])
+        mean = np.zeros((len(names), 3))
+        stddev = (degrees[..., 1] - degrees[..., 0]) / 6.0
+        for number, name in enumerate(names):
+            joint = name.rpartition("_")[2]
+            if joint in _POSTURE:
+                mean[number, 0], stddev[number, 0] = _POSTURE[joint]
+        self._shoulders = np.array([names.index(f"{side}_shoulder") for side in SIDES], dtype=np.intp)
+        reach = np.array([SHOULDER_SWING, SHOULDER_SWING, SHOULDER_TWIST])
+        degrees[self._shoulders] = np.stack([-reach, reach], axis=-1)
+        stddev[self._shoulders] = reach / 3.0
+        self._to_centre = np.array([_TO_CENTRE[side] for side in SIDES])
+        degrees[0] = -np.inf, np.inf
+        stddev[0] = np.inf
+        self.low: FloatArray = np.radians(degrees[..., 0])
+        self.high: FloatArray = np.radians(degrees[..., 1])
+        self.mean: FloatArray = np.radians(mean)
+        self.stddev: FloatArray = np.radians(stddev)
+
+    def angles(self, rotations: FloatArray) -> Angles:
+        """The angles of rotations (J, 3, 3) of each joint relative to its parent."""
+        q = self._parent_frames.mT @ rotations @ self._frames
+        b = -np.arcsin(np.clip(q[:, 1, 2], -1.0, 1.0))
+        c = np.arctan2(q[:, 1, 0], q[:, 1, 1])
+        values = np.stack([np.arctan2(q[:, 0, 2], q[:, 2, 2]), b, c], axis=1)
+        sin, cos = np.sin(c), np.cos(c)
+        # q = Ry(a) Rx(b) Rz(c): rates of the angles by the angular velocity in the turned frame, singular at b = 90 deg
+        secant = 1.0 / np.maximum(np.cos(b), 0.1)
+        gradients = np.zeros((len(q), 3, 3))
+        gradients[:, 0, 0], gradients[:, 0, 1] = sin * secant, cos * secant
+        gradients[:, 1, 0], gradients[:, 1, 1] = cos, -sin
+        gradients[:, 2, 0], gradients[:, 2, 1], gradients[:, 2, 2] = (
+            np.sin(b) * sin * secant,
+            np.sin(b) * cos * secant,
+            1.0,
+        )
+        turned = so3.log(so3.matrix_to_quat(self._to_centre @ q[self._shoulders]))
+        values[self._shoulders] = turned
+        gradients[self._shoulders] = so3.right_jacobian_inverse(turned)
+        values[0], gradients[0] = 0.0, 0.0
+        return Angles(values, gradients)
+
+    def rotations(self, turned: FloatArray) -> FloatArray:
+        """(J, 3, 3) rotations relative to the parents in the model's axes, of such between the segments' frames."""
+        result: FloatArray = self._parent_frames @ turned @ self._frames.mT
+        return result
