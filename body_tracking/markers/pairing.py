@@ -66,7 +66,9 @@ class FrameSets(Generic[Frame]):
 
     def problem(self) -> str:
         """Which camera lacks in many of the latest sets, and how far its stamps are off; empty for none."""
-        lacking = Counter(camera for cameras in self._recent for camera in cameras)
+        # a set of a camera alone says that it is apart, not the others
+        few = [cameras for cameras in self._recent if 2 * len(cameras) <= len(self._cameras)]
+        lacking = Counter(camera for cameras in few for camera in cameras)
         often = [camera for camera in self._cameras if lacking[camera] >= _MANY]
         if not often:
             return ""

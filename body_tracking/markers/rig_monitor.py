@@ -87,7 +87,8 @@ class Finding:
         fault: its kind.
         cameras: frames of the camera whose fault it is, or of two between which the images do not decide. Of two
             cameras out of step it is the one that is late.
-        amount: of the turn in radians, or of the delay in seconds.
+        amount: of the turn in radians, or of the delay in seconds; of three or more cameras one may be early by a
+            negative delay.
         deviation: its standard deviation.
     """
 
@@ -98,7 +99,9 @@ class Finding:
 
     def __str__(self) -> str:
         size = (
-            f"{np.degrees(self.amount):.2f} deg" if self.fault is Fault.MOVED_CAMERA else f"{self.amount * 1e3:.1f} ms"
+            f"{np.degrees(self.amount):.2f} deg"
+            if self.fault is Fault.MOVED_CAMERA
+            else f"{abs(self.amount) * 1e3:.1f} ms"
         )
         return f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
 
@@ -131,8 +134,8 @@ class _Explanation:
 
     @property
     def size(self) -> float:
-        """Of a turn its angle, of a delay itself."""
-        return float(np.linalg.norm(self.cause)) if len(self.cause) > 1 else float(self.cause[0])
+        """Of a turn its angle, of a delay its absolute value."""
+        return float(np.linalg.norm(self.cause))
 
     @property
     def significance(self) -> float:
@@ -248,7 +251,8 @@ class RigMonitor:
         rivals = [fit for fit in fits[1:] if fit[0] - cost < 2.0 * settings.ahead]
         if any(rival[1] is not fault for rival in rivals):
             return None  # not sure yet
-        return Finding(fault, (frame, *(rival[2] for rival in rivals)), best.size, best.deviation)
+        amount = best.size if fault is Fault.MOVED_CAMERA else float(best.cause[0])
+        return Finding(fault, (frame, *(rival[2] for rival in rivals)), amount, best.deviation)
 
     def _in_order(self, balls: Sequence[ImageBalls]) -> list[ImageBalls]:
         return sorted(balls, key=lambda image: self._geometry.index[image.camera])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
@@ -19,10 +20,10 @@ from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
 from body_tracking.markers.corrections import calibration_effects, centred
-from body_tracking.markers.detection import DetectionSettings, detect, prepare
+from body_tracking.markers.detection import DetectionSettings, ImageError, detect, prepare
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
-from body_tracking.markers.rig_monitor import RigMonitor
+from body_tracking.markers.rig_monitor import Finding, RigMonitor
 from body_tracking.markers.rig_storage import load_rig, rig_in
 from body_tracking.markers.targets_file import load_targets
 from body_tracking.markers.tracking import TargetTracker
@@ -33,6 +34,10 @@ from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
+_SATURATED: Final = 0.05
+"""Share of an image's pixels beyond which it is called saturated: 15 balls, 1 m away, fill less than 1 % of 640x480."""
+_WATCH_NS: Final = NANOSECONDS // 4
+"""Between two looks for a moved camera: each takes some 15 ms, and a fault is to be named within a second."""
 _LONGEST_NS: Final = NANOSECONDS // 5
 """Between two frames whose difference is a rate."""
 CONVENTION: Final = "markers"
@@ -67,7 +72,10 @@ class DetectorStage(Stage):
         self._settings = DetectionSettings(**fields_of(DetectionSettings, values))
         cameras = names_in(values["cameras"]) or setup.camera_names(Path(str(values["setup"])))
         self._topics = {setup.image_topic(camera): setup.balls_topic(camera) for camera in cameras}
+        rig = rig_in(values["setup"])
+        self._sizes = {} if rig is None else {setup.image_topic(each.frame_id): each for each in rig.cameras}
         self._counters: Counter[str] = Counter()
+        self._problems: dict[str, str] = {}
         prepare()
         self.inputs = tuple(Port(topic, CameraImage(), _IMAGES, perishable=True) for topic in self._topics)
         self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
@@ -79,10 +87,30 @@ class DetectorStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         stamp_ns, frame_id, pixels = payload
-        balls = detect(pixels, stamp_ns=stamp_ns, camera=frame_id, settings=self._settings)
         self._counters["images"] += 1
+        self._check(topic, pixels)
+        balls = detect(pixels, stamp_ns=stamp_ns, camera=frame_id, settings=self._settings)
         self._counters["images without balls"] += not len(balls.pixels)
         yield Output(self._topics[topic], balls, stamp_ns)
+
+    def _check(self, topic: str, pixels: NDArray[Any]) -> None:
+        """Note a saturated image; raise ImageError for one of another size than the calibrated one."""
+        self._problems.pop(topic, None)
+        camera = self._sizes.get(topic)
+        if camera is not None and pixels.shape != (camera.height, camera.width):
+            height, width = pixels.shape
+            text = f"{topic}: {width} x {height} pixels, calibrated were {camera.width} x {camera.height}"
+            self._problems[topic] = text
+            self._counters["images of another size"] += 1
+            raise ImageError(text)
+        share = np.count_nonzero(pixels == np.iinfo(pixels.dtype).max) / pixels.size
+        if share > _SATURATED:
+            self._problems[topic] = f"{topic}: {100 * share:.0f} % of the pixels are saturated"
+            self._counters["saturated images"] += 1
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """A camera whose last image was of another size or saturated is named."""
+        return (1, "; ".join(self._problems.values()), {}) if self._problems else (0, "", {})
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -99,7 +127,14 @@ class TriangulationStage(Stage):
             "diameter", 0.0, "of the balls; 0: the centroid of a ball's image is taken for its centre", "m", 0.0, 0.2
         ),
         Parameter("tolerance", 0.002, "by which the stamps of one set of images may differ", "s", 0.0, 0.1),
-        Parameter("max_wait", 0.03, "how long a set of images waits for a missing one", "s", 0.0, 1.0),
+        Parameter(
+            "max_wait",
+            0.25,
+            "how long a set of images waits for a missing one, unless a later one is complete before",
+            "s",
+            0.0,
+            1.0,
+        ),
         Parameter(
             "tf",
             True,
@@ -114,6 +149,9 @@ class TriangulationStage(Stage):
         self.rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
         self._settings = TriangulationSettings(**fields_of(TriangulationSettings, values))
         self._monitor = RigMonitor(self.rig)
+        self._watched_ns: int | None = None
+        self._finding: Finding | None = None
+        self._counters: Counter[str] = Counter()
         self._diameter = float(str(values["diameter"]))
         frames = [camera.frame_id for camera in self.rig.cameras]
         tolerance, wait = float(str(values["tolerance"])), float(str(values["max_wait"]))
@@ -139,7 +177,11 @@ class TriangulationStage(Stage):
         self.values = values
 
     def take(self, topic: str, payload: ImageBalls, now: Now) -> Iterable[Output]:
-        return self._points(self._sets.push(self._frames[topic], payload.stamp_ns, payload, now.steady_ns))
+        frame = self._frames[topic]
+        if payload.camera != frame:  # the topic says which camera it is
+            self._counters["balls in another frame"] += 1
+            payload = replace(payload, camera=frame)
+        return self._points(self._sets.push(frame, payload.stamp_ns, payload, now.steady_ns))
 
     def poll(self, steady_ns: int) -> Iterable[Output]:
         return self._points(self._sets.poll(steady_ns))
@@ -151,11 +193,12 @@ class TriangulationStage(Stage):
     def reset(self, topic: str) -> None:
         self._sets.reset()
         self._monitor.reset()
+        self._watched_ns = self._finding = None
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera that was moved, or one out of step with the others, is named."""
-        finding = self._monitor.finding()
-        return (0, "", {}) if finding is None else (1, str(finding), {})
+        """A camera that was moved, or one out of step with the others, by its images or by its stamps, is named."""
+        problems = [text for text in (self._sets.problem(), str(self._finding or "")) if text]
+        return (1, "; ".join(problems), {}) if problems else (0, "", {})
 
     def _points(self, sets: Iterable[Mapping[str, ImageBalls]]) -> Iterator[Output]:
         for frames in sets:
@@ -165,11 +208,25 @@ class TriangulationStage(Stage):
                 points = triangulate(self.rig, centred(self.rig, balls, points, self._diameter), self._settings)
             yield Output(setup.POINTS, points, points.stamp_ns)
             # nothing waits for it: after the points are on their way
-            self._monitor.take(balls)
+            self._watch(balls)
+
+    def _watch(self, balls: tuple[ImageBalls, ...]) -> None:
+        """Look for a moved camera and for cameras out of step; a new fault is told in the log at once."""
+        self._monitor.take(balls)
+        stamp_ns = balls[0].stamp_ns
+        if self._watched_ns is None or stamp_ns < self._watched_ns:
+            self._watched_ns = stamp_ns
+        if stamp_ns - self._watched_ns < _WATCH_NS:
+            return
+        self._watched_ns, before, self._finding = stamp_ns, self._finding, self._monitor.finding()
+        if self._finding is not None:
+            self._counters[f"{self._finding.fault.value} found"] += 1
+            if before is None or before.fault is not self._finding.fault:
+                self.events.append(str(self._finding))
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return {"incomplete sets": self._sets.incomplete, "late images": self._sets.late}
+        return {**self._counters, "incomplete sets": self._sets.incomplete, "late images": self._sets.late}
 
 
 class TrackerStage(Stage):

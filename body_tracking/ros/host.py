@@ -174,9 +174,9 @@ class StageNode(GraphNode):
         self.stage.reset(topic)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        found = self.stage.state(self.now_ns())
+        level, text, values = self.stage.state(self.now_ns())
         self.log_events()
-        return found
+        return level, text, {**self.stage.counters, **values}
 
     def close(self) -> None:
         try:
