@@ -37,19 +37,22 @@ _INSTANTS: Final = 7
 """Of the time that the shutter is open."""
 _BLURRED: Final = 4.0
 """Standard deviations of the blur by which discs must be apart not to hide each other."""
-_FAR: Final = 7.0
-"""Standard deviations beyond which the normal distribution function is 0 or 1, within 1e-11."""
+_FAR: Final = 4.0
+"""Standard deviations beyond which the normal distribution function is 0 or 1, within 3e-5."""
 _STRAIGHT: Final = 0.999
 """Correlation of two edges at most."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_ROOT_HALF: Final = math.sqrt(0.5)
+_B1, _B2, _B3, _B4, _B5 = 0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429
 _ROOT_2PI: Final = math.sqrt(2.0 * math.pi)
 
 
 @compiled
-def normal(u: float) -> float:
-    """The normal distribution function."""
-    return 0.5 * math.erfc(-u * _ROOT_HALF)
+def normal(u: float) -> tuple[float, float]:
+    """The normal distribution function, within 1e-7, and the density (Abramowitz and Stegun 1964, 26.2.17)."""
+    density = math.exp(-0.5 * u * u) / _ROOT_2PI
+    t = 1.0 / (1.0 + 0.2316419 * abs(u))
+    tail = density * t * (_B1 + t * (_B2 + t * (_B3 + t * (_B4 + t * _B5))))
+    return 1.0 - tail if u > 0.0 else tail, density
 
 
 @compiled
@@ -59,19 +62,24 @@ def _clear(values: FloatArray) -> None:
 
 
 @compiled
-def _density(u: float) -> float:
-    return math.exp(-0.5 * u * u) / _ROOT_2PI
-
-
-@compiled
-def both(u: float, v: float, correlation: float) -> tuple[float, float, float, float]:
+def both(u: float, share_u: float, density_u: float, v: float, correlation: float) -> tuple[float, float, float, float]:
     """Share of a blurred point that is within two straight edges: the bivariate normal distribution function.
 
     By the integral of Drezner and Wesolowsky (1990) over the angle whose sine is the correlation.
 
+    Args:
+        u: distance within the first edge, in standard deviations of the blur.
+        share_u: :func:`normal` of it, and
+        density_u: its density.
+        v: distance within the second edge.
+        correlation: of the two, the cosine between the edges' normals.
+
     Returns:
         The share, and its derivatives by u, v and the correlation.
     """
+    share_v, density_v = normal(v)
+    if abs(u) > _FAR or abs(v) > _FAR:
+        return share_u * share_v, density_u * share_v, density_v * share_u, 0.0
     correlation = min(max(correlation, -_STRAIGHT), _STRAIGHT)
     angle = math.asin(correlation)
     squares, product = u * u + v * v, 2.0 * u * v
@@ -80,10 +88,10 @@ def both(u: float, v: float, correlation: float) -> tuple[float, float, float, f
         sine = math.sin(0.5 * (1.0 + _NODES[k]) * angle)
         total += _WEIGHTS[k] * math.exp(-0.5 * (squares - product * sine) / (1.0 - sine * sine))
     cosine = math.sqrt(1.0 - correlation * correlation)
-    by_u = _density(u) * normal((v - correlation * u) / cosine)
-    by_v = _density(v) * normal((u - correlation * v) / cosine)
+    by_u = density_u * normal((v - correlation * u) / cosine)[0]
+    by_v = density_v * normal((u - correlation * v) / cosine)[0]
     by_correlation = math.exp(-0.5 * (squares - product * correlation) / (cosine * cosine)) / (2.0 * math.pi * cosine)
-    return normal(u) * normal(v) + angle / (4.0 * math.pi) * total, by_u, by_v, by_correlation
+    return share_u * share_v + angle / (4.0 * math.pi) * total, by_u, by_v, by_correlation
 
 
 @compiled
@@ -91,10 +99,11 @@ def _by_edge(
     slope: float, disc: int, inside: float, normal_x: float, normal_y: float, edge: float, to: FloatArray
 ) -> None:
     """Add a slope times the derivatives of a disc's distance within its edge, by its parameters and the edge's log."""
-    to[4 * disc] += slope * normal_x / edge
-    to[4 * disc + 1] += slope * normal_y / edge
-    to[4 * disc + 2] += slope / edge
-    to[-1] -= slope * inside
+    by_distance = slope / edge
+    to[4 * disc] += by_distance * normal_x
+    to[4 * disc + 1] += by_distance * normal_y
+    to[4 * disc + 2] += by_distance
+    to[len(to) - 1] -= slope * inside
 
 
 @compiled
@@ -116,30 +125,42 @@ def _by_cosine(
 
 @compiled
 def _overlapping(
-    x: float, y: float, p: FloatArray, order: IntArray, places: FloatArray, own: FloatArray, gradient: FloatArray
+    x: float,
+    y: float,
+    p: FloatArray,
+    edge: float,
+    order: IntArray,
+    places: FloatArray,
+    own: FloatArray,
+    gradient: FloatArray,
 ) -> float:
     """Brightness at a pixel, and its gradient (p,); places (k, 4) and own (p,) are room to work in."""
-    edge, total = math.exp(p[-1]), 0.0
+    total = 0.0
     _clear(gradient)
     for rank in range(len(order)):
         i = order[rank]
         dx, dy = x - p[4 * i], y - p[4 * i + 1]
-        distance = max(math.hypot(dx, dy), 1e-9)
+        distance = max(math.sqrt(dx * dx + dy * dy), 1e-9)
         inside, normal_x, normal_y = (p[4 * i + 2] - distance) / edge, dx / distance, dy / distance
         places[i, 0], places[i, 1], places[i, 2], places[i, 3] = inside, normal_x, normal_y, distance
         if inside < -_FAR:
             continue
-        share = shown = normal(inside)
-        density = _density(inside)
+        share, density = normal(inside)
+        shown = share
         _clear(own)
         _by_edge(density, i, inside, normal_x, normal_y, edge, own)
         for before in range(rank):
             j = order[before]
             other, other_x, other_y = places[j, 0], places[j, 1], places[j, 2]
-            gap = math.hypot(p[4 * i] - p[4 * j], p[4 * i + 1] - p[4 * j + 1]) - p[4 * i + 2] - p[4 * j + 2]
-            if other < -_FAR or gap > _BLURRED * edge:
+            gap_x, gap_y, radii = p[4 * i] - p[4 * j], p[4 * i + 1] - p[4 * j + 1], p[4 * i + 2] + p[4 * j + 2]
+            if other < -_FAR or gap_x * gap_x + gap_y * gap_y > (radii + _BLURRED * edge) ** 2:
                 continue
-            hidden, by_inside, by_other, by_cosine = both(inside, other, normal_x * other_x + normal_y * other_y)
+            if other > _FAR:
+                shown = 0.0
+                break
+            hidden, by_inside, by_other, by_cosine = both(
+                inside, share, density, other, normal_x * other_x + normal_y * other_y
+            )
             left = 1.0 - hidden / share
             if left <= 0.0:
                 shown = 0.0
@@ -163,18 +184,19 @@ def _overlapping(
 
 
 @compiled
-def _cut(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
+def _cut(x: float, y: float, p: FloatArray, edge: float, gradient: FloatArray) -> float:
     """Brightness at a pixel, and its gradient (p,)."""
-    edge, bright = math.exp(p[6]), float(p[3])
+    bright = float(p[3])
     line_x, line_y = math.cos(p[4]), math.sin(p[4])
     dx, dy = x - p[0], y - p[1]
-    distance = max(math.hypot(dx, dy), 1e-9)
+    distance = max(math.sqrt(dx * dx + dy * dy), 1e-9)
     normal_x, normal_y, inside = dx / distance, dy / distance, (p[2] - distance) / edge
     across = (p[5] - dx * line_x - dy * line_y) / edge
     _clear(gradient)
     if inside < -_FAR or across < -_FAR:
         return 0.0
-    shown, by_inside, by_across, by_cosine = both(inside, across, normal_x * line_x + normal_y * line_y)
+    share, density = normal(inside)
+    shown, by_inside, by_across, by_cosine = both(inside, share, density, across, normal_x * line_x + normal_y * line_y)
     _by_edge(bright * by_inside, 0, inside, normal_x, normal_y, edge, gradient)
     _by_cosine(bright * by_cosine, 0, distance, normal_x, normal_y, line_x, line_y, gradient)
     slope = bright * by_across / edge
@@ -188,19 +210,20 @@ def _cut(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
 
 
 @compiled
-def _moving(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
+def _moving(x: float, y: float, p: FloatArray, edge: float, gradient: FloatArray) -> float:
     """Brightness at a pixel, and its gradient (p,)."""
-    edge, total, bright = math.exp(p[6]), 0.0, float(p[3])
+    total, bright = 0.0, float(p[3])
     _clear(gradient)
     for instant in range(_INSTANTS):
         when = instant / (_INSTANTS - 1.0) - 0.5
         dx, dy = x - p[0] - when * p[4], y - p[1] - when * p[5]
-        distance = max(math.hypot(dx, dy), 1e-9)
+        distance = max(math.sqrt(dx * dx + dy * dy), 1e-9)
         inside = (p[2] - distance) / edge
         if inside < -_FAR:
             continue
-        total += normal(inside) / _INSTANTS
-        slope = bright / _INSTANTS * _density(inside)
+        share, density = normal(inside)
+        total += share / _INSTANTS
+        slope = bright / _INSTANTS * density
         _by_edge(slope, 0, inside, dx / distance, dy / distance, edge, gradient)
         gradient[4] += slope * when * dx / (distance * edge)
         gradient[5] += slope * when * dy / (distance * edge)
@@ -210,7 +233,15 @@ def _moving(x: float, y: float, p: FloatArray, gradient: FloatArray) -> float:
 
 @compiled
 def brightness(
-    kind: int, x: float, y: float, p: FloatArray, order: IntArray, work: FloatArray, gradient: FloatArray
+    kind: int,
+    x: float,
+    y: float,
+    p: FloatArray,
+    edge: float,
+    order: IntArray,
+    places: FloatArray,
+    own: FloatArray,
+    gradient: FloatArray,
 ) -> float:
     """Brightness of a model at a pixel, and its gradient.
 
@@ -219,13 +250,15 @@ def brightness(
         x: of the pixel.
         y: of the pixel.
         p: (p,) parameters of the model, the last of which is the log of the edge.
+        edge: standard deviation of the blur, ``exp(p[-1])``.
         order: (k,) discs of an overlapping model, the nearest first.
-        work: (max(4 k, p),) room to work in, two rows of it.
+        places: (k, 4) and
+        own: (p,) room to work in, for an overlapping model.
         gradient: (p,) derivatives by the parameters, which are written here.
     """
     if kind == OVERLAPPING:
-        return _overlapping(x, y, p, order, work[0, : 4 * len(order)].reshape(-1, 4), work[1, : len(p)], gradient)
-    return _cut(x, y, p, gradient) if kind == CUT else _moving(x, y, p, gradient)
+        return _overlapping(x, y, p, edge, order, places, own, gradient)
+    return _cut(x, y, p, edge, gradient) if kind == CUT else _moving(x, y, p, edge, gradient)
 
 
 @compiled
@@ -234,7 +267,6 @@ def _linear(
     p: FloatArray,
     pixels: FloatArray,
     ceiling: float,
-    work: FloatArray,
     information: FloatArray,
     pull: FloatArray,
 ) -> tuple[float, float]:
@@ -247,7 +279,7 @@ def _linear(
             order[rank] = order[rank - 1]
             rank -= 1
         order[rank] = i
-    gradient = np.empty(size)
+    edge, places, own, gradient = math.exp(p[-1]), np.empty((len(order), 4)), np.empty(size), np.empty(size)
     for i in range(size):
         pull[i] = 0.0
         for j in range(size):
@@ -257,7 +289,7 @@ def _linear(
     pull[-1] = prior * (_EXPECTED_EDGE / _EDGE_RANGE)
     squares, plain = prior * prior, 0.0
     for n in range(pixels.shape[1]):
-        made = brightness(kind, pixels[0, n], pixels[1, n], p, order, work, gradient)
+        made = brightness(kind, pixels[0, n], pixels[1, n], p, edge, order, places, own, gradient)
         difference, weight = pixels[2, n] - min(made, ceiling), 1.0 / pixels[3, n]
         plain += difference * difference
         squares += difference * difference * weight
@@ -318,11 +350,11 @@ def fit(
     for i in range(size - 1):
         found[i] = start[i]
     found[-1] = math.log(_EXPECTED_EDGE)
-    work, lower = np.empty((2, size)), np.empty((size, size))
+    lower = np.empty((size, size))
     information, pull = np.empty((size, size)), np.empty(size)
     tried_information, tried_pull = np.empty((size, size)), np.empty(size)
     damping = 1e-3
-    squares, plain = _linear(kind, found, pixels, ceiling, work, information, pull)
+    squares, plain = _linear(kind, found, pixels, ceiling, information, pull)
     for _ in range(_ITERATIONS):
         tried = np.empty(size)
         _solve(information, damping, pull, lower, tried)
@@ -334,7 +366,7 @@ def fit(
                 tried[first + 2] = max(tried[first + 2], _LEAST_RADIUS)
                 tried[first + 3] = min(max(tried[first + 3], _LEAST_BRIGHT), _MOST_BRIGHT)
         tried[-1] = min(max(tried[-1], math.log(_LEAST_EDGE)), math.log(_MOST_EDGE))
-        now, now_plain = _linear(kind, tried, pixels, ceiling, work, tried_information, tried_pull)
+        now, now_plain = _linear(kind, tried, pixels, ceiling, tried_information, tried_pull)
         if now < squares:
             done = squares - now < 1e-3 * max(squares, 1.0)
             found, squares, plain, damping = tried, now, now_plain, max(0.2 * damping, 1e-7)

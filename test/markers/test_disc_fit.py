@@ -24,7 +24,8 @@ MODELS = {
 
 def brightness(kind: int, x: float, y: float, p: np.ndarray) -> tuple[float, np.ndarray]:
     order, gradient = np.argsort(-p[2:-1:4], kind="stable"), np.empty(len(p))
-    return disc_fit.brightness(kind, x, y, p, order, np.empty((2, len(p))), gradient), gradient
+    room = np.empty((len(order), 4)), np.empty(len(p))
+    return disc_fit.brightness(kind, x, y, p, float(np.exp(p[-1])), order, *room, gradient), gradient
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -41,8 +42,9 @@ def test_the_gradient_is_that_of_finite_differences(name: str) -> None:
 def test_the_share_inside_two_edges_is_the_bivariate_normal_distribution() -> None:
     for u, v, correlation in np.random.default_rng(2).uniform([-3.0, -3.0, -0.9], [3.0, 3.0, 0.9], (40, 3)):
         expected = multivariate_normal(cov=[[1.0, correlation], [correlation, 1.0]]).cdf([u, v])
-        assert disc_fit.both(u, v, correlation)[0] == pytest.approx(expected, abs=1e-3)
-        assert disc_fit.normal(u) == pytest.approx(norm.cdf(u), rel=1e-12)
+        share, density = disc_fit.normal(u)
+        assert disc_fit.both(u, share, density, v, correlation)[0] == pytest.approx(expected, abs=1e-3)
+        assert (share, density) == pytest.approx((norm.cdf(u), norm.pdf(u)), abs=1e-7)
 
 
 @pytest.mark.parametrize("name", MODELS)
