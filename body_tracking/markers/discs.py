@@ -47,19 +47,15 @@ class Discs:
     criterion: float
 
 
-def explain(
-    x: FloatArray, y: FloatArray, values: FloatArray, variance: FloatArray, ceiling: float, starts: FloatArray
-) -> Discs:
+def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
     """The balls that explain a region of the image best.
 
     Args:
-        x: (n,) and
-        y: (n,) of its pixels.
-        values: (n,) brightness above the background.
-        variance: (n,) of the values by noise.
+        pixels: (4, n) x, y, brightness above the background, and its variance by noise.
         ceiling: brightness above the background at which the sensor saturates.
         starts: (k, 2) pixels inside the balls where so many are known to be, or their common centroid.
     """
+    x, y, values, variance = pixels
     bright = max(float(np.percentile(values, 95)), 1e-9)
     values, variance, ceiling = values / bright, variance / bright**2 + _MISFIT**2, ceiling / bright
     pixels = np.stack([x, y, values, variance])
