@@ -116,8 +116,6 @@ def detect(
 ) -> ImageBalls:
     """The balls in an image.
 
-    Gaschler (2011): section 3.1.3.
-
     Args:
         image: (h, w) uint8 or uint16.
         stamp_ns: capture time, nanoseconds.

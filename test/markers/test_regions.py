@@ -9,7 +9,7 @@ import pytest
 from body_tracking.markers.regions import Components, histogram, regions_of, shapes_of
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.5, 0.95])
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_the_components_are_those_of_opencv(share: float, kind: type) -> None:
     image = (100 * (np.random.default_rng(1).random((57, 83)) < share)).astype(kind)
