@@ -170,10 +170,15 @@ def detect(
 
 def prepare() -> None:
     """Compile the loops, or load them, before the first image: two discs that overlap need all of them."""
-    image = np.zeros((64, 64), dtype=np.uint8)
+    drawn = np.zeros((64, 64), dtype=np.uint8)
     for place in (28, 36):
-        cv2.circle(image, (place, 32), 6, 200, -1)
-    detect(cv2.GaussianBlur(image, (0, 0), 0.8))
+        cv2.circle(drawn, (place, 32), 6, 200, -1)
+    for kind in (np.uint8, np.uint16):
+        image = cv2.GaussianBlur(drawn, (0, 0), 0.8).astype(kind)
+        detect(image)
+        # an image in the memory of a message is another type to the compiler
+        image.flags.writeable = False
+        detect(image)
 
 
 @dataclass(frozen=True, slots=True)

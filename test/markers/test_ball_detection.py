@@ -34,7 +34,11 @@ def test_no_image_after_the_preparation_waits_for_the_compiler() -> None:
     prepare()
     before = [len(loop.signatures) for loop in LOOPS]
     assert any(before)
-    found([overlapping(1, 1.0, 0.02, Sensor(bits=bits)) for bits in (8, 16)])
+    for bits in (8, 16):
+        image = overlapping(1, 1.0, 0.02, Sensor(bits=bits)).image
+        assert len(detect(image).pixels) == 2
+        image.flags.writeable = False  # as in a message
+        assert len(detect(image).pixels) == 2
     assert [len(loop.signatures) for loop in LOOPS] == before
 
 
