@@ -143,6 +143,7 @@ class MeshFitter:
     Attributes:
         body: of the person.
         anatomy: angles of the body model.
+        ancestors: (J, J) whether a turn of the second joint's segment moves the first joint's.
     """
 
     def __init__(self, body: Body, settings: Settings | None = None) -> None:
@@ -152,9 +153,9 @@ class MeshFitter:
         self.anatomy = Anatomy(model.joint_names, model.parents, model.frames)
         self._starts, self._around = energy.faces_around(model.faces, len(model.vertices))
         joints = len(model.parents)
-        self._ancestors: BoolArray = np.eye(joints, dtype=np.bool_)
+        self.ancestors: BoolArray = np.eye(joints, dtype=np.bool_)
         for joint in range(1, joints):
-            self._ancestors[joint] |= self._ancestors[model.parents[joint]]
+            self.ancestors[joint] |= self.ancestors[model.parents[joint]]
         self._diagonal = np.arange(3 + 3 * joints)
 
     def neutral(self, place: FloatArray, elevation: float = 0.0, flexion: float = 0.0) -> Pose:
@@ -212,12 +213,12 @@ class MeshFitter:
         """
         terms = (prediction, orientations, joints)
         pose, damping = start, self.settings.damping
-        current = self._evaluate(observation, pose, scales[0], *terms)
+        current = self.evaluate(observation, pose, scales[0], *terms)
         for number, scale in enumerate(scales):
             if number and scale != scales[number - 1]:
-                current = self._evaluate(observation, current.fit.pose, scale, *terms)
+                current = self.evaluate(observation, current.fit.pose, scale, *terms)
             step = current.step(damping)
-            trial = self._evaluate(observation, self.moved(current.fit.pose, step), scale, *terms)
+            trial = self.evaluate(observation, self.moved(current.fit.pose, step), scale, *terms)
             if trial.fit.energy < current.fit.energy:
                 current, damping = trial, 0.3 * damping
             else:
@@ -229,15 +230,16 @@ class MeshFitter:
         turns = np.einsum("jab,jb->ja", self.body.model.frames, step[3:].reshape(-1, 3))
         return Pose(pose.rotations @ so3.quat_to_matrix(so3.exp(turns)), pose.translation + step[:3])
 
-    def _evaluate(
+    def evaluate(
         self,
         observation: Observation,
         pose: Pose,
         scale: float,
-        prediction: Prediction | None,
-        orientations: Sequence[Orientation],
-        joints: JointPoints | None,
-    ) -> _Evaluation:
+        prediction: Prediction | None = None,
+        orientations: Sequence[Orientation] = (),
+        joints: JointPoints | None = None,
+    ) -> Evaluation:
+        """The energy at a pose with its derivatives; arguments as of :meth:`fit`, with one robust scale, metres."""
         settings, body, model = self.settings, self.body, self.body.model
         posed = body.posed(pose)
         frames = posed.turned @ model.frames
@@ -304,7 +306,7 @@ class MeshFitter:
             rms=float(np.sqrt((planes[near] ** 2).mean())) if near.any() else float("inf"),
             lost=matched < settings.matched or violations > settings.violations,
         )
-        return _Evaluation(fit, system.gradient)
+        return Evaluation(fit, system.gradient)
 
     def _add_angles(self, system: _System, pose: Pose) -> float:
         """Limits (8) and ordinary postures."""
@@ -335,7 +337,7 @@ class MeshFitter:
         frame = system.frames[orientation.joint]
         off = so3.rotation_vectors(orientation.rotation.T @ frame)
         rows = np.zeros((3, len(system.gradient)))
-        for joint in np.flatnonzero(self._ancestors[orientation.joint]):
+        for joint in np.flatnonzero(self.ancestors[orientation.joint]):
             rows[:, 3 + 3 * joint : 6 + 3 * joint] = frame.T @ system.frames[joint]
         rows = so3.right_jacobian_inverse(off) @ rows
         return system.add_rows(rows, off, orientation.stddev**-2.0)
@@ -343,7 +345,7 @@ class MeshFitter:
     def _add_joints(self, system: _System, posed: PosedBody, joints: JointPoints) -> float:
         """Points of another sensor's skeleton."""
         arms = posed.placed[joints.joints][:, None] - posed.placed[None]
-        arms = np.where(self._ancestors[joints.joints][..., None], arms, 0.0)
+        arms = np.where(self.ancestors[joints.joints][..., None], arms, 0.0)
         offsets = posed.placed[joints.joints] - joints.points
         weights = np.full(len(arms), joints.stddev**-2.0)
         for axis in range(3):
@@ -379,7 +381,14 @@ class _System:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Evaluation:
+class Evaluation:
+    """A pose's fit, not yet improved.
+
+    Attributes:
+        fit: of the pose.
+        gradient: (3 + 3 J,) of its energy by the pose's change.
+    """
+
     fit: Fit
     gradient: FloatArray
 

@@ -9,8 +9,8 @@ import pytest
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
-from body_tracking.core.skeleton import FloatArray
-from body_tracking.mesh import body_model, energy, raster, solver
+from body_tracking.core.skeleton import FloatArray, Joint
+from body_tracking.mesh import body_model, energy, personalisation, raster, solver, uncertainty
 from body_tracking.mesh.body_model import Pose
 from body_tracking.mesh.depth import DepthCamera
 from body_tracking.mesh.energy import Observation
@@ -144,7 +144,7 @@ def test_gradient_of_each_term_is_the_derivative_of_its_energy(fitter: MeshFitte
         points = solver.JointPoints(chosen, fitter.body.posed(some_pose(fitter, rng)).placed[chosen], 0.03)
 
     def evaluated(pose: Pose) -> Any:
-        return fitter._evaluate(nothing(), pose, 0.03, prediction, [orientation] if orientation else [], points)
+        return fitter.evaluate(nothing(), pose, 0.03, prediction, [orientation] if orientation else [], points)
 
     gradient = evaluated(pose).gradient
     expected = [
@@ -265,3 +265,112 @@ def test_moved_is_undone_by_the_opposite_turns(fitter: MeshFitter) -> None:
     back = fitter.moved(fitter.moved(pose, step), -step)
     np.testing.assert_allclose(back.rotations, pose.rotations, atol=1e-12)
     assert so3.rotation_vectors(fitter.moved(pose, step).rotations).shape == (20, 3)
+
+
+# --- uncertainty and shape
+
+
+def shaped(shape: FloatArray) -> MeshFitter:
+    return MeshFitter(body_model.load().body(shape))
+
+
+def test_shape_gradients_are_the_derivative_of_points_and_joints() -> None:
+    rng = np.random.default_rng(10)
+    shape = rng.normal(size=10)
+    fitter = shaped(shape)
+    model, pose = fitter.body.model, some_pose(fitter, rng)
+    posed = fitter.body.posed(pose)
+    corners, shares = model.faces[:40], rng.dirichlet([1.0, 1.0, 1.0], size=40)
+    joints = uncertainty.joint_shape_gradients(model, posed)
+    points = uncertainty.point_shape_gradients(
+        *(corners, shares, model.vertex_shapes, model.joint_shapes, model.bones, model.weights),
+        *(posed.turned, joints),
+    )
+    for component, step in enumerate(1e-4 * np.eye(10)):
+        ends = [model.body(shape + sign * step).posed(pose) for sign in (1.0, -1.0)]
+        np.testing.assert_allclose(joints[..., component], (ends[0].placed - ends[1].placed) / 2e-4, atol=1e-9)
+        moved = (ends[0].vertices - ends[1].vertices)[corners] / 2e-4
+        np.testing.assert_allclose(points[..., component], np.einsum("pc,pca->pa", shares, moved), atol=1e-9)
+
+
+def test_landmarks_are_all_joints_of_the_kinect_in_their_anatomical_order(fitter: MeshFitter) -> None:
+    marks = uncertainty.kinect_landmarks(fitter.body)
+    height = marks.places[:, 1]
+    assert height[Joint.HEAD] > height[Joint.NECK] > height[Joint.SPINE_SHOULDER] > height[Joint.SPINE_MID]
+    assert height[Joint.SPINE_MID] > height[Joint.SPINE_BASE] > height[Joint.KNEE_LEFT] > height[Joint.ANKLE_LEFT]
+    left, right = marks.places[Joint.SHOULDER_LEFT], marks.places[Joint.SHOULDER_RIGHT]
+    assert left[0] > 0.1 > -0.1 > right[0]
+    for chain in ((Joint.WRIST_LEFT, Joint.HAND_LEFT, Joint.HAND_TIP_LEFT),):
+        assert np.all(np.linalg.norm(np.diff(marks.places[list(chain)], axis=0), axis=1) > 0.03)
+
+
+def test_covariance_is_that_of_joints_of_people_of_another_shape(camera: DepthCamera) -> None:
+    """Mean squared error over variance (NEES per degree of freedom) of a body that is not the fitter's."""
+    rng = np.random.default_rng(11)
+    fitter = shaped(np.zeros(10))
+    spread = np.diag(np.full(10, 0.3) ** 2)
+    marks = uncertainty.kinect_landmarks(fitter.body)
+    chosen = [Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT, Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT, Joint.HEAD, Joint.NECK]
+    ratios = []
+    for _ in range(12):
+        other = shaped(0.3 * rng.normal(size=10))
+        truth = some_pose(other, rng)
+        observation = seen(camera, other, truth, rng)
+        fit = fitter.fit(observation, truth)
+        found = uncertainty.placed(fitter, fit, observation, marks, spread)
+        where = uncertainty.kinect_landmarks(other.body)
+        turned, at = other.body.posed(truth).turned[where.bones], other.body.posed(truth).placed[where.bones]
+        true = np.einsum("nab,nb->na", turned, where.places - other.body.joints[where.bones]) + at
+        error = (found.points - true)[chosen]
+        ratios.append(np.einsum("na,nab,nb->n", error, np.linalg.inv(found.covariance[chosen]), error) / 3.0)
+    # these people wear no clothes, whose share of the variance is allowed for
+    assert 0.1 < np.mean(ratios) < 2.0
+
+
+def test_covariance_of_a_hidden_forearm_is_larger_and_that_of_a_known_shape_smaller(
+    fitter: MeshFitter, camera: DepthCamera
+) -> None:
+    rng = np.random.default_rng(12)
+    truth = fitter.neutral(PLACE, 0.8, 0.3)
+    observation = seen(camera, fitter, truth, rng)
+    marks = uncertainty.kinect_landmarks(fitter.body)
+    elbow = fitter.body.posed(truth).placed[fitter.body.model.index("left_elbow")]
+    x = int(CAMERA.project(elbow)[0])
+    depth, mask = observation.depth.copy(), observation.mask.copy()
+    depth[:, x - 3 :], mask[:, x - 3 :] = 1.0, False
+    hidden = energy.observe(camera, depth, mask, 400)
+    stddevs = []
+    for image, spread in ((observation, 0.0), (observation, 0.5), (hidden, 0.0)):
+        fit = fitter.fit(image, truth)
+        covariance = uncertainty.placed(fitter, fit, image, marks, spread**2 * np.eye(10)).covariance
+        np.linalg.cholesky(covariance)
+        stddevs.append(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
+    assert np.all(stddevs[1] > stddevs[0])
+    assert stddevs[2][Joint.WRIST_LEFT] > 2.0 * stddevs[0][Joint.WRIST_LEFT]
+    assert stddevs[2][Joint.WRIST_RIGHT] < 1.3 * stddevs[0][Joint.WRIST_RIGHT]
+
+
+def test_shape_of_a_person_from_three_poses(camera: DepthCamera) -> None:
+    rng = np.random.default_rng(13)
+    person = shaped(rng.normal(size=10))
+    model = person.body.model
+    poses = [person.neutral(PLACE, *arms) for arms in ((0.3, 0.2), (1.5, 0.1), (0.8, 1.0))]
+    observations = [seen(camera, person, pose, rng) for pose in poses]
+    found = personalisation.personalise(model, observations, poses)
+
+    def lengths(joints: FloatArray) -> FloatArray:
+        pairs = [("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee")]
+        ends = [[model.index(f"left_{name}") for name in pair] for pair in pairs]
+        return np.array([np.linalg.norm(joints[b] - joints[a]) for a, b in ends])
+
+    error = lengths(found.body.joints) - lengths(person.body.joints)
+    assert np.abs(error[:2]).max() < 0.015 and abs(error[2]) < 0.03
+    off_by = found.body.shape - person.body.shape
+    assert off_by @ np.linalg.solve(found.covariance, off_by) / len(off_by) < 3.0
+    assert not any(fit.lost for fit in found.fits)
+
+
+def test_personalisation_says_when_nobody_is_there(fitter: MeshFitter) -> None:
+    for images in ([], [nothing()]):
+        with pytest.raises(personalisation.PersonalisationError, match=r"no image|lost in 1 of 1"):
+            personalisation.personalise(fitter.body.model, images, [fitter.neutral(PLACE)] * len(images))
