@@ -40,6 +40,8 @@ START_NS = 1_750_000_000 * NANOSECONDS
 TRUE_ANGLES = graph.true_angles_topic(setup.BODY)
 COLUMNS, ROWS, SQUARE = 9, 6, 0.04
 """Of the chessboard: inner corners, and metres."""
+WAND: Final = (0.0, 0.1, 0.3)
+"""Places of the balls along the wand, metres."""
 SHIPPED: Final = "markers_arm"
 """The recording of images in ``bags/``."""
 DARK: Final = Sensor(background=0.0, read_noise=0.0008)
@@ -175,6 +177,32 @@ def write_boards(rig: Rig, folder: Path, count: int, seed: int) -> None:
             cv2.imwrite(str(folder / name / f"{number:02d}.png"), image)
 
 
+def wand_places(count: int, seed: int) -> FloatArray:
+    """(n, 3, 3) the balls of a wand that is held in ``count`` poses before the rig, metres in its frame."""
+    rng = np.random.default_rng([seed, 450])
+    middle = rng.uniform([0.0, -0.2, 0.9], [0.2, 0.2, 1.5], (count, 3))
+    along = rng.normal(0.0, [1.0, 1.0, 0.5], (count, 3))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return middle[:, None] + (np.array(WAND) - 0.5 * WAND[-1])[:, None] * along[:, None]
+
+
+def write_wand(rig: Rig, output: Path, count: int, seed: int, *, overwrite: bool = False) -> None:
+    """Write a recording of images of a wand, held in ``count`` poses before the rig.
+
+    Raises:
+        BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
+    """
+    with BagWriter(output, overwrite=overwrite, flush_interval_s=float("inf")) as bag:
+        for camera in rig.cameras:
+            bag.add_topic(setup.image_topic(camera.frame_id), IMAGE, RELIABLE)
+        for number, balls in enumerate(wand_places(count, seed)):
+            stamp_ns = START_NS + number * NANOSECONDS // 10
+            for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
+                image = render(camera, rotation, translation, balls, DIAMETER, Sensor(), seed * 1013 + number).image
+                message = CameraImage().encode((stamp_ns, camera.frame_id, image), BAG_WIRE)
+                bag.write(setup.image_topic(camera.frame_id), message, stamp_ns)
+
+
 def shipped_scene() -> MarkerScene:
     """The motion in the shipped recording."""
     return marker_scene(_MOTION, SEED, _RATE, _SECONDS, _START)
@@ -225,6 +253,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--rate", type=float, default=60.0, metavar="HZ", help="images a second (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the person and the noise")
     parser.add_argument("--boards", type=int, default=0, metavar="N", help="also N views of a chessboard, in FOLDER")
+    parser.add_argument("--wand", type=int, default=0, metavar="N", help="also N places of a wand, as FOLDER/wand")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
     parser.set_defaults(run=run)
 
@@ -238,5 +267,8 @@ def run(args: argparse.Namespace) -> int:
     if args.boards:
         write_boards(scene.rig, args.setup / "boards", args.boards, args.seed)
         print(f"boards: {COLUMNS} x {ROWS} inner corners, squares of {SQUARE} m, in {args.setup / 'boards'}")
+    if args.wand:
+        write_wand(scene.rig, args.setup / "wand", args.wand, args.seed, overwrite=args.overwrite)
+        print(f"wand: balls at {', '.join(map(str, WAND))} m, in {args.setup / 'wand'}")
     print(f"{len(scene.times)} pairs of images, balls of {DIAMETER} m; written to {args.output} and {args.setup}")
     return 0

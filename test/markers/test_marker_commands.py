@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from body_tracking.markers.rig_storage import load_rig, save_rig
 from body_tracking.markers.targets import Target
 from body_tracking.markers.targets_file import load_targets, save_targets
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
-from body_tracking.simulation.marker_scene import stereo_rig
+from body_tracking.simulation.marker_bags import WAND as RENDERED_WAND
+from body_tracking.simulation.marker_bags import write_wand
+from body_tracking.simulation.marker_scene import DIAMETER, stereo_rig
 from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation
 
 WAND = (0.0, 0.1, 0.3)
@@ -98,6 +101,21 @@ def test_a_wand_calibrates_three_cameras(waved: Path, tmp_path: Path, capsys: py
     assert cli.main(["markers", *words]) == 0
     out = capsys.readouterr().out
     assert "b: at " in out and " mm (± " in out and " deg (± " in out
+
+
+@pytest.mark.slow
+def test_a_rendered_wand_calibrates_the_rig(tmp_path: Path) -> None:
+    truth = stereo_rig()
+    write_wand(truth, tmp_path / "bag", 30, 0)
+    (tmp_path / "lab").mkdir()
+    unplaced = replace(truth, rotations=np.tile(np.eye(3), (2, 1, 1)), translations=np.zeros((2, 3)))
+    save_rig(unplaced, tmp_path / "lab" / setup.RIG)
+    words = ["wand", str(tmp_path / "bag"), "--setup", str(tmp_path / "lab"), "--diameter", str(DIAMETER)]
+    assert cli.main(["markers", *words, "--places", ",".join(map(str, RENDERED_WAND))]) == 0
+    found = load_rig(tmp_path / "lab" / setup.RIG)
+    # the wand's length is stated to 0.1 mm of 300, which is 0.16 mm of the distance of the cameras
+    np.testing.assert_allclose(found.translations, truth.translations, atol=0.5e-3)
+    np.testing.assert_allclose(found.rotations, truth.rotations, atol=0.5e-3)
 
 
 @pytest.mark.parametrize(
