@@ -17,6 +17,8 @@ from typing import NamedTuple
 
 from common import DATA
 
+from body_tracking.simulation.makehuman import WHEEL_VARIABLE, find_wheel
+
 FOLDER = Path(__file__).resolve().parent
 LEFT_OUT = (2, 77)
 """Exit codes of a benchmark that found that it cannot run here."""
@@ -57,6 +59,7 @@ class Benchmark(NamedTuple):
     options: str = ""
 
 
+MAKEHUMAN = Need(f"MakeHuman's data, `${WHEEL_VARIABLE}`", lambda: find_wheel() is not None)
 PAIRS = recordings("kinect_pairs")
 BENCHMARKS = (
     Benchmark(
@@ -70,6 +73,12 @@ BENCHMARKS = (
         "kinect_vs_vicon",
         "arm angles of a real Kinect, raw and filtered, against Vicon",
         recordings("kinect_vs_vicon"),
+        1,
+    ),
+    Benchmark(
+        "depth_images",
+        "a real depth image beside simulated ones, and the time of the depth input",
+        MAKEHUMAN,
         1,
     ),
     Benchmark("imu_pendulum", "orientations from raw inertial data against Vicon", recordings("imu"), 1),

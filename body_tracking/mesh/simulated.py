@@ -1,0 +1,130 @@
+"""A simulated Kinect v2: the depth that it measures of a scene whose depth is known.
+
+Errors as measured on real frames (``../shared/data/kinect_depth``): axial noise that grows with the distance and at
+grazing angles, steps of 1 mm, missing pixels where little light returns (corners of the image, grazing and dark
+surfaces, outlines), flying pixels between foreground and background, and multipath in the corner above the floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion, maximum_filter
+from scipy.special import ndtr
+
+from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
+from body_tracking.mesh.depth import DepthCamera, axial_noise
+from body_tracking.mesh.person import Floor
+
+
+@dataclass(frozen=True, slots=True)
+class DepthErrors:
+    """How much a simulated depth camera errs.
+
+    Attributes:
+        noise: factor of the axial noise, :func:`~body_tracking.mesh.depth.axial_noise`.
+        grazing: growth of the noise with the slope of a surface: 1 + grazing tan(angle of incidence).
+        dark: factor of the noise on dark cloth.
+        dark_bias: metres by which dark cloth seems farther away.
+        dark_holes: share of dark pixels that are missing.
+        outline_holes: share of pixels within 2 pixels of an outline that are missing.
+        corner_holes: share of pixels that are missing in the corners of the image, where the lamp is weak.
+        lit: distance from the image's centre, in halves of its sides, up to which the lamp is strong enough.
+        flying: share of the pixels beside an outline that lie between foreground and background.
+        jump: metres between neighbours from which on they are on both sides of an outline.
+        multipath: metres by which a surface in the corner above the floor seems farther away.
+        multipath_height: metres above the floor in which that falls to a third.
+        step: metres of the depth's resolution.
+        farthest: metres beyond which nothing is measured.
+    """
+
+    noise: float = 1.0
+    grazing: float = 0.25
+    dark: float = 2.0
+    dark_bias: float = 0.006
+    dark_holes: float = 0.1
+    outline_holes: float = 0.37
+    corner_holes: float = 0.9
+    lit: float = 0.9
+    flying: float = 0.3
+    jump: float = 0.08
+    multipath: float = 0.02
+    multipath_height: float = 0.12
+    step: float = 0.001
+    farthest: float = 8.0
+
+
+def measured(
+    depth: SingleArray,
+    view: DepthCamera,
+    rng: np.random.Generator,
+    errors: DepthErrors | None = None,
+    *,
+    dark: BoolArray | None = None,
+    floor: Floor | None = None,
+) -> NDArray[np.uint16]:
+    """The image that the sensor gives.
+
+    Args:
+        depth: (height, width) true distances along the optical axis, metres; 0 where nothing is.
+        view: the camera.
+        rng: of the errors.
+        errors: how much it errs.
+        dark: (height, width) pixels of dark cloth.
+        floor: of the multipath; none without it.
+
+    Returns:
+        (height, width) millimetres, 0 where missing, as ``16UC1``.
+
+    Raises:
+        DepthError: another size than the camera's.
+    """
+    view.check(depth)
+    own = DepthErrors() if errors is None else errors
+    shape, dark = depth.shape, np.zeros(depth.shape, np.bool_) if dark is None else dark
+    true = depth.astype(np.float64)
+    there = (true > 0.0) & (true < own.farthest)
+    empty = np.where(there, true, own.farthest)
+    near, far = grey_erosion(empty, 3), grey_dilation(empty, 3)
+    # a surface at 80 degrees falls away by 5.7 pixels for each pixel
+    edge = far - near > np.maximum(own.jump, 2.0 * 5.7 / view.camera.matrix[0, 0] * near)
+    slope = np.where(edge, 0.0, _slopes(empty, view))
+    sigma = own.noise * axial_noise(true) * (1.0 + own.grazing * slope) * np.where(dark, own.dark, 1.0)
+    seen = true + own.dark_bias * dark + sigma * rng.standard_normal(shape)
+    if floor is not None:
+        points = np.concatenate([view.rays, np.ones_like(view.rays[..., :1])], axis=-1) * true[..., None]
+        above = np.maximum(points @ floor.up + floor.height, 0.0)
+        # the floor itself is lit by nothing but the lamp; its neighbours are lit by it
+        seen += own.multipath * np.exp(-above / own.multipath_height) * (above > 0.02)
+    flies = edge & there & (rng.random(shape) < own.flying) & (far < own.farthest)
+    seen = np.where(flies, near + rng.random(shape) * (far - near), seen)
+    # holes come in patches of pixels whose light is too weak together
+    patches = gaussian_filter(rng.standard_normal(shape), 1.0)
+    level = ndtr(patches / patches.std())
+    missing = maximum_filter(edge, 3) & (level < own.outline_holes)
+    missing |= dark & (level > 1.0 - own.dark_holes)
+    rows, columns = np.indices(shape)
+    outwards = np.hypot((columns / (shape[1] - 1) - 0.5) * 2.0, (rows / (shape[0] - 1) - 0.5) * 2.0)
+    missing |= level > 1.0 - own.corner_holes * np.clip((outwards - own.lit) / 0.35, 0.0, 1.0)
+    # beyond 85 degrees hardly any light returns
+    missing |= slope > 11.0
+    seen = np.where(there & ~missing, seen, 0.0)
+    return np.round(np.clip(seen / own.step, 0.0, 65535.0)).astype(np.uint16)
+
+
+def _slopes(depth: FloatArray, view: DepthCamera) -> FloatArray:
+    """(height, width) tangent of the angle between a surface's normal and the ray, by the image gradient of ln z.
+
+    With z(x, y) over image coordinates x = X/Z, y = Y/Z the normal is along (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy).
+    """
+    focal = view.camera.matrix[[0, 1], [0, 1]]
+    down, across = np.gradient(np.log(depth))
+    gx, gy = across * focal[0], down * focal[1]
+    x, y = view.rays[..., 0].astype(np.float64), view.rays[..., 1].astype(np.float64)
+    normals = np.stack([-gx, -gy, 1.0 + x * gx + y * gy], axis=-1)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    cosine = np.abs((normals * rays).sum(-1)) / np.linalg.norm(normals, axis=-1) / np.linalg.norm(rays, axis=-1)
+    cosine = np.clip(np.nan_to_num(cosine, nan=1.0), 1e-3, 1.0)
+    return np.asarray(np.sqrt(1.0 - cosine**2) / cosine)
