@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
-from body_tracking.mesh.compiled import compiled
 
 FARTHEST: Final = 12.0
 """Metres; no depth camera that people are tracked with measures farther."""

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
-from body_tracking.mesh.compiled import compiled
 from body_tracking.mesh.depth import DepthCamera
 
 QUARTER: Final = 4

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
-from body_tracking.mesh.compiled import compiled
 from body_tracking.mesh.depth import DepthCamera, DepthError
 
 _CLEARANCE: Final = 0.05
 """Metres by which a person is nearer than the background, or above the floor; 12 standard deviations at 4.8 m."""
-_REVEALED, _ABSORBED = 3, 300
-"""Frames after which a pixel's background is replaced by a farther surface, and by a nearer one that is no person."""
+_REVEALED, _SMALL, _ABSORBED = 3, 30, 300
+"""Frames after which a farther surface becomes a pixel's background, a small one, and what may be a person."""
 _GRAZING: Final = 5.7
 """Largest slope of a surface against the image plane: 80 degrees. Steeper than that are jumps between surfaces."""
 _REACH: Final = 0.25
@@ -31,6 +31,9 @@ _PERSON_AREA: Final = (0.12, 1.6)
 """Square metres that the camera sees of a person: of a child from the side, and of a large man with his arms out."""
 _PERSON_EXTENT: Final = (0.45, 2.3)
 """Metres of the longest side of the box about a person."""
+_ATTACHED: Final = 0.3
+"""Share of a surface's boundary that goes over into known background from which on it is background too: the wall that
+an arm has hidden so far."""
 _LEAST_AREA: Final = 0.0015
 """Square metres of a surface that is more than noise: a part of a hand."""
 _FRAGMENT: Final = 0.15
@@ -116,34 +119,45 @@ class PersonFinder:
         candidates = _candidates(depth, self._view.rays, self._background, up, height, _CLEARANCE)
         if predicted is not None:
             candidates &= near(predicted, depth, self._view.camera, _REACH)
-        mask, kept, people = self._chosen(depth, candidates, predicted is not None, choice)
-        still = _REVEALED, _ABSORBED if predicted is None else 0
-        _learn(self._background, self._other, self._stays, depth, kept, _CLEARANCE, *still)
+        labels, count = _surfaces(depth, candidates, 2.0 * _GRAZING / self._view.camera.matrix[0, 0])
+        areas, boxes, attached = _measure(depth, self._view.rays, labels, count, self._background, _CLEARANCE)
+        free = attached < _ATTACHED
+        chosen = free & (areas > _LEAST_AREA)
+        if predicted is None:
+            chosen, alike, people = _person_among(areas, boxes, chosen, choice)
+        else:
+            people, alike = int(areas[chosen].sum() > _PERSON_AREA[0]), free
+            chosen &= bool(people)
+        mask = _of_surfaces(labels, chosen)
+        frames = np.where(areas < _PERSON_AREA[0], _SMALL, 1)
+        frames = np.where(alike, _ABSORBED if predicted is None else 0, np.where(free, frames, 1))
+        patience = np.concatenate([[_SMALL], frames]).astype(np.int16)
+        _learn(self._background, self._other, self._stays, depth, labels, patience, _CLEARANCE, _REVEALED)
         return Found(mask, people, "" if people else NOBODY)
 
-    def _chosen(
-        self, depth: SingleArray, candidates: BoolArray, tracked: bool, choice: int
-    ) -> tuple[BoolArray, BoolArray, int]:
-        """The person's pixels, those that may be a person's and so are not yet background, and the number of people."""
-        labels, count = _surfaces(depth, candidates, 2.0 * _GRAZING / self._view.camera.matrix[0, 0])
-        areas, boxes = _measure(depth, self._view.rays, labels, count)
-        chosen = areas > _LEAST_AREA
-        if tracked:
-            people = int(areas[chosen].sum() > _PERSON_AREA[0])
-            return _of_surfaces(labels, chosen & bool(people)), candidates, people
-        longest = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0.0)
-        alike = (areas > _PERSON_AREA[0]) & (areas < _PERSON_AREA[1])
-        alike &= (longest > _PERSON_EXTENT[0]) & (longest < _PERSON_EXTENT[1])
-        numbers = np.flatnonzero(alike)
-        if len(numbers):
-            nearest = numbers[np.argsort(boxes[numbers].mean(axis=1)[:, 2])][choice % len(numbers)]
-            low, high = boxes[nearest, 0] - _FRAGMENT, boxes[nearest, 1] + _FRAGMENT
-            chosen &= (boxes[:, 0] > low).all(axis=1) & (boxes[:, 1] < high).all(axis=1) & ~alike
-            chosen[nearest] = True
-            alike |= chosen
-        else:
-            chosen[:] = False
-        return _of_surfaces(labels, chosen), _of_surfaces(labels, alike), len(numbers)
+
+def _person_among(
+    areas: FloatArray, boxes: FloatArray, chosen: BoolArray, choice: int
+) -> tuple[BoolArray, BoolArray, int]:
+    """The surfaces of one person, of all that may be people, and the number of these.
+
+    Args:
+        areas: (S,) square metres of the surfaces.
+        boxes: (S, 2, 3) corners of the boxes about them.
+        chosen: (S,) surfaces that may belong to a person.
+        choice: which person, the nearest first.
+    """
+    longest = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0.0)
+    alike = chosen & (areas > _PERSON_AREA[0]) & (areas < _PERSON_AREA[1])
+    alike &= (longest > _PERSON_EXTENT[0]) & (longest < _PERSON_EXTENT[1])
+    numbers = np.flatnonzero(alike)
+    if not len(numbers):
+        return np.zeros_like(chosen), alike, 0
+    nearest = numbers[np.argsort(boxes[numbers].mean(axis=1)[:, 2])][choice % len(numbers)]
+    low, high = boxes[nearest, 0] - _FRAGMENT, boxes[nearest, 1] + _FRAGMENT
+    own = chosen & ~alike & (boxes[:, 0] > low).all(axis=1) & (boxes[:, 1] < high).all(axis=1)
+    own[nearest] = True
+    return own, alike | own, len(numbers)
 
 
 def of_body_index(
@@ -274,16 +288,15 @@ def _learn(
     other: SingleArray,
     stays: NDArray[np.int16],
     depth: SingleArray,
-    kept: BoolArray,
+    labels: NDArray[np.int32],
+    patience: NDArray[np.int16],
     clearance: float,
     revealed: int,
-    absorbed: int,
 ) -> None:
     """Update the background of each pixel, in place.
 
-    Another surface than the background replaces it after it has stayed for ``revealed`` frames where it is farther, and
-    for ``absorbed`` where it is nearer or may be a person's (``kept``); never for 0. ``other`` is its distance, and
-    ``stays`` counts the frames.
+    Another surface than the background replaces it after it has stayed for ``revealed`` frames where it is farther,
+    else for as many as ``patience`` says of its label; never for 0. ``other`` is its distance, ``stays`` counts frames.
     """
     rows, columns = depth.shape
     for i in range(rows):
@@ -295,7 +308,7 @@ def _learn(
                 background[i, j] = known + (z - known) / 16.0
                 stays[i, j] = 0
                 continue
-            frames = absorbed if known > 0.0 or kept[i, j] else 1
+            frames = patience[labels[i, j]]
             if known > 0.0 and z > known:
                 frames = revealed
             if abs(z - other[i, j]) > clearance or frames == 0:
@@ -370,10 +383,17 @@ def _of_surfaces(labels: NDArray[np.int32], chosen: BoolArray) -> BoolArray:
 
 @compiled
 def _measure(
-    depth: SingleArray, rays: SingleArray, labels: NDArray[np.int32], count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Area in square metres (count,), and the corners (count, 2, 3) of the box about each surface."""
-    areas = np.zeros(count)
+    depth: SingleArray,
+    rays: SingleArray,
+    labels: NDArray[np.int32],
+    count: int,
+    background: SingleArray,
+    clearance: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Area in square metres (count,), the corners (count, 2, 3) of the box about each surface, and what share of its
+    boundary (count,) goes over into known background.
+    """
+    areas, edges, contacts = np.zeros(count), np.zeros(count), np.zeros(count)
     boxes = np.zeros((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     height, width = depth.shape
@@ -392,4 +412,14 @@ def _measure(
             for k in range(3):
                 boxes[label, 0, k] = min(boxes[label, 0, k], point[k])
                 boxes[label, 1, k] = max(boxes[label, 1, k], point[k])
-    return areas, boxes
+            for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                if a < 0 or b < 0 or a >= height or b >= width or labels[a, b] == label + 1:
+                    continue
+                other = depth[a, b]
+                if other <= 0.0:
+                    continue
+                edges[label] += 1.0
+                still = background[a, b] > 0.0 and abs(other - background[a, b]) <= clearance
+                if labels[a, b] == 0 and still and abs(other - z) <= clearance:
+                    contacts[label] += 1.0
+    return areas, boxes, contacts / np.maximum(edges, 1.0)

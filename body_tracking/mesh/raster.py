@@ -8,10 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, SingleArray
-from body_tracking.mesh.compiled import compiled
 
 FaceArray = NDArray[np.int32]
+
+
+_BEYOND = 1.2
+"""Tangent of the angle from the optical axis up to which the distortion's polynomials are used, over the corners'."""
 
 
 class DepthBuffer(NamedTuple):
@@ -30,7 +34,8 @@ def render(vertices: FloatArray, faces: NDArray[np.integer], camera: Camera, sca
     """Render a mesh by a z-buffer, both sides of its faces.
 
     Lens distortion moves the vertices; the edges between them stay straight, which is exact enough for faces of
-    centimetres. A face with a vertex less than 1 cm in front of the camera is left out.
+    centimetres. A face with a vertex less than 1 cm in front of the camera is left out, and with distortion one with a
+    vertex so far outside of the image that the distortion is not known there.
 
     Args:
         vertices: (n, 3) metres in the optical frame.
@@ -39,6 +44,11 @@ def render(vertices: FloatArray, faces: NDArray[np.integer], camera: Camera, sca
         scale: pixels of the camera per pixel of the buffer, whose centres lie in the middle of theirs.
     """
     pixels = (camera.project(vertices) + 0.5) / scale - 0.5
+    if camera.distortion.any():
+        corners = np.array([[-0.5, -0.5], [camera.width, -0.5], [-0.5, camera.height], [camera.width, camera.height]])
+        widest = _BEYOND * np.linalg.norm(camera.undistort(corners), axis=1).max()
+        outside = np.linalg.norm(vertices[:, :2], axis=1) > widest * np.abs(vertices[:, 2])
+        pixels[outside] = np.nan
     shape = camera.height // scale, camera.width // scale
     depth, seen = _fill(pixels, vertices[:, 2].copy(), np.ascontiguousarray(faces, dtype=np.int32), *shape)
     return DepthBuffer(depth, seen)

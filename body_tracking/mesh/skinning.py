@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
-from body_tracking.mesh.compiled import compiled
 
 
 @compiled

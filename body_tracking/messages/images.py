@@ -1,7 +1,8 @@
-"""``sensor_msgs/Image`` of one brightness per pixel."""
+"""``sensor_msgs/Image`` of one brightness or distance per pixel."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from body_tracking.core.message_types import IMAGE
 from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
-_ENCODINGS: Final = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+BRIGHTNESS: Final = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+DEPTH: Final = {"16UC1": "u2", "32FC1": "f4", "mono16": "u2"}
+"""Encodings of distances: millimetres, metres (REP-118), and as some drivers call millimetres."""
 MAX_PIXELS: Final = 1 << 26
 """An image with more is malformed."""
 
@@ -39,16 +42,20 @@ def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
     return to_nanoseconds(message.header.stamp), ((total + 1) // 3).astype(np.uint8), True
 
 
-def image_to_array(message: Any) -> tuple[int, str, NDArray[Any]]:
-    """Stamp in nanoseconds, frame, and the (height, width) ``uint8`` or ``uint16`` pixels of a ``mono8`` or ``mono16``.
+def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> tuple[int, str, NDArray[Any]]:
+    """Stamp in nanoseconds, frame, and the (height, width) pixels.
+
+    Args:
+        message: of ``sensor_msgs/Image``.
+        encodings: those that are allowed, with the kind of number of each.
 
     Raises:
         MessageError: another encoding, as of a colour image; sizes that contradict each other.
     """
     encoding, height, width = str(message.encoding), int(message.height), int(message.width)
-    if encoding not in _ENCODINGS:
-        raise MessageError(f"encoding {encoding!r}, expected one of {', '.join(_ENCODINGS)}")
-    kind = np.dtype(_ENCODINGS[encoding]).newbyteorder(">" if message.is_bigendian else "<")
+    if encoding not in encodings:
+        raise MessageError(f"encoding {encoding!r}, expected one of {', '.join(encodings)}")
+    kind = np.dtype(encodings[encoding]).newbyteorder(">" if message.is_bigendian else "<")
     step, size = int(message.step), len(message.data)
     if not 0 < height * width <= MAX_PIXELS or step < width * kind.itemsize or size != step * height:
         raise MessageError(f"{width} x {height} pixels of {encoding}, {step} bytes a row and {size} in all")
@@ -57,8 +64,8 @@ def image_to_array(message: Any) -> tuple[int, str, NDArray[Any]]:
     return to_nanoseconds(message.header.stamp), str(message.header.frame_id), pixels.astype(kind.newbyteorder("="))
 
 
-def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
-    """The message of (height, width) ``uint8`` or ``uint16`` pixels."""
+def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: MessageTypes, encoding: str = "") -> Any:
+    """The message of (height, width) pixels; ``mono8`` or ``mono16`` without an encoding."""
     height, width = pixels.shape
     rows = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
     return types.make(
@@ -66,7 +73,7 @@ def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: Me
         header=to_header(stamp_ns, frame_id, types),
         height=height,
         width=width,
-        encoding="mono8" if pixels.dtype.itemsize == 1 else "mono16",
+        encoding=encoding or ("mono8" if pixels.dtype.itemsize == 1 else "mono16"),
         is_bigendian=0,
         step=width * pixels.dtype.itemsize,
         data=types.octets(rows.tobytes()),

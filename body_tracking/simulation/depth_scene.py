@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.sensor_poses import SensorPose, level_pose
@@ -19,7 +20,8 @@ from body_tracking.mesh.raster import render
 from body_tracking.mesh.simulated import DepthErrors, measured
 from body_tracking.simulation.clothed import ClothedPerson
 from body_tracking.simulation.makehuman import MakeHuman
-from body_tracking.simulation.repertoire import make_movement
+from body_tracking.simulation.people import Course
+from body_tracking.simulation.repertoire import Movement, make_movement
 
 RATE: Final = 30.0
 """Images a second."""
@@ -74,6 +76,7 @@ class DepthScene:
         standard: without an individual manner.
         table: whether a table stands before the person's left side.
         speed: factor of the motion's speed.
+        still: whether the errors of the room are the same in all images, which makes recordings small.
     """
 
     who: ClothedPerson
@@ -85,63 +88,87 @@ class DepthScene:
     standard: bool = False
     table: bool = False
     speed: float = 1.0
+    still: bool = False
 
     @property
     def pose(self) -> SensorPose:
         """The camera in ``world``: origin on the floor below it."""
         return level_pose(SENSOR, _HEIGHT, _PITCH)
 
+    @property
+    def movement(self) -> Movement:
+        """The person's performance of the motion."""
+        own = None if self.standard else np.random.default_rng([self.seed, self._name, 2])
+        return make_movement(self.motion, self.who.person, own, self.seconds)
+
+    @property
+    def _name(self) -> int:
+        return zlib.crc32(self.motion.encode())
+
+    def course(self, times: FloatArray) -> Course:
+        """The body at (n,) seconds in ``world``: the person faces the camera."""
+        movement = self.movement
+        inside = np.clip(times * self.speed, 0.0, movement.duration)
+        return movement.course(inside).placed(np.array([_DISTANCE, 0.0, 0.0]), np.pi)
+
     def frames(self, start: float = 0.0, stop: float | None = None, step: int = 1) -> Iterator[DepthFrame]:
         """The images from ``start`` to ``stop`` seconds, every ``step``-th; each has its own random generator."""
-        name = zlib.crc32(self.motion.encode())
-        own = None if self.standard else np.random.default_rng([self.seed, name, 2])
-        movement = make_movement(self.motion, self.who.person, own, self.seconds)
-        count = int(min(movement.duration / self.speed, np.inf if stop is None else stop) * RATE)
+        count = int(min(self.movement.duration / self.speed, np.inf if stop is None else stop) * RATE)
         numbers = np.arange(round(start * RATE), count, step)
-        times = numbers / RATE
-        # the person faces the camera
-        course = movement.course(times * self.speed).placed(np.array([_DISTANCE, 0.0, 0.0]), np.pi)
-        view, still, floor = DepthCamera(self.camera), self._room(), self._floor()
-        room = render(*still, self.camera).depth
+        course = self.course(numbers / RATE)
+        view, floor, room = DepthCamera(self.camera), self._floor(), render(*self._room(), self.camera).depth
+        empty = measured(room, view, self._rng(-1), self.errors, floor=floor)
         rotation, translation = self.pose.rotation, self.pose.translation
         for index, number in enumerate(numbers.tolist()):
             vertices, joints, segments = self.who.posed(course, index)
             seen = (vertices - translation) @ rotation
-            own_depth = render(seen, self.who.body.faces, self.camera)
-            person = (own_depth.depth > 0.0) & ((room == 0.0) | (own_depth.depth < room))
-            depth = np.where(person, own_depth.depth, room)
-            corner = self.who.body.faces[np.maximum(own_depth.faces, 0), 0]
+            own = render(seen, self.who.body.faces, self.camera)
+            person = (own.depth > 0.0) & ((room == 0.0) | (own.depth < room))
+            depth = np.where(person, own.depth, room)
+            corner = self.who.body.faces[np.maximum(own.faces, 0), 0]
             dark = person & self.who.body.dark[corner]
-            image = measured(
-                depth, view, np.random.default_rng([self.seed, name, 7, number]), self.errors, dark=dark, floor=floor
-            )
-            yield DepthFrame(
-                float(times[index]),
-                image,
-                depth,
-                person,
-                (joints - translation) @ rotation,
-                rotation.T @ segments,
-                seen,
-            )
+            image = measured(depth, view, self._rng(number), self.errors, dark=dark, floor=floor)
+            if self.still:
+                image = np.where(maximum_filter(person, 5), image, empty)
+            optical = (joints - translation) @ rotation
+            yield DepthFrame(number / RATE, image, depth, person, optical, rotation.T @ segments, seen)
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, self._name, 7, number + 1])
 
     def _floor(self) -> Floor:
         return Floor(self.pose.rotation.T @ [0.0, 0.0, 1.0], _HEIGHT)
 
     def _room(self) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Floor, wall and table, in the optical frame."""
-        floor = [[0.4, 4.0, 0.0], [0.4, -4.0, 0.0], [_WALL, 4.0, 0.0], [_WALL, -4.0, 0.0]]
-        wall = [[_WALL, 4.0, 0.0], [_WALL, -4.0, 0.0], [_WALL, 4.0, 3.5], [_WALL, -4.0, 3.5]]
-        quads = [floor, wall]
+        """Floor, wall and table, in the optical frame, of small faces, as lens distortion bends their edges."""
+        quads = [
+            _quad((0.4, -4.0, 0.0), (_WALL - 0.4, 0.0, 0.0), (0.0, 8.0, 0.0)),
+            _quad((_WALL, -4.0, 0.0), (0.0, 8.0, 0.0), (0.0, 0.0, 3.5)),
+        ]
         if self.table:
             (left, right), (near, far), height = _TABLE
-            quads.append([[x, y, height] for x in (near, far) for y in (left, right)])
-            quads.append([[near, y, z] for z in (height - 0.08, height) for y in (left, right)])
-            quads += [[[near, y + d, z] for z in (0.0, height) for d in (0.0, 0.05)] for y in (left, right - 0.05)]
-        corners = np.array(quads, dtype=float)
-        faces = np.concatenate([np.array([[0, 1, 2], [1, 3, 2]]) + 4 * k for k in range(len(quads))])
-        points = (corners.reshape(-1, 3) - self.pose.translation) @ self.pose.rotation
-        return points, faces.astype(np.int32)
+            wide, thick, leg = right - left, 0.08, 0.05
+            quads.append(_quad((near, left, height), (far - near, 0.0, 0.0), (0.0, wide, 0.0)))
+            quads.append(_quad((near, left, height - thick), (0.0, wide, 0.0), (0.0, 0.0, thick)))
+            quads += [_quad((near, y, 0.0), (0.0, leg, 0.0), (0.0, 0.0, height)) for y in (left, right - leg)]
+        starts = np.cumsum([0, *(len(points) for points, _ in quads[:-1])])
+        faces = [each + start for (_, each), start in zip(quads, starts, strict=True)]
+        points = np.concatenate([points for points, _ in quads])
+        return (points - self.pose.translation) @ self.pose.rotation, np.concatenate(faces).astype(np.int32)
+
+
+def _quad(
+    corner: tuple[float, float, float], one: tuple[float, float, float], other: tuple[float, float, float]
+) -> tuple[FloatArray, NDArray[np.int32]]:
+    """A parallelogram by a corner and two sides, in faces of a decimetre."""
+    a, b = np.array(one), np.array(other)
+    rows, columns = (int(np.ceil(np.linalg.norm(side) / 0.1)) + 1 for side in (a, b))
+    along, across = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns), indexing="ij")
+    points = np.array(corner) + along[..., None] * a + across[..., None] * b
+    number = np.arange(rows * columns).reshape(rows, columns)
+    p, q, r, t = number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    faces = np.concatenate([np.column_stack([p, q, r]), np.column_stack([q, t, r])])
+    return points.reshape(-1, 3), faces.astype(np.int32)
 
 
 def held_out(data: MakeHuman, seed: int) -> ClothedPerson:

@@ -89,6 +89,16 @@ def test_a_tracked_person_who_stands_still_never_becomes_background() -> None:
     assert overlap(found.mask, pixels_of(person, depth, SMALL)) > 0.9
 
 
+def test_the_wall_that_a_person_has_hidden_so_far_is_no_second_person() -> None:
+    finder = PersonFinder(VIEW)
+    finder.find(seen(room(wall=2.9), dummy(-0.6, 2.2)))
+    depth = seen(room(wall=2.9), dummy(0.7, 2.2))
+    found = finder.find(depth)
+    assert found.people == 1 and overlap(found.mask, pixels_of(dummy(0.7, 2.2), depth)) > 0.93
+    predicted = finder.find(depth, dummy(0.7, 2.2)[0])
+    assert overlap(predicted.mask, pixels_of(dummy(0.7, 2.2), depth)) > 0.93
+
+
 def test_an_empty_room_and_a_covered_lens_are_told_apart() -> None:
     finder = PersonFinder(VIEW)
     empty = finder.find(seen(room()))

@@ -55,6 +55,12 @@ def test_what_is_behind_the_camera_or_without_extent_is_left_out() -> None:
     assert not render(np.full((3, 3), np.nan), np.array([[0, 1, 2]]), camera()).depth.any()
 
 
+def test_distortion_beyond_the_image_brings_nothing_back_into_it() -> None:
+    # 80 degrees from the axis, where the polynomial of k1 and k2 has long turned back
+    far = np.array([[10.0, 0.0, 1.5], [11.0, 0.0, 1.5], [10.0, 1.0, 1.5]])
+    assert not render(far, np.array([[0, 1, 2]]), camera(k1=0.09)).depth.any()
+
+
 def test_a_coarse_buffer_is_the_same_view() -> None:
     vertices, faces = plane(np.array([0.2, 0.1, 1.0]), 2.0, size=4.0)
     fine, coarse = render(vertices, faces, camera()).depth, render(vertices, faces, camera(), scale=2).depth

@@ -1,0 +1,32 @@
+"""Topics of the mesh system (names as of depth_image_proc)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from body_tracking.core.qos import Qos
+
+IMAGES: Final = Qos(reliability="reliable", depth=10)
+"""Of images: best effort loses one in fourteen."""
+MESH_SUFFIX: Final = "_mesh"
+"""Of the sensor whose skeletons the tracker publishes."""
+
+
+def depth_topic(sensor: str) -> str:
+    """The depth images of a sensor."""
+    return f"/{sensor}/depth/image_raw"
+
+
+def info_topic(sensor: str) -> str:
+    """The calibration of its depth camera."""
+    return f"/{sensor}/depth/camera_info"
+
+
+def body_index_topic(sensor: str) -> str:
+    """Which body each pixel belongs to, from sensors that tell it."""
+    return f"/{sensor}/body_index/image_raw"
+
+
+def mesh_topic(sensor: str) -> str:
+    """The fitted mesh as a marker."""
+    return f"/{sensor}{MESH_SUFFIX}/mesh"
