@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
-from body_tracking.markers.discs import MOST_DISCS, explain
+from body_tracking.markers.discs import MOST_DISCS, Discs, cut_by_border, explain
 from body_tracking.markers.observations import ImageBalls
 from body_tracking.markers.regions import Components, Regions, Shapes, histogram, regions_of, shapes_of
 from body_tracking.markers.spheres import sphere_centre_correction as sphere_centre_correction
@@ -29,12 +29,12 @@ _ROWS: Final = 4
 _APART: Final = 5.0
 """Pixels between the edges of balls that are near enough to disturb each other's centroids."""
 _TOGETHER: Final = 0.06
-"""Misfit up to which regions that are near to each other are one ball each."""
+"""Misfit up to which regions that are near to each other, or cut by the border, are one ball each."""
 _FIT_FLOOR: Final = 0.004
 """Standard deviation of a fitted centre without noise, pixels."""
 _DISTURBED: Final = 0.05
 """Standard deviation of a centroid by the light of a ball nearby, pixels."""
-_LOST: Final = 3.0
+_LOST: Final = 4.0
 """Pixels of area by which the blur of an edge lowers :attr:`~body_tracking.markers.regions.Shapes.fill` at most."""
 _ELONGATION_NOISE: Final = 4.0
 """Elongation by noise, standard deviations of the centroid in radii of the ball."""
@@ -86,7 +86,11 @@ class DetectionSettings:
         1.12, "ratio of its axes from which a region is taken for more or less than one whole ball", "", 1.0, 10.0
     )
     fill: float = number_field(
-        0.85, "ratio of its area to an ellipse's of its moments, under which it is", "", 0.0, 1.0
+        0.93,
+        "ratio of its area to an ellipse's of its moments, under which it is; of three balls that touch 0.82 to 0.87",
+        "",
+        0.0,
+        1.0,
     )
     misfit: float = number_field(
         0.12, "RMS difference from discs, share of the brightness, over which a region is dropped", "", 0.01, 1.0
@@ -136,7 +140,7 @@ def detect(
     components = Components.of(image, brightness.threshold)
     areas = components.areas
     none = ImageBalls(stamp_ns, camera, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)), len(areas) - 1)
-    keep = components.inside & (areas >= settings.least_area) & (areas <= settings.most_area)
+    keep = (areas >= settings.least_area) & (areas <= settings.most_area)
     keep[0] = False
     kept = np.flatnonzero(keep)
     kept = np.sort(kept[np.argsort(-areas[kept], kind="stable")[: int(settings.most_balls)]])
@@ -146,13 +150,15 @@ def detect(
     saturation = settings.saturation or float(np.iinfo(image.dtype).max)
     regions = regions_of(image, components, kept, background, saturation, settings.full_well)
     shapes = shapes_of(regions, settings.floor)
-    odd = _odd(shapes, settings)
+    odd, cut = _odd(shapes, settings), ~components.inside[kept]
     found: list[_Ball] = []
     dropped = len(areas) - 1 - len(kept)
     for group in _groups(shapes):
         balls = _explained(regions, shapes, group, _TOGETHER) if 1 < len(group) <= MOST_DISCS else []
         for region in group if not balls else []:
-            if odd[region]:
+            if cut[region]:
+                alone = _balls(cut_by_border(*regions.of(np.array([region]))), _TOGETHER)
+            elif odd[region]:
                 alone = _explained(regions, shapes, np.array([region]), settings.misfit)
             else:
                 covariance = shapes.covariance[region]
@@ -232,7 +238,11 @@ def _groups(shapes: Shapes) -> list[IntArray]:
 
 def _explained(regions: Regions, shapes: Shapes, members: IntArray, misfit: float) -> list[_Ball]:
     """Centres, areas and covariances of the balls in regions; none where they are no balls."""
-    discs = explain(*regions.of(members), shapes.pixels[members])
+    return _balls(explain(*regions.of(members), shapes.pixels[members]), misfit)
+
+
+def _balls(discs: Discs, misfit: float) -> list[_Ball]:
+    """Balls of discs; none where they fit worse."""
     if discs.misfit > misfit:
         return []
     areas = np.pi * discs.radii**2

@@ -18,10 +18,15 @@ MOST_DISCS: Final = 4
 """That are fitted together."""
 _MISFIT: Final = 0.01
 """Of the models, share of the brightness: a ball is not equally bright all over."""
+_ROUND: Final = 0.01
+"""Radii by which the centre of a disc that the border cuts is off: there a ball's image is no circle, but an ellipse,
+20 degrees off the axis longer than wide by 7 %."""
 _LEAST_GAP: Final = 0.25
 """Radii between the centres of discs that are two."""
 _CONVINCING: Final = 1.0
 """Weighted sum of squares over the number of pixels of a model that needs no rival."""
+_COMPACT: Final = 1.1
+"""Ratio of the axes up to which a region is as wide as it is long; half overlapping balls have 1.3."""
 _EXPLAINED: Final = 0.06
 """Misfit from which on no more discs are tried."""
 
@@ -55,19 +60,26 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
         ceiling: brightness above the background at which the sensor saturates.
         starts: (k, 2) pixels inside the balls where so many are known to be, or their common centroid.
     """
-    x, y, values, variance = pixels
-    bright = max(float(np.percentile(values, 95)), 1e-9)
-    values, variance, ceiling = values / bright, variance / bright**2 + _MISFIT**2, ceiling / bright
-    pixels = np.stack([x, y, values, variance])
+    pixels, ceiling = _scaled(pixels, ceiling)
+    x, y, values, _ = pixels
     weights = np.clip(values, 0.0, 1.0)
     area = max(float(weights.sum()), 1.0)
     if len(starts) > 1:
         radius = np.sqrt(area / np.pi / len(starts))
         return _several(starts, radius, pixels, ceiling)
     middle, (along, across), lengths, lopsided = _shape(x, y, weights)
-    overlap = [_several(_cluster(x, y, weights, 2, along), np.sqrt(0.75 * area / np.pi), pixels, ceiling)]
-    if overlap[0].squares < _CONVINCING:
-        return overlap[0]
+    overlap: dict[int, Discs] = {}
+
+    def try_discs(count: int) -> Discs:
+        # discs that share a part of their area
+        radius = np.sqrt(1.5 * area / np.pi / count)
+        overlap[count] = _several(_cluster(x, y, weights, count, along), radius, pixels, ceiling)
+        return overlap[count]
+
+    # what is as wide as it is long is three balls rather than two
+    for count in (2,) if lengths[0] > _COMPACT * lengths[1] else (3, 2):
+        if try_discs(count).squares < _CONVINCING:
+            return overlap[count]
     way = np.sqrt(12.0 * (lengths[0] ** 2 - lengths[1] ** 2)) * along
     single = [_single(MOVING, [*middle, 2.0 * lengths[1], 1.0, *way], pixels, ceiling)]
     # the flat side of a disc that is cut is opposite to its tail; where it is small noise decides
@@ -78,13 +90,11 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
         if single[-1].squares < _CONVINCING:
             break
     for count in range(3, MOST_DISCS + 1):
-        if min(discs.misfit for discs in overlap + single) < _EXPLAINED:
+        if min(discs.misfit for discs in (*overlap.values(), *single)) < _EXPLAINED:
             break
-        # discs that share a part of their area
-        overlap.append(
-            _several(_cluster(x, y, weights, count, along), np.sqrt(1.5 * area / np.pi / count), pixels, ceiling)
-        )
-    best = min(overlap + single, key=lambda discs: discs.criterion)
+        if count not in overlap:
+            try_discs(count)
+    best = min((*overlap.values(), *single), key=lambda discs: discs.criterion)
     if best not in single:
         return best
     # what the model may be wrong by: the centres by the others, each by its probability
@@ -92,6 +102,27 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
     apart = np.stack([discs.centres[0] - best.centres[0] for discs in single])
     between = (odds[:, None] * apart).T @ apart / odds.sum()
     return replace(best, covariance=best.covariance + between)
+
+
+def cut_by_border(pixels: FloatArray, ceiling: float) -> Discs:
+    """The ball of a region that the image's border cuts, of which at least half is seen.
+
+    Args:
+        pixels: as of :func:`explain`.
+        ceiling: brightness above the background at which the sensor saturates.
+    """
+    pixels, ceiling = _scaled(pixels, ceiling)
+    lit = pixels[:2, pixels[2] > 0.5]
+    low, high = lit.min(axis=1), lit.max(axis=1)
+    disc = _several(0.5 * (low + high)[None], 0.5 * float((high - low).max()) + 0.5, pixels, ceiling)
+    return replace(disc, covariance=disc.covariance + (_ROUND * disc.radii[:, None, None]) ** 2 * np.eye(2))
+
+
+def _scaled(pixels: FloatArray, ceiling: float) -> tuple[FloatArray, float]:
+    """Pixels and saturation in the brightness of the region, with the variance of what the models are wrong by."""
+    x, y, values, variance = pixels
+    bright = max(float(np.percentile(values, 95)), 1e-9)
+    return np.stack([x, y, values / bright, variance / bright**2 + _MISFIT**2]), ceiling / bright
 
 
 def _shape(x: FloatArray, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -128,7 +159,7 @@ def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: flo
     centres, radii = discs[:, :2], discs[:, 2]
     gaps = np.linalg.norm(centres[:, None] - centres, axis=2)[np.triu_indices(count, 1)]
     low, high = pixels[:2].min(axis=1), pixels[:2].max(axis=1)
-    if not ((centres > low) & (centres < high)).all() or gaps.min() < _LEAST_GAP * radii.max():
+    if not ((centres > low) & (centres < high)).all() or gaps.min(initial=np.inf) < _LEAST_GAP * radii.max():
         return Discs(centres, radii, blocks, np.inf, np.inf, np.inf)
     return Discs(centres, radii, blocks, *quality)
 

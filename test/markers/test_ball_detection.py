@@ -14,6 +14,7 @@ from body_tracking.simulation.ball_images import (
     HERE,
     apart,
     at,
+    cut_by_border,
     found,
     half_hidden,
     overlapping,
@@ -82,9 +83,6 @@ def test_balls_that_nearly_touch_do_not_disturb_each_other() -> None:
     assert rms(errors) < 0.03
 
 
-@pytest.mark.xfail(
-    reason="an open defect: in six scenes of nine, all at 0.8 and 1.8 m, three balls that touch are taken for one"
-)
 def test_three_balls_that_touch_are_three() -> None:
     for seed in range(draws(3, 15)):
         for depth in (0.8, 1.2, 1.8):
@@ -135,10 +133,16 @@ def test_broken_pixels_and_large_lights_are_dropped_and_counted() -> None:
     assert len(balls.pixels) == 5
 
 
-def test_a_ball_that_the_border_cuts_is_dropped() -> None:
-    scene = render(CAMERA, *HERE, at(np.array([[1.0, 200.0]]), np.array([1.0])), DIAMETER, Sensor(), 0)
-    balls = detect(scene.image)
-    assert len(balls.pixels) == 0 and balls.dropped == 1
+def test_a_ball_that_the_border_cuts_is_found_where_half_of_it_is_seen_as_surely_as_is_said() -> None:
+    scenes = [cut_by_border(seed, depth, Sensor()) for seed in range(draws(10, 40)) for depth in (0.6, 1.0, 1.5, 2.5)]
+    errors, deviations, missed, extra = found(scenes)
+    assert extra == 0 and missed <= 0.05 * len(scenes)  # with the centre on the border it may seem beyond
+    assert rms(errors) < 0.1
+    assert inside(errors, deviations) > 0.88
+    for x in (-6.0, -3.0):  # of a ball of 5.8 pixels
+        scene = render(CAMERA, *HERE, at(np.array([[x, 200.0]]), np.array([1.0])), DIAMETER, Sensor(), 0)
+        balls = detect(scene.image)
+        assert len(balls.pixels) == 0 and balls.dropped <= 1
 
 
 @pytest.mark.slow
