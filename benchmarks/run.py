@@ -154,6 +154,7 @@ BENCHMARKS = (
         10,
         "--calibrations 10",
     ),
+    Benchmark("markers_wand", "cameras around a room, placed by a waved wand, and their stated deviations", NOTHING, 1),
     Benchmark("markers_time", "time from a pair of images to joint angles, computed and live", NOTHING, 2),
     Benchmark(
         "markers_reference",
