@@ -29,14 +29,17 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
+from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize, first_field
 from draws import ALL
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from test_up import Up
 
-BAGS = Path(__file__).resolve().parent.parent / "bags"
+ROOT = Path(__file__).resolve().parent.parent
+BAGS = ROOT / "bags"
+MARKERS, SETUP = "markers_arm", ROOT / "config" / "marker_setup"
+"""The recording of image pairs, and what tracks the markers in it."""
 SAME = 1e-4
 """Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
 to the last bit while both have the same number of BLAS threads; with another number sums round differently (4e-5)."""
@@ -146,8 +149,20 @@ def inputs(bag: Path) -> set[str]:
 
 CASES = [
     ("wave", "ekf"),
-    *((bag.name, each) for bag in sorted(BAGS.iterdir()) for each in FILTERS),
+    (MARKERS, ""),
+    *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name != MARKERS for each in FILTERS),
 ]
+
+
+def beginning(bag: Path, excerpt: Path, seconds: float) -> Path:
+    """The first seconds of a bag."""
+    with BagReader(bag) as reader, BagWriter(excerpt) as writer:
+        for topic, info in reader.topics.items():
+            writer.add_topic(topic, info.type_name, info.offered)
+        for raw in reader.messages():
+            if raw.log_time_ns <= reader.start_ns + seconds * NANOSECONDS:
+                writer.write(raw.topic, raw.cdr, raw.log_time_ns, raw.publish_time_ns)
+    return excerpt
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +173,12 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
     def play(name: str, filter_name: str) -> Path:
         folder = tmp_path_factory.mktemp(f"{name}_{filter_name}")
         bag = wave if name == "wave" else BAGS / name
-        arguments = ("--filter", filter_name, "--params-file", parameters(folder))
+        if name == MARKERS:
+            bag, file = beginning(bag, folder / "excerpt", 1.5), folder / "parameters.yaml"
+            file.write_text(yaml.safe_dump({"/**": {SECTION: {"max_wait": 1.0, "deadline": 1.0}}}))
+            arguments: tuple[str | Path, ...] = ("--marker-setup", SETUP, "--params-file", file)
+        else:
+            arguments = ("--filter", filter_name, "--params-file", parameters(folder))
         assert cli.main(["replay", str(bag), "-o", str(folder / "offline"), *map(str, arguments)]) == 0
         said: list[object] = []
         for rate in ("1", "0.5", "0.25"):

@@ -102,7 +102,11 @@ class Downstream:
             self._writer.close()
         else:
             self._writer.discard()
-        counters = {f"filter {name}": count for name, count in self._stages[0].counters.items()}
+        counters = {
+            f"{'filter' if stage.NAME == 'skeleton_filter' else stage.NAME} {name}": count
+            for stage in self._stages
+            for name, count in stage.counters.items()
+        }
         return Written(self._frames, {**counters, **self._runner.counters})
 
     @property

@@ -42,6 +42,7 @@ from body_tracking.systems import (
     nodes_for,
     options_from,
     options_of,
+    played,
     stage_class,
     with_file,
 )
@@ -58,13 +59,16 @@ class ReplaySettings:
     """Parameters of the offline graph; defaults as the nodes'.
 
     Attributes:
-        sensors: the first is the reference unless ``reference`` is set; all of the bag when empty.
+        sensors: the first is the reference unless ``reference`` is set; all of the bag when empty, which may be none
+            with a ``marker_setup``.
         reference: or empty.
         filter_name: one of the filters.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
         filter_input, angles_input: as the parameters ``input`` of ``skeleton_filter`` and ``joint_angles``.
         calibration_file: start from this calibration; None for none.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
+        marker_setup, marker_points: the options of these names: folder of infrared markers, topic of their points.
+        played: topics of the bag that take the place of sensors.
         people: whom to track.
         calibration, fusion, tracking: parameters of the calibration, the fusion and the inertial sensors.
         filter_parameters: parameters of the filter, without its prefix.
@@ -80,6 +84,9 @@ class ReplaySettings:
     angles_input: str = graph.AUTO
     calibration_file: Path | None = None
     imus: tuple[str, ...] = ()
+    marker_setup: str = ""
+    marker_points: str = ""
+    played: tuple[str, ...] = ()
     people: PeopleParameters = field(default_factory=PeopleParameters)
     calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
     fusion: FusionParameters = field(default_factory=FusionParameters)
@@ -91,12 +98,15 @@ class ReplaySettings:
     def options(self) -> Options:
         """Options of the graph."""
         return options_of(
-            sensors=self.sensors or graph.DEFAULT_SENSORS,
+            sensors=self.sensors or (() if self.marker_setup else graph.DEFAULT_SENSORS),
             filter=self.filter_name,
             filter_input=self.filter_input,
             convention=self.convention,
             angles_input=self.angles_input,
             imus=self.imus,
+            marker_setup=self.marker_setup,
+            marker_points=self.marker_points,
+            played=self.played,
             calibration="" if self.calibration_file is None else str(self.calibration_file),
             external=True,
         )
@@ -118,6 +128,8 @@ class ReplaySettings:
             "fusion": {**asdict(self.fusion), **people},
             "imu_skeleton": {**asdict(self.tracking), "subject": self.people.subject},
             "skeleton_filter": {f"{prefix}{name}": each for name, each in self.filter_parameters.items()} | people,
+            # of the time that a live graph has: here it would make the results depend on the machine
+            "rigid_body_tracker": {"deadline": 1.0},
             "joint_angles": {"subject": self.people.subject, "people": self.people.people},
         }
         found = {}
@@ -259,17 +271,22 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         overwrite: replace an existing ``out``.
 
     Raises:
-        ReplayError: no skeletons in the bag.
+        ReplayError: no skeletons in the bag, or no images, balls or points of markers.
         BagError: the bag cannot be read, or ``out`` cannot be written.
         CalibrationError: the calibration file belongs to other sensors.
     """
     began = time.perf_counter()
     counters: Counter[str] = Counter()
     with RigReader(bag_path) as bag:
-        topics = sensor_topics(bag, settings.sensors)
+        without = settings.marker_setup and not (settings.sensors or graph.sensors_among(bag.topics))
+        topics = {} if without else sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
-        kept = (*topics, *truth, *graph.played_imu_topics(settings.imus, bag.topics))
+        try:
+            settings = replace(settings, played=played(settings.options(), bag.topics))
+        except graph.GraphError as error:
+            raise ReplayError(f"{bag_path}: {error}") from error
+        kept = tuple(dict.fromkeys((*topics, *truth, *settings.played)))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         if settings.calibration_file is not None:
             load(settings.calibration_file)  # raises if it is missing or invalid
@@ -286,12 +303,11 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             progress, frames = Progress(bag.start_ns, bag.end_ns), _Frames(topics, counters)
             started = False
             for raw in bag.messages(kept):
-                if raw.topic in topics:
-                    if frames.skeletons(raw) is None:
-                        continue
-                    if not started:
-                        started = True
-                        runner.start(raw.log_time_ns)
+                if raw.topic in topics and frames.skeletons(raw) is None:
+                    continue
+                if not started and raw.topic in (topics or settings.played):
+                    started = True
+                    runner.start(raw.log_time_ns)
                 downstream.take(raw.topic, raw.cdr, raw.log_time_ns)
                 runner.push(raw.topic, raw.cdr, raw.log_time_ns)
                 progress.at(raw.log_time_ns)
@@ -303,9 +319,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         progress.end()
         counters.update(runner.counters)
         if not written.frames:
-            raise ReplayError(
-                f"{bag_path}: no frame of {', '.join(settings.sensors)} came through ({_listed(counters)})"
-            )
+            sources = ", ".join(settings.sensors or settings.played)
+            raise ReplayError(f"{bag_path}: no frame of {sources} came through ({_listed(counters)})")
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters.update(written.counters)
@@ -363,13 +378,13 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     chosen = with_file(options_of(**{**options_from(args), "external": True}), args.params_file)
     specs = [spec for spec in nodes_for(chosen) if spec.name in STAGES]
     given = parameters_of_nodes(specs, args.params_file, absent=all_nodes_for(chosen))
-    left = ("use_sim_time", "sensors", "calibration_file")
+    left = ("use_sim_time", "sensors", "calibration_file", "deadline")
     parameters = {
         node: {name: value for name, value in values.items() if name not in left} for node, values in given.items()
     }
-    whom = given["skeleton_filter"]
+    whom = given.get("skeleton_filter", {})
     people = {name: whom[name] for name in ("subject", "people") if name in whom}
-    for node in ("skeleton_filter", "joint_angles"):
+    for node in parameters.keys() & {"skeleton_filter", "joint_angles"}:
         parameters[node]["body"] = args.body
     if args.reference:
         for values in parameters.values():
@@ -384,6 +399,9 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         options["angles_input"] or graph.AUTO,
         args.calibration,
         options["imus"],
+        options["marker_setup"],
+        options["marker_points"],
+        (),
         PeopleParameters(**people),  # type: ignore[arg-type]
         parameters=parameters,
         model_covariance=args.model_covariance,
@@ -398,15 +416,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "graph, and writes every topic that the graph would publish into a new bag.",
     )
     command.add_argument(
-        "bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics"
+        "bag",
+        type=Path,
+        metavar="BAG",
+        help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics, or with images, balls or points of markers",
     )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
     command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
     names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "params_file")
+    markers = ("marker_setup", "marker_points")
     add_options(
         command,
         *names,
+        *markers,
         "model_covariance",
         filter=f"default: {DEFAULT_FILTER}",
         convention="of the joint angles (default: by the filter)",

@@ -219,9 +219,11 @@ def test_a_c3d_file_becomes_angles_without_cameras(tmp_path: Path) -> None:
         ["markers", "fit", str(bag), "--joint", "knee:hinge:thigh:shank", "--setup", str(lab)],
         ["markers", "check", "--setup", str(lab)],
         ["markers", "angles", str(bag), "-o", str(out), "--setup", str(lab)],
+        ["replay", str(bag), "-o", str(tmp_path / "replayed"), "--marker-setup", str(lab)],
     ):
         assert cli.main(words) == 0, words
-    tracked = read(out).angles
+    tracked, replayed = read(out).angles, read(tmp_path / "replayed").angles
+    np.testing.assert_array_equal(replayed.known, tracked.known)
     assert len(tracked.known) >= 0.98 * len(angles)
     found, rows = tracked.known[:, 0], np.arange(len(angles))[-len(tracked.known) :]
     # the zero and the sense of a hinge are the fit's choice
