@@ -58,10 +58,9 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking show $(DEMO)/recording --truth $(DEMO_BAG) --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
 
-# At half the rate: on two cores, detection does not keep up with 30 pairs a second where balls touch in the images.
 demo-markers: $(STAMP) ## the same with images of infrared markers: from balls to joint angles, beside the truth
 	@rm -rf $(DEMO_MARKERS) && mkdir $(DEMO_MARKERS)
-	$(BIN)/body_tracking up --sensors none --bag $(MARKERS_BAG) --rate 0.5 --marker-setup config/marker_setup --record $(DEMO_MARKERS)/recording --log-dir $(DEMO_MARKERS)/log
+	$(BIN)/body_tracking up --sensors none --bag $(MARKERS_BAG) --marker-setup config/marker_setup --record $(DEMO_MARKERS)/recording --log-dir $(DEMO_MARKERS)/log
 	$(BIN)/body_tracking show $(DEMO_MARKERS)/recording --truth $(MARKERS_BAG) --output $(DEMO_MARKERS)/joint_angles.png
 	@echo "recording: $(DEMO_MARKERS)/recording"
 
