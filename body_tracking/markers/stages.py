@@ -47,6 +47,8 @@ CAMERAS = Parameter(
     "cameras", (), "names of the cameras, whose /<camera>/image_raw the node takes; empty for those of the setup's rig"
 )
 _IMAGES: Final = Qos(reliability="reliable", depth=10)
+_KEPT: Final = 64
+"""Images of a camera that wait with the parameter ``reliable``: two seconds, 20 MB at 640x480."""
 _DETECTION: Final = ("lower", "noise", "least_area", "most_area", "most_balls")
 _TRIANGULATION: Final = ("gate", "nearest", "farthest")
 
@@ -77,7 +79,10 @@ class DetectorStage(Stage):
         self._counters: Counter[str] = Counter()
         self._problems: dict[str, str] = {}
         prepare()
-        self.inputs = tuple(Port(topic, CameraImage(), _IMAGES, perishable=True) for topic in self._topics)
+        waiting = _KEPT if values["reliable"] else 0
+        self.inputs = tuple(
+            Port(topic, CameraImage(), _IMAGES, waiting, perishable=not waiting) for topic in self._topics
+        )
         self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
 
     def change(self, values: Mapping[str, Value]) -> None:
