@@ -1,4 +1,4 @@
-"""The simulated Kinect v2 beside what Schlagenhauf (2017) published of real ones, and the offsets that make it so.
+"""The simulated Kinect v2 beside what Schlagenhauf (2017) published of real ones.
 
 Table E.1: her pipeline (``thesis_pipeline``) over her three motions in her layout 4, her female subject; its output,
 aligned with the truth in time and space as she did (section 5.7.1), and the mean absolute error of ten joints along x
@@ -8,10 +8,7 @@ Table 4.4: one sensor, two motions at four yaws of the person; low-pass at 3 Hz 
 between forearm and upper arm, and of the shoulder's elevation. And the 3D error of the joints, which others report as
 50 to 101 mm.
 
-``--fit`` finds the errors that are constant in the body, a table of joints (``kinect_joints.ANATOMICAL``), that
-makes table E.1 what it is: the offset between the joint centre of a Kinect and that of Plug-in Gait is no chance, but
-the same for everybody. Each step adds to every joint's offset what would bring its errors closest to hers, and
-simulates anew. Everything else has been set from recordings of real pairs; our own filters play no part.
+The parameters have been set from recordings of real pairs and of a Kinect beside Vicon; our own filters play no part.
 """
 
 from __future__ import annotations
@@ -24,16 +21,13 @@ from pathlib import Path
 import common
 import numpy as np
 from common import between
-from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 from thesis_pipeline import LKF2, run_thesis
 
 from body_tracking.calibration.rigid import rigid_registration
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, grid, known
-from body_tracking.evaluation.segments import segment_frames
 from body_tracking.kinect.simulated import KinectErrors, read_errors
-from body_tracking.kinect.simulated_joints import ANATOMICAL
 from body_tracking.simulation.layouts import around, layout
 from body_tracking.simulation.people import Person
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
@@ -91,25 +85,18 @@ class Subject:
     Attributes:
         found: (n, 10, 3) metres, her output, NaN where unknown.
         true: (n, 10, 3) metres.
-        frames: (n, 10, 3, 3) from the frames of the segments (forward, left, up: ``evaluation.segments``) to world.
     """
 
     found: FloatArray
     true: FloatArray
-    frames: FloatArray
 
-    def mae(self, offsets: FloatArray | None = None) -> FloatArray:
-        """(10, 3) mm along the person's right, front and up, with further offsets (10, 3), metres in the segments."""
-        moved = self.found if offsets is None else self.found + np.einsum("njik,jk->nji", self.frames, offsets)
-        both = known(moved) & known(self.true)
-        rotation, translation = rigid_registration(self.true[both], moved[both])
-        apart = (moved @ rotation.T + translation - self.true) @ _AXES.T
+    def mae(self) -> FloatArray:
+        """(10, 3) mm along the person's right, front and up."""
+        both = known(self.found) & known(self.true)
+        rotation, translation = rigid_registration(self.true[both], self.found[both])
+        apart = (self.found @ rotation.T + translation - self.true) @ _AXES.T
         result: FloatArray = 1e3 * np.nanmean(np.abs(apart), axis=0)
         return result
-
-    def thinned(self, step: int) -> Subject:
-        """Every so manieth instant."""
-        return Subject(self.found[::step], self.true[::step], self.frames[::step])
 
 
 def _axes() -> FloatArray:
@@ -133,7 +120,7 @@ def subject(seed: int, errors: KinectErrors) -> Subject:
         found.append(estimate.at(times, 0.2).positions)
         true.append(curve.at(times - delay))
     theirs = np.concatenate(true)
-    return Subject(np.concatenate(found)[:, TEN], theirs[:, TEN], segment_frames(theirs)[:, TEN])
+    return Subject(np.concatenate(found)[:, TEN], theirs[:, TEN])
 
 
 def _in_seconds(skeletons: Sequence[Skeleton], recording: SimulatedRecording) -> tuple[Trajectory, Curve]:
@@ -210,99 +197,14 @@ def table_e1(subjects: Sequence[Subject]) -> FloatArray:
     return np.median([each.mae() for each in subjects], axis=0)
 
 
-_BEFORE: dict[Joint, Joint] = {
-    Joint.SPINE_MID: Joint.SPINE_SHOULDER,
-    Joint.SHOULDER_LEFT: Joint.SPINE_SHOULDER,
-    Joint.ELBOW_LEFT: Joint.SHOULDER_LEFT,
-    Joint.WRIST_LEFT: Joint.ELBOW_LEFT,
-    Joint.HAND_TIP_LEFT: Joint.WRIST_LEFT,
-    Joint.SHOULDER_RIGHT: Joint.SPINE_SHOULDER,
-    Joint.ELBOW_RIGHT: Joint.SHOULDER_RIGHT,
-    Joint.WRIST_RIGHT: Joint.ELBOW_RIGHT,
-    Joint.HAND_TIP_RIGHT: Joint.WRIST_RIGHT,
-}
-_ENDS = [list(E1).index(joint) for joint in _BEFORE]
-_STARTS = [list(E1).index(joint) for joint in _BEFORE.values()]
-_COHERENT = 2.5
-"""Per metre, against a logarithm: what table E.1 leaves open (an error has no sign there) table 4.4 decides: angles
-between segments are off by far less than joints are, so that neighbours are off to the same side."""
-_GUESSES = 10
-
-
-def _residuals(change: FloatArray, subjects: Sequence[Subject], before: FloatArray, goal: FloatArray) -> FloatArray:
-    """What is to be small: logarithms of errors over hers (10, 3), and how far neighbours are off to different sides.
-
-    Args:
-        change: (30,) metres, of the offsets (10, 3) that there were ``before``.
-        subjects: with these.
-        before: see above.
-        goal: (10, 3) logarithms of table E.1.
-    """
-    moved = change.reshape(-1, 3)
-    after = before + moved
-    mae = np.median(np.log([each.mae(moved) for each in subjects]), axis=0)
-    # what all joints have in common the alignment takes out of table E.1: there is none of it
-    bent = np.concatenate([after[_ENDS] - after[_STARTS], after.mean(axis=0, keepdims=True)])
-    return np.concatenate([(mae - goal).ravel(), _COHERENT * bent.ravel()])
-
-
-def fit(errors: KinectErrors, count: int, steps: int) -> FloatArray:
-    """(25, 3) metres: the table of offsets (forward, left, up), from the one there is."""
-    goal = np.log([E1[Joint(joint)] for joint in TEN])
-    rng = np.random.default_rng(0)
-    for step in range(steps):
-        subjects = subjects_of(errors, count)
-        off = table_e1(subjects) / np.exp(goal) - 1.0
-        print(
-            f"step {step}: worst {np.abs(off).max():.0%}, {(np.abs(off) > WITHIN).sum()} of 30 beyond 25 %", flush=True
-        )
-        thinned = [each.thinned(25) for each in subjects]
-        guesses = [np.zeros(3 * len(TEN))]
-        if not ANATOMICAL.any():
-            # whole chains to either side; from where there is something it is only corrected
-            guesses += [np.tile(rng.choice([-0.03, 0.03], 3), len(TEN)) for _ in range(2)]
-            guesses += [(0.03 * rng.choice([-1.0, 1.0], (len(TEN), 3))).ravel() for _ in range(_GUESSES)]
-        best = None
-        for number, guess in enumerate(guesses):
-            found = least_squares(
-                _residuals,
-                guess,
-                args=(thinned, ANATOMICAL[TEN].copy(), goal),
-                diff_step=1e-2,
-                x_scale=0.02,
-                max_nfev=25,
-            )
-            best = found if best is None or found.cost < best.cost else best
-            print(f"\rguess {number + 1} of {len(guesses)}: {best.cost:.3f} ", end="", file=sys.stderr, flush=True)
-        print(file=sys.stderr)
-        assert best is not None
-        ANATOMICAL[TEN] += best.x.reshape(-1, 3)
-        _spread(ANATOMICAL)
-    return ANATOMICAL
-
-
-def _spread(offsets: FloatArray) -> None:
-    """Joints of which she says nothing: hands and thumbs as the way from wrist to tip, neck and head as the spine."""
-    for side in ("LEFT", "RIGHT"):
-        wrist, tip = offsets[Joint[f"WRIST_{side}"]], offsets[Joint[f"HAND_TIP_{side}"]]
-        offsets[Joint[f"HAND_{side}"]] = 0.5 * (wrist + tip)
-        offsets[Joint[f"THUMB_{side}"]] = 0.5 * (wrist + tip)
-    offsets[[Joint.NECK, Joint.HEAD]] = offsets[Joint.SPINE_SHOULDER]
-    offsets[Joint.SPINE_BASE] = 0.5 * offsets[Joint.SPINE_MID]
-
-
 def main() -> int:
     """Print both tables; exit code 1 where table E.1 is off by more than 25 % anywhere."""
     parser = common.parser(__doc__)
     parser.add_argument("--subjects", type=int, default=12, metavar="N", help="simulated subjects (default: 12)")
-    parser.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit the offsets, and print them")
     parser.add_argument("--config", type=Path, metavar="FILE", help="errors as in config/simulator.yaml")
     parser.add_argument("--write", action="store_true", help="write docs/simulator.md, but for its part on real pairs")
     args = parser.parse_args()
     errors = KinectErrors() if args.config is None else read_errors(args.config)
-    if args.fit:
-        for joint, row in zip(Joint, fit(errors, args.subjects, args.fit), strict=True):
-            print(f'    "{joint.name}": ({", ".join(f"{value:.4f}" for value in row)}),')
     mae = table_e1(subjects_of(errors, args.subjects))
     tables = table_4_4(errors, args.subjects)
     common.report(args, {"E.1": mae, "4.4": tables}, lambda: (show_e1(mae), show_4_4(tables)))
@@ -367,8 +269,8 @@ _HEAD = """# How realistic the simulated sensors are
 
 The simulated Kinect v2 (`body_tracking/kinect/simulated_sensor.py`, parameters in `config/simulator.yaml`) was tuned
 before any of our filters was evaluated with it. Noise, drops, flips and pose-dependent errors are tuned to recordings
-of real pairs of sensors, the offsets between a Kinect's joint centres and the anatomical ones to table E.1 of
-Schlagenhauf (2017). Two benchmarks write this page:
+of real pairs of sensors; the offsets of the shoulders and the errors of the arms' directions are those of a real Kinect
+against Vicon, and the offsets of the spine follow table E.1 of Schlagenhauf (2017). Two benchmarks write this page:
 
     python benchmarks/run.py calibrate_simulator --write
     python benchmarks/run.py simulated_pairs --write

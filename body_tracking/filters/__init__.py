@@ -30,6 +30,8 @@ _FILTERS: Final = {
 
 FILTERS: Final = tuple(_FILTERS)
 """The names that :func:`make_filter` knows."""
+THESIS_FILTERS: Final = ("thesis_lkf1", "thesis_lkf2", "schlagenhauf_ekf")
+"""The published methods, which get their measurements as they are."""
 
 
 class SkeletonFilter(Protocol):

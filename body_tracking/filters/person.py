@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from body_tracking.calibration.arm_directions import corrected_arms
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
@@ -14,6 +15,7 @@ from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.filters import (
     DEFAULT_FILTER,
+    THESIS_FILTERS,
     ModelFilter,
     make_filter,
 )
@@ -58,6 +60,8 @@ class FilterSettings:
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: greatest time in seconds that a sensor's frame waits for an older one.
         people: selection of people.
+        kinect_arms: whether the skeletons are of a Kinect v2, whose arms err in their directions by a known law; the
+            thesis's filters do not use it.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -70,6 +74,7 @@ class FilterSettings:
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
     people: PeopleParameters = field(default_factory=PeopleParameters)
+    kinect_arms: bool = True
 
 
 class PersonFilter:
@@ -109,6 +114,7 @@ class PersonFilter:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
             if one_of_several is None:
                 self.people = People(settings.sensors, settings.people, self.alignment.reference)
+        self._corrects_arms = settings.kinect_arms and settings.filter_name not in THESIS_FILTERS
         self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
@@ -184,7 +190,7 @@ class PersonFilter:
             now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
-        skeleton = skeletons[0]
+        skeleton = self._corrected(skeletons[0])
         self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
@@ -212,7 +218,12 @@ class PersonFilter:
             ((_, subject),) = found
         else:
             return None
-        return None if self.alignment is None else self.alignment.push(sensor, subject)
+        aligned = None if self.alignment is None else self.alignment.push(sensor, subject)
+        return None if aligned is None else self._corrected(aligned)
+
+    def _corrected(self, skeleton: Skeleton) -> Skeleton:
+        """With the arms in their anatomical directions."""
+        return corrected_arms(skeleton) if self._corrects_arms else skeleton
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """Take the orientation of one segment, in ``world`` and in the reference's clock.

@@ -65,6 +65,13 @@ ORDER_WAIT = Parameter(
     max=1.0,
     live=True,
 )
+KINECT_ARMS = Parameter(
+    "kinect_arms",
+    True,
+    "correct the directions of the arms by what a Kinect v2 has wrong against Vicon; false for other sensors. The "
+    "thesis's filters never do",
+    live=True,
+)
 ORIENTATIONS = Parameter(
     "orientations",
     (),
@@ -125,6 +132,7 @@ class FilterStage(Stage):
         ORDER_WAIT,
         PREDICT_AFTER,
         ORIENTATIONS,
+        KINECT_ARMS,
         *PEOPLE,
         *filter_table(),
         RELIABLE,
@@ -153,6 +161,7 @@ class FilterStage(Stage):
             given["predict_after"],
             given["order_wait"],
             people_from(values),
+            given["kinect_arms"],
         )
         return filter_of(settings, self._publish, self.wanted)
 

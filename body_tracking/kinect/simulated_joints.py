@@ -12,18 +12,18 @@ from body_tracking.kinematics.motion import EXTREMITY, JOINT_CLASSES, LIMB
 
 _KINDS: Final[dict[str, tuple[Any, ...]]] = {
     # kind of joint: multiples of the white noise and of the slow errors; offset along the ray, mm; anatomical offset, m
-    # forward, left and up in the segment's frame, of the left joint and of the right one
-    "SPINE_BASE": (1.0, 1.2, 32.0, (-0.0308, -0.0071, -0.0298)),
-    "SPINE_MID": (0.8, 0.8, 14.0, (-0.0616, -0.0143, -0.0597)),
-    "SPINE_SHOULDER": (1.0, 0.8, -8.0, (-0.0366, -0.0394, -0.0199)),
-    "NECK": (1.0, 0.8, -18.0, (-0.0366, -0.0394, -0.0199)),
-    "HEAD": (1.3, 1.1, 32.0, (-0.0366, -0.0394, -0.0199)),
-    "SHOULDER": (1.3, 1.1, 4.0, (0.0188, -0.0678, -0.0439), (-0.0466, -0.0386, -0.0459)),
-    "ELBOW": (1.4, 1.3, -10.0, (-0.0184, -0.0434, -0.0303), (0.0058, -0.0642, -0.0534)),
-    "WRIST": (2.0, 1.4, -15.0, (0.0323, 0.0036, -0.0341), (-0.0881, -0.0079, -0.0068)),
-    "HAND": (4.5, 1.5, -12.0, (0.0508, 0.0193, -0.0686), (-0.0734, -0.0343, 0.0039)),
-    "HAND_TIP": (10.0, 1.8, -10.0, (0.0693, 0.035, -0.1031), (-0.0587, -0.0607, 0.0146)),
-    "THUMB": (22.0, 2.0, -20.0, (0.0508, 0.0193, -0.0686), (-0.0734, -0.0343, 0.0039)),
+    # forward, left and up in the trunk's frame, of the left joint and of the right one; arms have their shoulder's
+    "SPINE_BASE": (1.0, 1.2, 32.0, (-0.031, 0.0, -0.030)),
+    "SPINE_MID": (0.8, 0.8, 14.0, (-0.062, 0.0, -0.060)),
+    "SPINE_SHOULDER": (1.0, 0.8, -8.0, (-0.037, 0.0, -0.020)),
+    "NECK": (1.0, 0.8, -18.0, (-0.037, 0.0, -0.020)),
+    "HEAD": (1.3, 1.1, 32.0, (-0.037, 0.0, -0.020)),
+    "SHOULDER": (1.3, 1.1, 4.0, (-0.010, -0.008, -0.020), (-0.010, 0.008, -0.020)),
+    "ELBOW": (1.4, 1.3, -10.0),
+    "WRIST": (2.0, 1.4, -15.0),
+    "HAND": (4.5, 1.5, -12.0),
+    "HAND_TIP": (10.0, 1.8, -10.0),
+    "THUMB": (22.0, 2.0, -20.0),
     "HIP": (1.0, 1.2, 6.0),
     "KNEE": (1.7, 1.2, -15.0),
     "ANKLE": (1.7, 1.4, -20.0),
@@ -31,8 +31,10 @@ _KINDS: Final[dict[str, tuple[Any, ...]]] = {
 }
 """White noise: third differences of the ``kinect_pairs`` recordings; slow errors: spread of limb lengths and
 disagreement of two sensors there, and the greater errors of hands and feet in Schlagenhauf 2017, table E.1; along the
-ray: the consistent disagreement of sensors 45 and 90 degrees apart there; anatomical offsets:
-``benchmarks/calibrate_simulator.py --fit``."""
+ray: the consistent disagreement of sensors 45 and 90 degrees apart there; anatomical offsets: of the spine forward and
+up by Schlagenhauf 2017, table E.1, of the shoulders against SpineShoulder by the five subjects of ``kinect_vs_vicon``,
+alike on both sides (medians: 27 mm forward, 8 mm inward, of a hanging arm's 0 mm up). An arm errs by its direction
+besides (``calibration.arm_directions``)."""
 
 
 def _column(number: int) -> FloatArray:
@@ -57,6 +59,8 @@ ANATOMICAL: Final[FloatArray] = _column(3)
 SPINE: Final = named("SPINE_BASE", "SPINE_MID", "SPINE_SHOULDER", "NECK", "HEAD")
 ARMS: Final = named("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
 LEGS: Final = named("KNEE", "ANKLE", "FOOT")
+for _side in ("LEFT", "RIGHT"):
+    ANATOMICAL[ARMS & [joint.name.endswith(_side) for joint in Joint]] = ANATOMICAL[Joint[f"SHOULDER_{_side}"]]
 FLICKERS: Final[FloatArray] = np.select([JOINT_CLASSES == EXTREMITY, JOINT_CLASSES == LIMB], [1.0, 0.5], 0.0)
 PARENTS: Final[IntArray] = np.arange(N_JOINTS, dtype=np.intp)
 """(25,) the joint at the other end of each joint's segment."""

@@ -4,8 +4,9 @@ The errors apply to the body as the sensor interprets it: facing the sensor, so 
 the person faces away (``mirrored``). From the true joints to the reported ones:
 
 1. lifted shoulders are reported too low, the body's yaw too small (``lift_damping``, ``turn_loss``);
-2. each joint has a constant offset from the anatomical one in the body's own frames (``offset``), and along the ray an
-   offset by its kind (``depth_offset``);
+2. each joint has a constant offset from the anatomical one in the body's own frames (``anatomical``, ``offset``), the
+   arms an error of direction by their pose (the inverse of ``calibration.arm_directions``, by ``anatomical``), and
+   along the ray an offset by its kind (``depth_offset``);
 3. each joint has an error that is a function of pose and view (``bias``, ``bias_turn``, ``length_spread``), and one
    that drifts with time (``drift``, ``drift_time``); :class:`Misreading` holds what is drawn once per person and type
    of sensor;
@@ -34,6 +35,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
+from body_tracking.calibration.arm_directions import KINECT_V2, turn_arms
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import body_heading
 from body_tracking.core.sensor_poses import SensorPose
@@ -231,6 +233,7 @@ class _View:
 
     Attributes:
         trunk: (n, 3, 3) the trunk's axes (forward, left, up) in the optical frame, as columns.
+        thorax: (n, 3, 3) likewise of the thorax.
         yaw: (n,) radians about the trunk's axis from its forward direction to the sensor, positive to its left.
         rays: (n, 25, 3, 3) unit vectors right, down and along the ray of each joint, as rows.
         growth: (n, 25) factor of the errors by distance and yaw.
@@ -238,6 +241,7 @@ class _View:
     """
 
     trunk: FloatArray
+    thorax: FloatArray
     yaw: FloatArray
     rays: FloatArray
     growth: FloatArray
@@ -258,7 +262,7 @@ class _View:
         behind = np.einsum("nji,ni->nj", sight - sight[:, None, Joint.SPINE_MID], away)
         weight = np.where(tables.SPINE, _SPINE_WEIGHT, np.clip(1.0 + behind / _FAR_DEPTH, 0.1, 1.9))
         growth = distance * np.sqrt(1.0 + (factor**2 - 1.0) * weight)
-        return cls(trunk, yaw, rays, growth, distance)
+        return cls(trunk, _thorax(sight), yaw, rays, growth, distance)
 
     def in_optical(self, errors: FloatArray) -> FloatArray:
         """Transform (n, 25, 3) errors from (right, down, along the ray) into the optical frame."""
@@ -297,7 +301,7 @@ class _Sighting:
 
         view = _View.of(sight, self.errors)
         segments = _unit(sight - sight[:, tables.PARENTS])
-        anatomy = sight + self._offset(view, segments, misreading)
+        anatomy = sight + self._offset(sight, view, segments, misreading)
         slow, length = self._slow(anatomy, view, segments, misreading, for_slow)
         placed = anatomy + self._shape(sight, view) + slow
         placed += self._hidden(view, cover, nearer, for_slow)
@@ -362,19 +366,17 @@ class _Sighting:
                     moved[:, end] -= errors.lift_damping * lift[:, None] * up
         return moved
 
-    def _offset(self, view: _View, segments: FloatArray, misreading: Misreading) -> FloatArray:
-        """(n, 25, 3) the constant offsets: in the body's frames, and along the ray."""
-        constant = (
-            self.errors.anatomical * tables.ANATOMICAL
-            + self.errors.offset * tables.SLOW_SCALE[:, None] * misreading.offset
-        )
-        offset = np.einsum("nik,jk->nji", view.trunk, constant)
+    def _offset(self, sight: FloatArray, view: _View, segments: FloatArray, misreading: Misreading) -> FloatArray:
+        """(n, 25, 3) what all people share, a person's own offsets in the body's frames, and offsets along the ray."""
+        common = turn_arms(sight, view.thorax, KINECT_V2.measured) - sight
+        common += np.einsum("nik,jk->nji", view.trunk, tables.ANATOMICAL)
+        own = np.einsum("nik,jk->nji", view.trunk, self.errors.offset * tables.SLOW_SCALE[:, None] * misreading.offset)
         # limbs: by the least rotation that takes the segment's rest direction to its present one
         limbs = ~tables.ON_TRUNK
         rest = np.einsum("nik,jk->nji", view.trunk, tables.REST[limbs])
-        offset[:, limbs] = _least_rotation(rest, segments[:, limbs], offset[:, limbs])
-        result: FloatArray = offset + self.errors.depth_offset * tables.DEPTH_PATTERN[:, None] * view.rays[:, :, 2]
-        return result
+        own[:, limbs] = _least_rotation(rest, segments[:, limbs], own[:, limbs])
+        result: FloatArray = self.errors.anatomical * common + own
+        return result + self.errors.depth_offset * tables.DEPTH_PATTERN[:, None] * view.rays[:, :, 2]
 
     def _slow(
         self,
@@ -490,15 +492,24 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return result
 
 
+def _axes(up: FloatArray, across: FloatArray) -> FloatArray:
+    """(n, 3, 3) forward, left and up as columns, from (n, 3) vectors up and roughly to the left."""
+    up = _unit(up)
+    left = _unit(across - (across * up).sum(axis=1, keepdims=True) * up)
+    return np.stack([np.cross(left, up), left, up], axis=2)
+
+
+def _thorax(sight: FloatArray) -> FloatArray:
+    """(n, 3, 3) the thorax's axes (forward, left, up) as columns."""
+    shoulders = sight[:, Joint.SHOULDER_LEFT] - sight[:, Joint.SHOULDER_RIGHT]
+    return _axes(sight[:, Joint.SPINE_SHOULDER] - sight[:, Joint.SPINE_MID], shoulders)
+
+
 def _trunk(sight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(n, 3, 3) the trunk's axes (forward, left, up) as columns, and (n,) radians from forward to the sensor."""
-    up = _unit(sight[:, Joint.SPINE_SHOULDER] - sight[:, Joint.SPINE_BASE])
-    across = body_heading(sight)
-    left = _unit(across - (across * up).sum(axis=1, keepdims=True) * up)
-    forward = np.cross(left, up)
-    towards = -sight[:, Joint.SPINE_SHOULDER]
-    yaw = np.arctan2((towards * left).sum(axis=1), (towards * forward).sum(axis=1))
-    return np.stack([forward, left, up], axis=2), yaw
+    axes = _axes(sight[:, Joint.SPINE_SHOULDER] - sight[:, Joint.SPINE_BASE], body_heading(sight))
+    forward, left, _ = np.einsum("nik,ni->kn", axes, -sight[:, Joint.SPINE_SHOULDER])
+    return axes, np.arctan2(left, forward)
 
 
 def _least_rotation(start: FloatArray, end: FloatArray, vectors: FloatArray) -> FloatArray:
