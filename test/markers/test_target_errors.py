@@ -42,7 +42,7 @@ def test_the_errors_of_targets_are_in_the_deviations_of_joints() -> None:
                 views = zip(rig.cameras, rig.rotations, rig.translations, strict=True)
                 seen_by = [project(*view, true).by_point for view in views]
                 noise = 1e-2 * np.linalg.inv(sum(each.swapaxes(1, 2) @ each for each in seen_by))
-                seen = Points(0, "rig", true, noise, np.zeros((5, 0), dtype=np.intp))
+                seen = Points(0, rig.cameras[0].frame_id, true, noise, np.zeros((5, 0), dtype=np.intp))
                 poses.append(fit_pose(replace(target, covariance=np.zeros((15, 15))), seen, np.arange(5)))
             frames.append(poses)
         described = [JointDescription("joint", bodies[0].name, bodies[1].name, JointKind.BALL)]
