@@ -372,7 +372,7 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
 
         assert robots.until(lambda: state() == State.FOLLOWING, 60.0), (robots.log("up"), robots.diagnostics)
         begun = len(arm.commands)
-        assert robots.until(lambda: len(arm.commands) > begun + 350 and arm.moving(), 60.0), robots.log("up")
+        assert robots.until(lambda: len(arm.commands) > begun + 500 and arm.moving(), 60.0), robots.log("up")
         (player,) = [each for each in psutil.Process(up.pid).children() if "bag_player" in each.cmdline()]
         killed = time.time()
         player.kill()
@@ -383,14 +383,16 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         assert re.search(rf"\| robot ({'|'.join(State)})", robots.log("up"))  # the status line, every 5 s
         assert stop(up) == 0, robots.log("up")
     commanded, came = np.array([each[2] for each in followed]), np.array([each[0] for each in followed])
-    # how late commands are depends on the machine, and from second to second; where they lead does not
-    delays = np.arange(0.0, 0.5, 0.02)
+    # How late commands are, and how late the angles came here, depends on the machine, and changes within a second; a
+    # machine that stands still makes the robot hold and come back. In most half seconds it does not.
+    delays = np.arange(-0.5, 0.5, 0.02)
     apart = np.array([np.square(commanded - joints_of(arm.mapping, angles, came - delay)) for delay in delays])
-    seconds = np.floor(came - came[0])
-    best = [apart[:, seconds == each] for each in np.unique(seconds)]
-    off = np.degrees(np.sqrt(np.concatenate([each[each.mean(axis=(1, 2)).argmin()] for each in best]).mean(axis=0)))
+    halves = np.floor((came - came[0]) / 0.5)
+    means = np.array([apart[:, halves == each].mean(axis=1) for each in np.unique(halves)])  # (halves, delays, joints)
+    best = means[np.arange(len(means)), means.sum(axis=2).argmin(axis=1)]
+    off = np.degrees(np.sqrt(np.median(best, axis=0)))
     assert np.ptp(commanded[:, 1]) > np.radians(50.0)
-    assert (off < 8.0).all(), off  # a waving elbow is faster than the robot's limits: 5 deg are theirs
+    assert (off < 5.0).all(), off
     # up to when diagnostics said that it held, its commands changed for a tenth of a second
     last = max((k for k in range(1, len(after)) if (after[k][2] != after[k - 1][2]).any()), default=0)
     assert len(after) > last + 1
