@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 from body_tracking.mesh.body_model import Body, BodyModel, PosedBody
-from body_tracking.mesh.compiled import compiled
 from body_tracking.mesh.energy import Observation
 from body_tracking.mesh.skinning import lever_arms
 from body_tracking.mesh.solver import Fit, MeshFitter

@@ -1,0 +1,283 @@
+"""Tracking of one person through depth images: find the pixels, fit the body, notice when it is lost.
+
+Each image is fitted from where the last motion leads. A fit that is lost is tried again with a wide robust scale, from
+the last pose and from another sensor's skeleton where there is one; a person who stays lost is searched for anew, in
+the next candidate of a person's size each time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.core import so3
+from body_tracking.core.camera import Camera
+from body_tracking.core.parameters import number_field
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, SingleArray, Skeleton, TrackingState
+from body_tracking.mesh.body_model import Body, Pose, load
+from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, supported
+from body_tracking.mesh.energy import Observation, observe
+from body_tracking.mesh.person import NOBODY, PersonFinder, of_body_index
+from body_tracking.mesh.personalisation import personalise
+from body_tracking.mesh.raster import render
+from body_tracking.mesh.solver import WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction
+from body_tracking.mesh.uncertainty import kinect_landmarks, placed
+
+_RATES: Final = {"shoulder": 9.0, "elbow": 9.0, "wrist": 9.0, "collar": 3.0}
+_TRUNK_RATE: Final = 3.0
+"""rad/s by which a joint may turn otherwise than before, one standard deviation; arms, and all others."""
+_SHIFT_RATE: Final = 1.0
+"""m/s by which the pelvis may move otherwise than before, one standard deviation."""
+_KEPT: Final = 0.7
+"""Share of the last change of pose that is expected again."""
+_LONGEST_S: Final = 0.2
+"""Seconds between two images whose change of pose is a rate."""
+_SKELETON: Final = 0.08
+"""Metres: standard deviation of the joints of another sensor's skeleton as a start."""
+_SEEN: Final = 0.05
+"""Metres: standard deviation per axis up to which a joint counts as tracked; others are inferred."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerParameters:
+    """Settings of the tracker; each field's metadata has its meaning, unit and range."""
+
+    points: int = field(
+        default=600, metadata={"doc": "measured points of the person in a fit", "min": 100, "max": 5000}
+    )
+    predict_for: float = number_field(0.5, "how long a person who is lost is expected where they were", "s", 0.0, 5.0)
+    search_every: float = number_field(0.2, "between two searches for a person", "s", 0.0, 10.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """A person in one image.
+
+    Attributes:
+        stamp_ns: of the image.
+        fit: of the body.
+        points: (25, 3) joints of the Kinect's set, metres in the optical frame.
+        covariance: (25, 3, 3) square metres.
+    """
+
+    stamp_ns: int
+    fit: Fit
+    points: FloatArray
+    covariance: FloatArray
+
+    def skeleton(self, frame_id: str, body: int = 0) -> Skeleton:
+        """The joints as a sensor's skeleton; those that the image does not place are inferred."""
+        spread = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3.0)
+        states = np.where(spread < _SEEN, TrackingState.TRACKED, TrackingState.INFERRED).astype(np.uint8)
+        return Skeleton(self.stamp_ns, frame_id, self.points, states, body, covariances=self.covariance)
+
+
+class MeshTracker:
+    """Tracks one person.
+
+    Args:
+        view: the depth camera.
+        body: of the person.
+        shape_covariance: (S, S) of the body's shape components.
+        parameters: settings.
+
+    Attributes:
+        problem: why there is no person in the last image; "" where there is one.
+        counters: of images and what became of them.
+    """
+
+    def __init__(
+        self,
+        view: DepthCamera,
+        body: Body,
+        shape_covariance: FloatArray,
+        parameters: TrackerParameters | None = None,
+    ) -> None:
+        self.parameters = parameters or TrackerParameters()
+        self.counters: Counter[str] = Counter()
+        self._view, self._finder = view, PersonFinder(view)
+        self.wear(body, shape_covariance)
+        self.reset()
+
+    def wear(self, body: Body, shape_covariance: FloatArray) -> None:
+        """Track with another body from now on, as after a personalisation."""
+        self._fitter, self._shape_covariance = MeshFitter(body), shape_covariance
+        self._landmarks = kinect_landmarks(body)
+        names = [name.rpartition("_")[2] for name in body.model.joint_names]
+        self._rates = np.array([[_RATES.get(name, _TRUNK_RATE)] * 3 for name in names])
+
+    def reset(self) -> None:
+        """Forget the person and the background."""
+        self._finder.reset()
+        self._fits: list[tuple[int, Fit]] = []
+        self._lost_ns: int | None = None
+        self._searched_ns: int | None = None
+        self._choice = 0
+        self._body_number: int | None = None
+        self.problem = NOBODY
+        self.observation: Observation | None = None
+
+    @property
+    def body(self) -> Body:
+        """The body that is fitted."""
+        return self._fitter.body
+
+    def update(
+        self,
+        stamp_ns: int,
+        depth: SingleArray,
+        index: NDArray[np.uint8] | None = None,
+        orientations: Sequence[Orientation] = (),
+        skeleton: Skeleton | None = None,
+    ) -> Tracked | None:
+        """The person in the next image.
+
+        Args:
+            stamp_ns: of the image.
+            depth: (height, width) metres, 0 where missing.
+            index: (height, width) body-index image of the same time, where there is one.
+            orientations: of inertial sensors.
+            skeleton: by another sensor in the same frame, a start where the person is lost.
+
+        Returns:
+            None where nobody is found, or the fit is lost.
+
+        Raises:
+            DepthError: another size than the camera's.
+        """
+        self.counters["images"] += 1
+        expected = self._fits[-1][1] if self._fits else None
+        if index is not None:
+            mask, self._body_number = of_body_index(index, depth, self._body_number)
+            self.problem = "" if mask.any() else NOBODY
+        else:
+            found = self._finder.find(depth, None if expected is None else expected.posed.vertices, self._choice)
+            mask, self.problem = found.mask, found.reason
+        if self.problem:
+            self.counters[self.problem] += 1
+            self._forget(stamp_ns)
+            return None
+        self.observation = observe(self._view, _without_flying(depth, mask), mask, self.parameters.points)
+        if len(self.observation.points) < self.parameters.points // 4:
+            self.problem = "too few points of the person for a fit"
+            self.counters[self.problem] += 1
+            self._forget(stamp_ns)
+            return None
+        fit = self._fit(stamp_ns, self.observation, orientations, skeleton)
+        if fit is None:
+            return None
+        if fit.lost:
+            self.problem = f"the body does not fit: {fit.matched:.0%} of the points, {fit.violations:.0%} outside"
+            self.counters["lost"] += 1
+            self._choice += not self._fits
+            self._forget(stamp_ns)
+            return None
+        self._lost_ns = None
+        self._fits = [*self._fits[-1:], (stamp_ns, fit)]
+        result = placed(self._fitter, fit, self.observation, self._landmarks, self._shape_covariance)
+        return Tracked(stamp_ns, fit, result.points, result.covariance)
+
+    def _fit(
+        self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], skeleton: Skeleton | None
+    ) -> Fit | None:
+        """The best fit that is at hand; None where it is not yet time to search again."""
+        points = None if skeleton is None else self._points_of(skeleton)
+        if self._fits:
+            prediction = self._predicted(stamp_ns)
+            fit = self._fitter.fit(seen, prediction.pose, prediction, orientations)
+            if not fit.lost:
+                return fit
+            self.counters["second starts"] += 1
+            again = self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)
+            return min(fit, again, key=lambda each: (each.lost, each.energy))
+        waiting = self.parameters.search_every * NANOSECONDS
+        if self._searched_ns is not None and 0 <= stamp_ns - self._searched_ns < waiting:
+            self.problem = "searching"
+            return None
+        self._searched_ns = stamp_ns
+        self.counters["searches"] += 1
+        fit = self._fitter.search(seen, orientations)
+        if points is not None and fit.lost:
+            fit = self._fitter.fit(seen, fit.pose, None, orientations, points, WIDE)
+        return fit
+
+    def _predicted(self, stamp_ns: int) -> Prediction:
+        """The last pose, moved on by its last change where that is known."""
+        last_ns, last = self._fits[-1]
+        elapsed = max((stamp_ns - last_ns) / NANOSECONDS, 1e-3)
+        pose = last.pose
+        if len(self._fits) > 1:
+            before_ns, before = self._fits[-2]
+            between = (last_ns - before_ns) / NANOSECONDS
+            if 0.0 < between < _LONGEST_S and elapsed < _LONGEST_S:
+                share = _KEPT * elapsed / between
+                turns = so3.rotation_vectors(before.pose.rotations.mT @ pose.rotations)
+                rotations = pose.rotations @ so3.quat_to_matrix(so3.exp(share * turns))
+                pose = Pose(rotations, pose.translation + share * (pose.translation - before.pose.translation))
+        return Prediction(pose, 0.01 + _SHIFT_RATE * elapsed, 0.05 + self._rates * elapsed)
+
+    def _points_of(self, skeleton: Skeleton) -> JointPoints | None:
+        """The joints that body model and skeleton share."""
+        names = self.body.model.joint_names
+        pairs = [
+            (names.index(f"{side}_{name}"), number)
+            for number, joint in enumerate(skeleton.joints.names)
+            for name, _, side in [joint.lower().partition("_")]
+            if skeleton.valid[number] and side and f"{side}_{name}" in names
+        ]
+        if not pairs:
+            return None
+        own, theirs = np.array(pairs, dtype=np.intp).T
+        return JointPoints(own, skeleton.positions[theirs], _SKELETON)
+
+    def _forget(self, stamp_ns: int) -> None:
+        """A person who was lost for too long is not expected any more."""
+        self._lost_ns = stamp_ns if self._lost_ns is None else self._lost_ns
+        if self._fits and stamp_ns - self._lost_ns > self.parameters.predict_for * NANOSECONDS:
+            self._fits = []
+            self.counters["people lost"] += 1
+
+    def state(self) -> dict[str, Any]:
+        """Figures of the last fit, for diagnostics."""
+        if not self._fits:
+            return {"tracked": False, "problem": self.problem}
+        fit = self._fits[-1][1]
+        return {
+            "tracked": not self.problem,
+            "problem": self.problem,
+            "points matched": round(fit.matched, 3),
+            "outside of the silhouette": round(fit.violations, 3),
+            "residual, mm": round(1e3 * fit.rms, 1),
+        }
+
+
+def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
+    """The image without pixels that lie on no surface, in the box about the mask."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    # the outermost pixels of a block have too few neighbours
+    box = slice(max(rows[0] - 2, 0), rows[-1] + 3), slice(max(columns[0] - 2, 0), columns[-1] + 3)
+    clean = depth.copy()
+    block = np.ascontiguousarray(depth[box])
+    clean[box] = np.where(supported(block, JUMP, LEAST), block, np.float32(0.0))
+    return clean
+
+
+def prepare() -> None:
+    """Compile the loops, or load them, before the first image: a person is found, tracked and personalised."""
+    matrix = np.array([[92.0, 0.0, 64.0], [0.0, 92.0, 53.0], [0.0, 0.0, 1.0]])
+    view = DepthCamera(Camera("prepared", 128, 106, matrix, np.zeros(5)))
+    body = load().body()
+    standing = MeshFitter(body).neutral(np.array([0.0, 0.0, 2.3]), 0.6, 0.3)
+    person = render(body.posed(standing).vertices, body.model.faces, view.camera).depth
+    wall = np.full_like(person, 4.0)
+    depth = np.where(person > 0.0, person, wall)
+    tracker = MeshTracker(view, body, np.eye(len(body.shape)))
+    for stamp_ns, image in enumerate((wall, depth, depth)):
+        tracker.update(stamp_ns * NANOSECONDS, image)
+    assert tracker.observation is not None
+    personalise(body.model, [tracker.observation], [standing])

@@ -1,0 +1,110 @@
+"""A person is tracked through depth images, and the loss of them is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from depth_recording import recording
+
+from body_tracking.core.compiled import LOOPS
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.mesh import body_model
+from body_tracking.mesh.depth import DepthCamera, DepthError
+from body_tracking.mesh.person import COVERED, NOBODY, PersonFinder
+from body_tracking.mesh.tracking import MeshTracker, Tracked, prepare
+
+ARMS = [getattr(Joint, f"{name}_{side}") for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
+STAMPS = [*recording().images]
+NOTHING = np.zeros_like(recording().images[STAMPS[0]])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _prepared() -> None:
+    prepare()
+
+
+@pytest.fixture
+def tracker() -> MeshTracker:
+    """Of a person of whom nothing is known."""
+    body = body_model.load().body()
+    return MeshTracker(DepthCamera(recording().camera), body, np.eye(len(body.shape)))
+
+
+def tracked(tracker: MeshTracker, numbers: range) -> list[Tracked | None]:
+    return [tracker.update(STAMPS[number], recording().images[STAMPS[number]]) for number in numbers]
+
+
+def off(found: Tracked) -> FloatArray:
+    """(6, 3) metres."""
+    return (found.points - recording().joints[found.stamp_ns])[ARMS]
+
+
+def test_no_image_after_the_preparation_waits_for_the_compiler(tracker: MeshTracker) -> None:
+    before = [len(loop.signatures) for loop in LOOPS]
+    assert any(before)
+    assert all(tracked(tracker, range(3)))
+    assert [len(loop.signatures) for loop in LOOPS] == before
+
+
+def test_arms_of_an_unknown_person_are_nearer_to_the_truth_than_a_kinects_and_within_their_covariance(
+    tracker: MeshTracker,
+) -> None:
+    found = tracked(tracker, range(0, 120, 2))
+    assert all(found)
+    assert tracker.counters["second starts"] <= 2 and not tracker.counters["lost"]
+    errors = np.array([off(each) for each in found if each])
+    kinect = np.array([(recording().kinect[s] - recording().joints[s])[ARMS] for s in STAMPS[:120:2]])
+    assert np.linalg.norm(errors, axis=2).mean() < 0.67 * np.linalg.norm(kinect, axis=2).mean()
+    covariances = np.array([each.covariance[ARMS] for each in found if each])
+    nees = np.einsum("tna,tnab,tnb->tn", errors, np.linalg.inv(covariances), errors) / 3.0
+    # one person, whose shape errs the same way in all images: wider than the 0.5 to 2 over many
+    assert 0.3 < nees.mean() < 2.5
+    skeleton = found[-1].skeleton("camera") if found[-1] else None
+    assert skeleton is not None and skeleton.covariances is not None
+    # the legs' surface is seen as well
+    assert np.mean(skeleton.states == TrackingState.TRACKED) > 0.7
+
+
+def test_a_covered_lens_is_told_and_the_person_is_found_again_at_once(tracker: MeshTracker) -> None:
+    tracked(tracker, range(3))
+    # within predict_for the pose is still expected
+    for number in range(3, 9):
+        assert tracker.update(STAMPS[number], NOTHING) is None
+        assert tracker.problem == COVERED and not tracker.state()["tracked"]
+    assert all(tracked(tracker, range(9, 12)))
+    assert tracker.counters["searches"] == 1 and tracker.counters[COVERED] == 6
+    # after that the person is searched for anew
+    for number in range(12, 30):
+        assert tracker.update(STAMPS[number], NOTHING) is None
+    assert tracker.counters["people lost"] == 1
+    found = tracked(tracker, range(30, 32))
+    assert found[0] and tracker.counters["searches"] == 2
+    assert np.linalg.norm(off(found[0]), axis=1).mean() < 0.1
+    assert tracker.state()["tracked"]
+
+
+def test_furniture_of_a_persons_size_is_lost_and_searches_take_turns_in_time(tracker: MeshTracker) -> None:
+    height, width = NOTHING.shape
+    image = np.full_like(NOTHING, 4.0)
+    image[height // 4 : -height // 4, 2 * width // 5 : -2 * width // 5] = 2.2
+    found = [tracker.update(k * NANOSECONDS // 30, image) for k in range(9)]
+    assert not any(found)
+    # every 0.2 s, for a search takes as long as ten images
+    assert tracker.counters["searches"] == 2 and tracker.counters["lost"] == 2
+    assert tracker.problem == "searching"
+
+
+def test_the_person_of_the_body_index_is_tracked(tracker: MeshTracker) -> None:
+    image = recording().images[STAMPS[0]]
+    index = np.full(image.shape, 255, np.uint8)
+    assert tracker.update(STAMPS[0], image, index) is None and tracker.problem == NOBODY
+    index[PersonFinder(DepthCamera(recording().camera)).find(image).mask] = 3
+    found = tracker.update(STAMPS[1], image, index)
+    assert found is not None and np.linalg.norm(off(found), axis=1).mean() < 0.1
+
+
+def test_an_image_of_another_size_is_refused_and_does_no_harm(tracker: MeshTracker) -> None:
+    assert all(tracked(tracker, range(2)))
+    with pytest.raises(DepthError, match="100 x 50"):
+        tracker.update(STAMPS[2], np.ones((50, 100), np.float32))
+    assert all(tracked(tracker, range(3, 5))) and tracker.counters["searches"] == 1
