@@ -37,6 +37,7 @@ import numpy as np
 from time_warp import TimeWarp, compare, estimate_warp
 
 from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
+from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.metrics import sample
 from body_tracking.filters import DEFAULT_FILTER, ModelFilter, make_filter
@@ -125,7 +126,7 @@ def read(path: Path) -> dict[str, FloatArray]:
 
 
 def kinect_skeletons(path: Path) -> list[Skeleton]:
-    """A clip as skeletons in world axes (z up, x along the sensor's view)."""
+    """A clip as skeletons in world axes (z up, x along the sensor's view), with the covariances of the live graph."""
     points = read(path)
     frames = len(points["waist"])
     positions = np.full((frames, N_JOINTS, 3), np.nan)
@@ -136,8 +137,16 @@ def kinect_skeletons(path: Path) -> list[Skeleton]:
     world = np.stack([optical[..., 2], -optical[..., 0], -optical[..., 1]], axis=-1)
     states = np.full(N_JOINTS, TrackingState.NOT_TRACKED, dtype=np.uint8)
     states[list(KINECT_JOINTS.values())] = TrackingState.TRACKED
+    variances = joint_stddev(optical, np.tile(states, (frames, 1))) ** 2
     return [
-        Skeleton(round(index * NANOSECONDS / KINECT_RATE), "world", each, states) for index, each in enumerate(world)
+        Skeleton(
+            round(index * NANOSECONDS / KINECT_RATE),
+            "world",
+            each,
+            states,
+            covariances=np.where(np.eye(3) > 0.0, variance[:, None, None], 0.0),
+        )
+        for index, (each, variance) in enumerate(zip(world, variances, strict=True))
     ]
 
 
