@@ -90,7 +90,12 @@ def options_of(**given: Value) -> Options:
     unknown = given.keys() - OPTIONS.keys()
     if unknown:
         raise KeyError(f"no option {', '.join(sorted(unknown))}")
-    return {name: given.get(name, option.default) for name, option in OPTIONS.items()}
+    found = {name: given.get(name, option.default) for name, option in OPTIONS.items()}
+    computed = tuple(sensor for system in SYSTEMS for sensor in system.computes(found))
+    if computed and not found["computed"]:
+        others = given.get("sensors", ())
+        found |= {"computed": computed, "sensors": (*(others if isinstance(others, tuple) else ()), *computed)}
+    return found
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> None:

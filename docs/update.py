@@ -48,6 +48,7 @@ GROUPS = {
         "marker_triangulation",
         "rigid_body_tracker",
     ),
+    "Depth cameras": ("mesh_tracker",),
     "Calibration and fusion": ("calibration", "fusion"),
     "Recordings": ("bag_player", "bag_recorder"),
     "Views": ("body_markers", "viewer"),

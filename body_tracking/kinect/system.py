@@ -43,7 +43,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["bag"] or options["external"]:
         return
     adapted = _adapted(options)
-    for sensor in sensors:
+    for sensor in _own(options):
         yield NodeSpec(
             f"{sensor}_skeleton",
             "skeleton_adapter" if sensor in adapted else "kinect_skeleton",
@@ -52,7 +52,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
-    wanted = tuple(map(graph.skeleton_topic, sensors_of(options)))
+    wanted = tuple(map(graph.skeleton_topic, _own(options)))
     missing = [topic for topic in wanted if topic not in topics]
     if missing:
         there = ", ".join(graph.sensors_among(topics)) or "none"
@@ -74,6 +74,12 @@ def sensors_of(options: Options) -> tuple[str, ...]:
     return sensors
 
 
+def _own(options: Options) -> tuple[str, ...]:
+    """The sensors whose skeletons no other node computes."""
+    computed = options["computed"]
+    return tuple(each for each in sensors_of(options) if not (isinstance(computed, tuple) and each in computed))
+
+
 def _adapted(options: Options) -> dict[str, dict[str, Value]]:
     """The adapter's parameters by sensor, for sensors with another driver.
 
@@ -81,7 +87,7 @@ def _adapted(options: Options) -> dict[str, dict[str, Value]]:
         GraphError: a sensor that is not in the graph.
     """
     found: dict[str, dict[str, Value]] = {}
-    sensors, given = sensors_of(options), options["adapt"]
+    sensors, given = _own(options), options["adapt"]
     for entry in given if isinstance(given, tuple) else ():
         sensor, _, topic = entry.partition(":")
         if sensor not in sensors:
@@ -108,6 +114,7 @@ SYSTEM = System(
             "names, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
             "A,B",
         ),
+        Option("computed", (), hidden=True),
         Option("external", False, "start no sensor nodes: other processes publish /<sensor>/skeleton"),
         Option(
             "adapt",

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import IMAGE
-from body_tracking.core.skeleton import SingleArray
+from body_tracking.core.skeleton import FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthError, to_metres
-from body_tracking.messages.base import MessageError
+from body_tracking.messages.base import MessageError, to_header
 from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
 from body_tracking.messages.codecs import Codec, Wire
 from body_tracking.messages.images import BRIGHTNESS, DEPTH, array_to_image, image_to_array
+from body_tracking.messages.markers import MARKER, marker, to_colour, to_points
+
+_TRIANGLES: Final = 11
+"""``visualization_msgs/Marker``: list of triangles."""
+_SKIN: Final = (214, 180, 150)
+"""Colour of the mesh: red, green, blue."""
 
 
 class DepthImage(Codec):
@@ -63,3 +69,21 @@ class DepthInfo(Codec):
 
     def decode(self, cdr: bytes, wire: Wire) -> Camera:
         return info_to_camera(wire.deserialize(CAMERA_INFO, cdr))
+
+
+class MeshMarker(Codec):
+    """A mesh as a marker of triangles: stamp in nanoseconds, frame, (F, 3, 3) corners in metres; written only."""
+
+    type_name = MARKER
+
+    def encode(self, payload: tuple[int, str, FloatArray], wire: Wire) -> bytes:
+        stamp_ns, frame_id, corners = payload
+        types = wire.types
+        pose = types.make(
+            "geometry_msgs/msg/Pose",
+            position=types.make("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
+            orientation=types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        scale = types.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0)
+        given = to_header(stamp_ns, frame_id, types), "mesh", 0, _TRIANGLES, scale, to_colour(_SKIN, types), pose, types
+        return wire.serialize(MARKER, marker(*given, points=to_points(corners.reshape(-1, 3), types)))

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.mesh.body_model import Body, BodyModel, Pose
@@ -30,6 +31,46 @@ STATURES: Final = (-1.2, 0.0, 1.2)
 
 class PersonalisationError(BodyTrackingError):
     """The images do not show one person well enough for a shape."""
+
+
+APART: Final = 0.25
+"""Radians, root mean square over the arms' and the trunk's joints, from which on two poses are different ones."""
+_MOVING: Final = ("shoulder", "elbow", "spine1", "spine2", "spine3")
+
+
+class DistinctPoses:
+    """Collects observations of one person in different poses.
+
+    Args:
+        model: shape space.
+        count: observations that are needed.
+
+    Attributes:
+        observations: so far.
+        poses: in which the person was fitted.
+    """
+
+    def __init__(self, model: BodyModel, count: int) -> None:
+        self._count = count
+        self._joints = [k for k, name in enumerate(model.joint_names) if name.rpartition("_")[2] in _MOVING]
+        self.observations: list[Observation] = []
+        self.poses: list[Pose] = []
+
+    @property
+    def complete(self) -> bool:
+        """Whether these are enough."""
+        return len(self.poses) >= self._count
+
+    def offer(self, observation: Observation, pose: Pose) -> None:
+        """Keep an observation if its pose differs from all that were kept."""
+        own = pose.rotations[self._joints]
+        for other in self.poses:
+            angles = np.linalg.norm(so3.rotation_vectors(other.rotations[self._joints].mT @ own), axis=1)
+            if float(np.sqrt(np.mean(angles**2))) < APART:
+                return
+        if not self.complete:
+            self.observations.append(observation)
+            self.poses.append(pose)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,8 @@ IMAGES: Final = Qos(reliability="reliable", depth=10)
 MESH_SUFFIX: Final = "_mesh"
 """Of the sensor whose skeletons the tracker publishes."""
 
+PERSONALISE_SERVICE: Final = "mesh_tracker/personalise"
+
 
 def depth_topic(sensor: str) -> str:
     """The depth images of a sensor."""
@@ -30,3 +32,8 @@ def body_index_topic(sensor: str) -> str:
 def mesh_topic(sensor: str) -> str:
     """The fitted mesh as a marker."""
     return f"/{sensor}{MESH_SUFFIX}/mesh"
+
+
+def mesh_sensor(sensor: str) -> str:
+    """The sensor whose skeletons are those of the mesh that is fitted to a depth camera's images."""
+    return f"{sensor}{MESH_SUFFIX}"

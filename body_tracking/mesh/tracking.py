@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -85,6 +86,7 @@ class MeshTracker:
         body: of the person.
         shape_covariance: (S, S) of the body's shape components.
         parameters: settings.
+        counters: that go on from a tracker before.
 
     Attributes:
         problem: why there is no person in the last image; "" where there is one.
@@ -97,9 +99,10 @@ class MeshTracker:
         body: Body,
         shape_covariance: FloatArray,
         parameters: TrackerParameters | None = None,
+        counters: Counter[str] | None = None,
     ) -> None:
         self.parameters = parameters or TrackerParameters()
-        self.counters: Counter[str] = Counter()
+        self.counters: Counter[str] = Counter() if counters is None else counters
         self._view, self._finder = view, PersonFinder(view)
         self.wear(body, shape_covariance)
         self.reset()
@@ -121,6 +124,11 @@ class MeshTracker:
         self._body_number: int | None = None
         self.problem = NOBODY
         self.observation: Observation | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the depth camera."""
+        return self._view.camera
 
     @property
     def body(self) -> Body:
@@ -267,6 +275,7 @@ def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
     return clean
 
 
+@cache
 def prepare() -> None:
     """Compile the loops, or load them, before the first image: a person is found, tracked and personalised."""
     matrix = np.array([[92.0, 0.0, 64.0], [0.0, 92.0, 53.0], [0.0, 0.0, 1.0]])

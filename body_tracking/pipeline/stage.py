@@ -41,6 +41,8 @@ class Port:
         measured: an output whose delay and latency are reported.
         optional: an output whose message type may not be installed: left out there, and offline.
         absolute: the user chose the name; with a leading slash it holds in every namespace.
+        foreign: an input of other packages' publishers: its subscription asks for the strongest quality of service that
+            they offer, and for ``qos`` before there are any.
     """
 
     topic: str
@@ -52,6 +54,7 @@ class Port:
     measured: bool = False
     optional: bool = False
     absolute: bool = False
+    foreign: bool = False
 
 
 class Output(NamedTuple):

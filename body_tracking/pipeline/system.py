@@ -24,13 +24,14 @@ class Place(IntEnum):
     """A node's place between the sensors and the angles; no node needs an output of a later one."""
 
     SOURCE = 0
-    CALIBRATION = 1
-    FUSION = 2
-    SENSING = 3
-    FILTER = 4
-    ANGLES = 5
-    CONSUMER = 6
-    RECORDER = 7
+    IMAGES = 1
+    CALIBRATION = 2
+    FUSION = 3
+    SENSING = 4
+    FILTER = 5
+    ANGLES = 6
+    CONSUMER = 7
+    RECORDER = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +197,8 @@ class System:
         specs: returns the nodes that it runs for given options, without their namespace.
         played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
             none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
+        computes: returns the sensors whose skeletons its own nodes publish; they join those of the option ``sensors``,
+            and take the place of its default.
         options, topics, services, commands, layers, views: that it adds.
         prepare: ``module:function`` that runs every compiled loop of the system once; empty where it has none.
     """
@@ -205,6 +208,7 @@ class System:
     nodes: tuple[NodeType, ...] = ()
     specs: Callable[[Options], Iterable[NodeSpec]] = lambda options: ()
     played: Callable[[Options, Collection[str]], tuple[str, ...]] = lambda options, topics: ()
+    computes: Callable[[Options], tuple[str, ...]] = lambda options: ()
     options: tuple[Option, ...] = ()
     topics: tuple[TopicSpec, ...] = ()
     services: tuple[Service, ...] = ()

@@ -68,6 +68,7 @@ class ReplaySettings:
         calibration_file: start from this calibration; None for none.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
         marker_setup, marker_points: the options of these names: folder of infrared markers, topic of their points.
+        depth, person: the options of these names: depth cameras, file of the person's body.
         played: topics of the bag that take the place of sensors.
         people: whom to track.
         calibration, fusion, tracking: parameters of the calibration, the fusion and the inertial sensors.
@@ -86,6 +87,8 @@ class ReplaySettings:
     imus: tuple[str, ...] = ()
     marker_setup: str = ""
     marker_points: str = ""
+    depth: tuple[str, ...] = ()
+    person: str = ""
     played: tuple[str, ...] = ()
     people: PeopleParameters = field(default_factory=PeopleParameters)
     calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
@@ -98,7 +101,7 @@ class ReplaySettings:
     def options(self) -> Options:
         """Options of the graph."""
         return options_of(
-            sensors=self.sensors or (() if self.marker_setup else graph.DEFAULT_SENSORS),
+            sensors=self.sensors or (() if self.marker_setup or self.depth else graph.DEFAULT_SENSORS),
             filter=self.filter_name,
             filter_input=self.filter_input,
             convention=self.convention,
@@ -106,6 +109,8 @@ class ReplaySettings:
             imus=self.imus,
             marker_setup=self.marker_setup,
             marker_points=self.marker_points,
+            depth=self.depth,
+            person=self.person,
             played=self.played,
             calibration="" if self.calibration_file is None else str(self.calibration_file),
             external=True,
@@ -278,8 +283,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     began = time.perf_counter()
     counters: Counter[str] = Counter()
     with RigReader(bag_path) as bag:
-        without = settings.marker_setup and not (settings.sensors or graph.sensors_among(bag.topics))
-        topics = {} if without else sensor_topics(bag, settings.sensors)
+        without = settings.depth or (settings.marker_setup and not graph.sensors_among(bag.topics))
+        topics = {} if without and not settings.sensors else sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
         try:
@@ -391,7 +396,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
             values["reference"] = args.reference
     options: dict[str, Any] = dict(chosen)
     return ReplaySettings(
-        options["sensors"] if args.sensors else (),
+        tuple(each for each in options["sensors"] if each not in options["computed"]) if args.sensors else (),
         args.reference or "",
         options["filter"] or DEFAULT_FILTER,
         options["convention"] or graph.AUTO,
@@ -401,6 +406,8 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         options["imus"],
         options["marker_setup"],
         options["marker_points"],
+        options["depth"],
+        options["person"],
         (),
         PeopleParameters(**people),  # type: ignore[arg-type]
         parameters=parameters,
@@ -425,11 +432,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
     command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
     names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "params_file")
-    markers = ("marker_setup", "marker_points")
+    cameras = ("marker_setup", "marker_points", "depth", "person")
     add_options(
         command,
         *names,
-        *markers,
+        *cameras,
         "model_covariance",
         filter=f"default: {DEFAULT_FILTER}",
         convention="of the joint angles (default: by the filter)",

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -15,8 +16,9 @@ from std_srvs.srv import Trigger
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Value
+from body_tracking.core.qos import Qos, request_for
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.ros.bag_topics import UnknownTypeError, message_class, to_profile
+from body_tracking.ros.bag_topics import UnknownTypeError, from_profile, message_class, to_profile
 from body_tracking.ros.node import STEADY, GraphNode, run
 from body_tracking.ros.wire import WIRE
 from body_tracking.systems import stage_class
@@ -39,6 +41,7 @@ class StageNode(GraphNode):
     def __init__(self) -> None:
         self.inputs: dict[str, tuple[Port, Subscription]] = {}
         self.outputs: dict[str, tuple[Port, Publisher | None]] = {}
+        self._requested: dict[str, Qos] = {}
         self.sent_ns: int | None = None
         """Wall time at which the current message was sent."""
         super().__init__()
@@ -55,6 +58,8 @@ class StageNode(GraphNode):
         self.connect()
         for name, action in self.stage.services.items():
             self.create_service(Trigger, name, partial(self.answer, action))
+        if any(port.foreign for port in self.stage.inputs):
+            self.create_timer(_LOOK_S, self.adapt, clock=STEADY)
         if type(self.stage).look is not Stage.look:
             self.create_timer(_LOOK_S, self.look, clock=STEADY)
         if type(self.stage).save is not Stage.save:
@@ -86,9 +91,24 @@ class StageNode(GraphNode):
                 raise
             return None
 
+    def _request(self, port: Port) -> Qos:
+        """The profile of an input's subscription, whose depth is at least that of the waiting messages."""
+        depth = max(port.qos.depth, port.waiting)
+        if port.foreign and (publishers := self.get_publishers_info_by_topic(self.full_name(port.topic))):
+            return request_for([from_profile(each.qos_profile) for each in publishers], depth)
+        return replace(port.qos, depth=depth)
+
+    def adapt(self) -> None:
+        """Subscribe again where the publishers of another package offer another quality of service than before."""
+        for topic, (port, subscription) in tuple(self.inputs.items()):
+            if port.foreign and self._request(port) != self._requested[topic]:
+                self._droppable.pop(subscription, None)
+                self.destroy_subscription(subscription)
+                self.inputs[topic] = port, self._subscription(port)
+
     def _subscription(self, port: Port) -> Subscription:
-        qos = to_profile(port.qos)
-        qos.depth = max(qos.depth, port.waiting)
+        self._requested[port.topic] = self._request(port)
+        qos = to_profile(self._requested[port.topic])
         kind = message_class(port.codec.type_name)
         handle = partial(self.on_message, port.topic)
         subscription = self.subscribe(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)

@@ -120,7 +120,8 @@ def options_for(args: argparse.Namespace) -> Options:
         with RigReader(args.bag) as reader:
             topics = frozenset(reader.topics)
             there = graph.sensors_among(reader.topics)
-        given.setdefault("sensors", there)
+        if not options_of(**given)["computed"]:
+            given.setdefault("sensors", there)
     if args.robot is not None:
         given["convention"] = convention_of(args.robot, args.convention or "")
     given["namespace"] = names.check_namespace(args.namespace or "/")

@@ -10,15 +10,14 @@ import numpy as np
 from body_tracking.core import so3
 from body_tracking.core.message_types import MARKERS, TF, TRANSFORM
 from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageTypes, to_header, to_vector
+from body_tracking.messages.markers import marker, to_colour, to_points
 from body_tracking.viewing.colours import Colour
 from body_tracking.viewing.shapes import Ellipsoids, Figure
 
 # visualization_msgs/Marker types
 _SPHERE, _LINE_LIST, _SPHERE_LIST, _TEXT = 2, 5, 7, 9
-MARKER_LIFETIME_NS = NANOSECONDS // 2
-"""Markers vanish after this time unless they are published again."""
 
 
 class Markers:
@@ -79,41 +78,21 @@ class Markers:
         colors: Sequence[Any] = (),
         text: str = "",
     ) -> None:
-        types = self._types
-        lifetime = types.make("builtin_interfaces/msg/Duration", sec=0, nanosec=MARKER_LIFETIME_NS)
+        placed = self._pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) if pose is None else pose
         self._markers.append(
-            types.make(
-                "visualization_msgs/msg/Marker",
-                header=self._header,
-                ns=name,
-                id=number,
-                type=kind,
-                action=0,
-                pose=self._pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) if pose is None else pose,
-                scale=scale,
-                color=colour,
-                lifetime=lifetime,
-                frame_locked=False,
-                points=list(points),
-                colors=list(colors),
-                texture_resource="",
-                texture=types.make(
-                    "sensor_msgs/msg/CompressedImage", header=self._header, format="", data=types.octets(b"")
-                ),
-                uv_coordinates=[],
+            marker(
+                *(self._header, name, number, kind, scale, colour, placed, self._types),
+                points=points,
+                colours=colors,
                 text=text,
-                mesh_resource="",
-                mesh_file=types.make("visualization_msgs/msg/MeshFile", filename="", data=types.octets(b"")),
-                mesh_use_embedded_materials=False,
             )
         )
 
     def _points(self, points: FloatArray) -> list[Any]:
-        return [self._types.make("geometry_msgs/msg/Point", x=x, y=y, z=z) for x, y, z in points.tolist()]
+        return to_points(points, self._types)
 
     def _colour(self, rgb: Sequence[int], opacity: float = 1.0) -> Any:
-        r, g, b = (value / 255.0 for value in rgb)
-        return self._types.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=opacity)
+        return to_colour(rgb, self._types, opacity)
 
     def _pose(self, position: FloatArray, quat_xyzw: FloatArray) -> Any:
         x, y, z = position.tolist()

@@ -1,0 +1,282 @@
+"""Depth images to the skeleton and the mesh of a person: the stage of the node ``mesh_tracker``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
+from body_tracking.core.qos import LATCHED, RELIABLE
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.sources import check_sensor_name, optical_frame
+from body_tracking.mesh import body_model, storage
+from body_tracking.mesh.body_model import Body
+from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.depth import DepthCamera, DepthError
+from body_tracking.mesh.person import COVERED
+from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationError, personalise
+from body_tracking.mesh.topics import IMAGES, PERSONALISE_SERVICE, depth_topic, info_topic, mesh_sensor, mesh_topic
+from body_tracking.mesh.tracking import MeshTracker, Tracked, TrackerParameters, prepare
+from body_tracking.messages.codecs import Skeletons
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
+from body_tracking.pipeline.shared import names_in, skeleton_qos
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+
+DEPTH = Parameter("depth", (), "depth cameras; the node takes /<sensor>/depth/image_raw and camera_info of each")
+PERSON = Parameter(
+    "person",
+    "",
+    "YAML file with the shape of the person's body; written after a personalisation where it is not there",
+)
+_PERSONALISED_FROM = Parameter(
+    "personalise_from",
+    5,
+    "images in different poses from which the shape of a person is estimated, unless a file says it; 0 for never",
+    min=0,
+    max=12,
+)
+_MESH_RATE = Parameter(
+    "mesh_rate", 5.0, "publish the mesh at most this often, and only while there is a subscriber", "Hz", 0.1, 100.0
+)
+_KEPT: Final = 64
+"""Images of a camera that wait with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
+_NO_INFO: Final = "images without camera_info"
+
+
+class MeshStage(Stage):
+    """Fits the mesh of a person to each image of depth cameras."""
+
+    NAME = "mesh_tracker"
+    PARAMETERS = (
+        DEPTH,
+        PERSON,
+        *parameters_from(TrackerParameters),
+        _PERSONALISED_FROM,
+        _MESH_RATE,
+        TRANSPORT,
+    )
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        cameras = tuple(check_sensor_name(each) for each in names_in(values["depth"]))
+        if not cameras or len(set(cameras)) < len(cameras):
+            raise graph.GraphError(f"depth cameras: {', '.join(cameras) or 'none'}; expected one or more, each once")
+        self.sensors = {camera: DepthSensor(camera, values, self.events) for camera in cameras}
+        prepare()
+        reliable = bool(values["reliable"])
+        inputs, outputs = [], []
+        self._by_topic: dict[str, DepthSensor] = {}
+        for camera, sensor in self.sensors.items():
+            info, images = info_topic(camera), depth_topic(camera)
+            inputs += [
+                Port(info, DepthInfo(), LATCHED, foreign=True),
+                Port(
+                    *(images, DepthImage(), IMAGES, _KEPT if reliable else 0),
+                    droppable=not reliable,
+                    perishable=not reliable,
+                    foreign=True,
+                ),
+            ]
+            outputs += [
+                Port(sensor.skeleton_topic, Skeletons(), skeleton_qos(values), measured=True),
+                Port(sensor.mesh_topic, MeshMarker(), RELIABLE),
+            ]
+            self._by_topic |= {info: sensor, images: sensor}
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        self.services = {PERSONALISE_SERVICE: self._personalise}
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        sensor = self._by_topic[topic]
+        if isinstance(payload, Camera):
+            sensor.calibrate(payload)
+            return
+        stamp_ns, _, depth = payload
+        tracked = sensor.update(stamp_ns, depth)
+        if tracked is None:
+            return
+        frame_id = optical_frame(sensor.name)
+        yield Output(sensor.skeleton_topic, (tracked.skeleton(frame_id),), stamp_ns)
+        if self.wanted(sensor.mesh_topic) and sensor.mesh_is_due(stamp_ns):
+            posed = tracked.fit.posed.vertices
+            yield Output(sensor.mesh_topic, (stamp_ns, frame_id, posed[sensor.body.model.faces]), stamp_ns)
+
+    def _personalise(self) -> str:
+        for sensor in self.sensors.values():
+            sensor.personalise_anew()
+        return "move your arms and trunk before the camera: the shape of your body is estimated from different poses"
+
+    def refused(self, topic: str) -> None:
+        """Count a message of another encoding, or a calibration that cannot be used."""
+        self._by_topic[topic].counters["messages that cannot be used"] += 1
+
+    def reset(self, topic: str) -> None:
+        """Forget the person, not the shape of the body."""
+        self._by_topic[topic].reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """A camera without calibration, with images of another size, or whose lens is covered is named."""
+        problems = [f"{name}: {sensor.problem}" for name, sensor in self.sensors.items() if sensor.problem]
+        values = {
+            f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.state().items()
+        }
+        return (1 if problems else 0), "; ".join(problems), values
+
+    def save(self) -> None:
+        """Write the shape of the person's body, if it is new."""
+        for sensor in self.sensors.values():
+            sensor.save()
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        return {f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.counters.items()}
+
+
+class DepthSensor:
+    """One depth camera with the tracker of the person before it.
+
+    Args:
+        camera: its name.
+        values: parameters of the stage.
+        events: lines for the log.
+
+    Attributes:
+        name: of the sensor whose skeletons are published.
+        body: of the person.
+        problem: why images are of no use; "" where they are, or where only nobody is there.
+
+    Raises:
+        PersonFileError: the file of the person is invalid.
+    """
+
+    def __init__(self, camera: str, values: Mapping[str, Value], events: list[str]) -> None:
+        self.name = mesh_sensor(camera)
+        self.skeleton_topic, self.mesh_topic = graph.skeleton_topic(self.name), mesh_topic(camera)
+        self.problem = ""
+        self._camera, self._events = camera, events
+        self._parameters = TrackerParameters(**fields_of(TrackerParameters, values))
+        self._needed = int(str(values["personalise_from"]))
+        self._mesh_ns = round(NANOSECONDS / float(str(values["mesh_rate"])))
+        self._drawn_ns: int | None = None
+        self._model = body_model.load()
+        self._file = Path(str(values["person"])).expanduser() if values["person"] else None
+        self._known = self._file is not None and self._file.exists()
+        self._changed = False
+        if self._file is not None and self._known:
+            self.body, self._covariance = storage.load(self._file, self._model)
+        else:
+            self.body, self._covariance = self._nobody()
+        self._poses = DistinctPoses(self._model, 0 if self._known else self._needed)
+        self._tracker: MeshTracker | None = None
+        self._counters: Counter[str] = Counter()
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Of images and of what became of them."""
+        return self._counters
+
+    def _nobody(self) -> tuple[Body, FloatArray]:
+        """The mean body with the covariance of the population."""
+        return self._model.body(), np.eye(self._model.vertex_shapes.shape[2])
+
+    def calibrate(self, camera: Camera) -> None:
+        """Take the intrinsics; the person is looked for anew where they have changed."""
+        if self._tracker is not None:
+            if _alike(self._tracker.camera, camera):
+                return
+            self._counters["calibrations that differ from the last one"] += 1
+        self._tracker = MeshTracker(
+            DepthCamera(camera), self.body, self._covariance, self._parameters, counters=self._counters
+        )
+        self.problem = ""
+
+    def update(self, stamp_ns: int, depth: Any) -> Tracked | None:
+        """The person in an image.
+
+        Raises:
+            DepthError: another size than that of the calibration.
+        """
+        if self._tracker is None:
+            self._counters[_NO_INFO] += 1
+            self.problem = f"no calibration: nothing on {info_topic(self._camera)}"
+            return None
+        gone = self._counters["people lost"]
+        try:
+            tracked = self._tracker.update(stamp_ns, depth)
+        except DepthError as error:
+            self._counters["images of another size"] += 1
+            self.problem = str(error)
+            raise
+        self.problem = COVERED if self._tracker.problem == COVERED else ""
+        if self._counters["people lost"] > gone and not self._known:
+            # the next one may be somebody else
+            self._poses = DistinctPoses(self._model, self._needed)
+            self._wear(*self._nobody())
+        if tracked is not None and not self._poses.complete:
+            self._collect(self._tracker, tracked)
+        return tracked
+
+    def _collect(self, tracker: MeshTracker, tracked: Tracked) -> None:
+        """Keep the image if its pose is a new one, and estimate the shape when there are enough."""
+        assert tracker.observation is not None
+        self._poses.offer(tracker.observation, tracked.fit.pose)
+        if not self._poses.complete:
+            return
+        try:
+            person = personalise(self._model, self._poses.observations, self._poses.poses)
+        except PersonalisationError as error:
+            self._events.append(f"{self._camera}: {error}")
+            self._counters["failed personalisations"] += 1
+            self._poses = DistinctPoses(self._model, self._needed)
+            return
+        self._wear(person.body, person.covariance)
+        self._changed = True
+        self._counters["personalisations"] += 1
+        stature = float(np.ptp(person.body.vertices[:, 1]))
+        self._events.append(f"{self._camera}: body of {stature:.2f} m from {len(self._poses.poses)} images")
+
+    def _wear(self, body: Body, covariance: FloatArray) -> None:
+        self.body, self._covariance = body, covariance
+        if self._tracker is not None:
+            self._tracker.wear(body, covariance)
+
+    def personalise_anew(self) -> None:
+        """Estimate the shape from the next poses, whoever it was of before."""
+        self._poses = DistinctPoses(self._model, self._needed or int(str(_PERSONALISED_FROM.default)))
+
+    def mesh_is_due(self, stamp_ns: int) -> bool:
+        """Whether the mesh of an image is to be published; it is counted as published then."""
+        if self._drawn_ns is not None and 0 <= stamp_ns - self._drawn_ns < self._mesh_ns:
+            return False
+        self._drawn_ns = stamp_ns
+        return True
+
+    def reset(self) -> None:
+        """Forget the person and the background."""
+        if self._tracker is not None:
+            self._tracker.reset()
+
+    def state(self) -> dict[str, object]:
+        """Figures of the last fit."""
+        return {} if self._tracker is None else self._tracker.state()
+
+    def save(self) -> None:
+        """Write the shape of the body into the file, if it is new.
+
+        Raises:
+            PersonFileError: it cannot be written.
+        """
+        if self._file is not None and self._changed:
+            storage.save(self._file, self.body.shape, self._covariance)
+        self._changed = False
+
+
+def _alike(one: Camera, other: Camera) -> bool:
+    """Whether two calibrations are the same, as a driver sends one with each image."""
+    same = (one.width, one.height, one.model) == (other.width, other.height, other.model)
+    return same and np.array_equal(one.matrix, other.matrix) and np.array_equal(one.distortion, other.distortion)

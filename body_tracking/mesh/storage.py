@@ -1,0 +1,55 @@
+"""The shape of a person as a YAML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import yaml
+
+from body_tracking.core import files
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.mesh.body_model import Body, BodyModel
+
+_HEADER: Final = """\
+# Shape of a person written by body_tracking: components of the shipped body model in standard deviations of the
+# population, and their covariance.
+"""
+
+
+class PersonFileError(BodyTrackingError):
+    """A file of a person's shape cannot be read or written."""
+
+
+def save(path: Path, shape: FloatArray, covariance: FloatArray) -> None:
+    """Write a shape (S,) with its covariance (S, S); the file is replaced as a whole or not at all.
+
+    Raises:
+        PersonFileError: the file cannot be written.
+    """
+    content = {"shape": shape.round(6).tolist(), "covariance": covariance.round(8).tolist()}
+    try:
+        files.write_text(path, _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    except files.FileError as error:
+        raise PersonFileError(f"{path}: {error}") from error
+
+
+def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
+    """The body of a person, and the covariance (S, S) of its shape.
+
+    Raises:
+        PersonFileError: the file is missing, is not YAML, or its numbers are no shape of this model.
+    """
+    count = model.vertex_shapes.shape[2]
+    try:
+        data = files.read_yaml(path)
+        shape, covariance = (np.asarray(data[name], dtype=np.float64) for name in ("shape", "covariance"))
+        if covariance.shape != (count, count) or not np.isfinite(covariance).all():
+            raise ValueError(f"covariance of {covariance.shape}, expected ({count}, {count}) finite numbers")
+        if np.linalg.eigvalsh(covariance).min() < -1e-6 or not np.allclose(covariance, covariance.T, atol=1e-6):
+            raise ValueError("covariance: not symmetric and positive semidefinite")
+        return model.body(shape), covariance
+    except (files.FileError, KeyError, TypeError, ValueError) as error:
+        raise PersonFileError(f"{path}: {error}") from error

@@ -1,0 +1,99 @@
+"""The mesh system: depth cameras, and the mesh of a body that is fitted to their images."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.core.qos import RELIABLE
+from body_tracking.mesh.topics import (
+    PERSONALISE_SERVICE,
+    depth_topic,
+    info_topic,
+    mesh_sensor,
+    mesh_topic,
+)
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.system import (
+    NodeSpec,
+    NodeType,
+    Option,
+    Options,
+    Place,
+    Service,
+    System,
+    TopicSpec,
+    asked,
+    transport,
+)
+
+
+def _cameras(options: Options) -> tuple[str, ...]:
+    given = options["depth"]
+    return given if isinstance(given, tuple) else ()
+
+
+def _specs(options: Options) -> Iterable[NodeSpec]:
+    if _cameras(options):
+        given = {"depth": _cameras(options), **asked(options, person="person"), **transport(options)}
+        yield NodeSpec("mesh_tracker", "mesh_tracker", parameters=given)
+
+
+def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
+    wanted = tuple(topic(camera) for camera in _cameras(options) for topic in (info_topic, depth_topic))
+    for topic in wanted:
+        if topic not in topics:
+            raise graph.GraphError(f"no topic {topic}")
+    return wanted
+
+
+SYSTEM = System(
+    "mesh",
+    order=1,
+    nodes=(NodeType("mesh_tracker", Place.IMAGES, "body_tracking.mesh.stage:MeshStage"),),
+    specs=_specs,
+    played=_played,
+    computes=lambda options: tuple(map(mesh_sensor, _cameras(options))),
+    options=(
+        Option(
+            "depth",
+            (),
+            "fit the mesh of a body to the images of this depth camera, /<sensor>/depth/image_raw; its skeletons are "
+            "those of a sensor SENSOR_mesh",
+            "SENSOR",
+            example=("kinect1",),
+        ),
+        Option(
+            "person",
+            "",
+            "YAML file with the shape of the person's body for --depth; written when it was estimated, if not there",
+            "FILE",
+            path=True,
+        ),
+    ),
+    topics=(
+        TopicSpec(
+            graph.skeleton_topic(mesh_sensor("<sensor>")),
+            POINT_CLOUD,
+            graph.SKELETON,
+            "mesh_tracker",
+            "the joints of the fitted body in `<sensor>_mesh_optical_frame`, with covariance as `/fused/skeleton`; "
+            "centres of rotation, joints that the image does not show are inferred",
+        ),
+        TopicSpec(
+            mesh_topic("<sensor>"),
+            "visualization_msgs/msg/Marker",
+            RELIABLE,
+            "mesh_tracker",
+            "the fitted mesh, a list of triangles in the same frame; only while there is a subscriber",
+        ),
+    ),
+    services=(
+        Service(
+            PERSONALISE_SERVICE,
+            "mesh_tracker",
+            "estimate the shape of the person's body anew from the next different poses",
+        ),
+    ),
+    prepare="body_tracking.mesh.tracking:prepare",
+)

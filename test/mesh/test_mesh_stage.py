@@ -1,0 +1,190 @@
+"""The stage of ``mesh_tracker``: bad input, the shape of the person, the mesh, and its place in the graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from depth_recording import recording
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.parameters import check_all
+from body_tracking.core.skeleton import Joint, SingleArray
+from body_tracking.mesh import body_model, stage, storage
+from body_tracking.mesh.codecs import DepthImage, MeshMarker
+from body_tracking.mesh.depth import DepthError
+from body_tracking.mesh.person import COVERED
+from body_tracking.mesh.stage import MeshStage
+from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
+from body_tracking.messages.base import MessageError
+from body_tracking.messages.images import array_to_image
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now, Output
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE
+from body_tracking.systems import nodes_for, options_of, played
+
+INFO, IMAGES, SKELETONS = info_topic("kinect1"), depth_topic("kinect1"), graph.skeleton_topic("kinect1_mesh")
+STAMPS = [*recording().images]
+NOW = Now(0, 0)
+
+
+def made(wanted: bool = False, **given: Any) -> MeshStage:
+    return MeshStage(check_all(MeshStage.PARAMETERS, {"depth": ("kinect1",), **given}), lambda topic: wanted)
+
+
+def take(node: MeshStage, number: int, depth: SingleArray | None = None) -> list[Output]:
+    stamp = STAMPS[number]
+    return [*node.take(IMAGES, (stamp, "camera", recording().images[stamp] if depth is None else depth), NOW)]
+
+
+def calibrated(**given: Any) -> MeshStage:
+    node = made(**given)
+    assert not [*node.take(INFO, recording().camera, NOW)]
+    return node
+
+
+def test_a_skeleton_with_covariance_has_the_stamp_of_its_image() -> None:
+    node = calibrated()
+    (output,) = take(node, 0)
+    (skeleton,) = output.payload
+    assert output.topic == SKELETONS and output.stamp_ns == skeleton.stamp_ns == STAMPS[0]
+    assert skeleton.frame_id == "kinect1_mesh_optical_frame"
+    assert np.linalg.eigvalsh(skeleton.covariances).min() > 0.0
+    assert node.state(0)[0] == 0 and node.counters["kinect1 images"] == 1
+
+
+def test_images_without_camera_info_are_counted_and_named() -> None:
+    node = made()
+    assert take(node, 0) == []
+    assert node.counters["kinect1 images without camera_info"] == 1
+    level, text, _ = node.state(0)
+    assert level == 1 and INFO in text
+    node = calibrated()
+    assert take(node, 1) and node.state(0)[:2] == (0, "")
+
+
+def test_an_image_of_another_size_in_mid_run_is_refused_until_the_calibration_follows() -> None:
+    node = calibrated()
+    take(node, 0)
+    half = recording().images[STAMPS[1]][::2, ::2]
+    with pytest.raises(DepthError, match="128 x 106"):
+        take(node, 1, half)
+    assert node.counters["kinect1 images of another size"] == 1 and node.state(0)[0] == 1
+    assert take(node, 2)  # it did no harm
+    own = recording().camera
+    matrix = np.diag([0.5, 0.5, 1.0]) @ own.matrix
+    [*node.take(INFO, replace(own, width=128, height=106, matrix=matrix), NOW)]
+    assert take(node, 3, np.ascontiguousarray(recording().images[STAMPS[3]][::2, ::2]))
+    # a driver sends its calibration with each image
+    searches = node.counters["kinect1 searches"]
+    [*node.take(INFO, replace(own, width=128, height=106, matrix=matrix.copy()), NOW)]
+    assert take(node, 4, np.ascontiguousarray(recording().images[STAMPS[4]][::2, ::2]))
+    assert node.counters["kinect1 searches"] == searches
+
+
+def test_other_encodings_are_refused_and_counted() -> None:
+    node = calibrated()
+    message = array_to_image(np.zeros((4, 4), np.uint8), 0, "camera", BAG_MESSAGES, "mono8")
+    with pytest.raises(MessageError, match="mono8"):
+        DepthImage().decode(BAG_WIRE.serialize("sensor_msgs/msg/Image", message), BAG_WIRE)
+    node.refused(IMAGES)
+    assert node.counters["kinect1 messages that cannot be used"] == 1
+
+
+@pytest.mark.parametrize("covering", [0.0, np.nan])
+def test_a_covered_lens_and_a_hand_before_it_are_survived(covering: float) -> None:
+    node = calibrated()
+    take(node, 0)
+    image = recording().images[STAMPS[1]]
+    nothing = np.where(np.isnan(covering), 0.0, covering) * image
+    assert take(node, 1, nothing) == [] and COVERED in node.state(0)[1]
+    hand = image.copy()
+    hand[40:, :] = 0.25  # metres
+    take(node, 2, hand)
+    assert take(node, 4) and node.state(0)[0] == 0
+
+
+def test_of_two_people_the_tracked_one_is_kept() -> None:
+    node = calibrated()
+    take(node, 0)
+    for number in range(1, 8):
+        image = recording().images[STAMPS[number]].copy()
+        # the same person once more, a metre nearer to the edge and half a metre nearer to the camera
+        other = np.roll(image, 70, axis=1) - np.float32(0.5)
+        image = np.where((other > 0.3) & (other < image - 0.4) & (np.indices(image.shape)[1] > 150), other, image)
+        (output,) = take(node, number, image)
+        points = output.payload[0].positions
+        assert np.linalg.norm(points - recording().joints[STAMPS[number]], axis=1)[Joint.SPINE_MID] < 0.1
+
+
+def test_the_shape_is_estimated_from_different_poses_and_kept_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "person.yaml"
+    node = calibrated(person=str(file), personalise_from=2)
+    for number in (0, 1, 106):  # the arms hang, and are stretched forward
+        node.sensors["kinect1"].reset()
+        assert not node.counters.get("kinect1 personalisations")
+        take(node, number)
+    assert node.counters["kinect1 personalisations"] == 1 and "body of 1." in node.events[-1]
+    node.save()
+    again = made(person=str(file))
+    np.testing.assert_allclose(again.sensors["kinect1"].body.shape, node.sensors["kinect1"].body.shape, atol=1e-6)
+    assert "poses" in node.services["mesh_tracker/personalise"]()
+    for content in ("shape: [1]", "shape: {}", "- 1", "{shape: [0,0,0,0,0,0,0,0,0,0], covariance: [[1]]}"):
+        file.write_text(content)
+        with pytest.raises(storage.PersonFileError, match=str(file)):
+            made(person=str(file))
+
+
+def test_somebody_else_does_not_get_the_shape_of_who_has_left() -> None:
+    node = calibrated()
+    sensor = node.sensors["kinect1"]
+    take(node, 0)
+    sensor._wear(body_model.load().body(np.full(10, 0.5)), 0.1 * np.eye(10))
+    for number in range(1, 20):
+        take(node, number, np.zeros_like(recording().images[STAMPS[0]]))
+    assert node.counters["kinect1 people lost"] == 1 and not sensor.body.shape.any()
+
+
+def test_the_mesh_is_published_where_a_subscriber_is_and_at_its_rate() -> None:
+    node = calibrated(wanted=True)
+    meshes = [each for number in range(8) for each in take(node, number) if each.topic == mesh_topic("kinect1")]
+    assert len(meshes) == 2  # 5 of 30 a second
+    message = BAG_WIRE.deserialize("visualization_msgs/msg/Marker", MeshMarker().encode(meshes[0].payload, BAG_WIRE))
+    faces = node.sensors["kinect1"].body.model.faces
+    assert message.type == 11 and len(message.points) == faces.size
+    points = np.array([[p.x, p.y, p.z] for p in message.points])
+    assert np.abs(points.mean(axis=0) - recording().joints[STAMPS[0]].mean(axis=0)).max() < 0.5
+
+
+def test_time_that_jumped_back_forgets_the_person() -> None:
+    node = calibrated()
+    take(node, 1)
+    node.reset(IMAGES)
+    assert take(node, 0) and node.counters["kinect1 searches"] == 2
+
+
+@pytest.mark.parametrize("cameras", [(), ("kinect1", "kinect1")])
+def test_cameras_are_named_each_once(cameras: tuple[str, ...]) -> None:
+    with pytest.raises(graph.GraphError, match="depth cameras"):
+        made(depth=cameras)
+
+
+def test_a_depth_camera_is_a_sensor_of_the_graph_that_its_mesh_tracker_computes() -> None:
+    alone = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",)))}
+    assert "mesh_tracker" in alone and not any("_skeleton" in name for name in alone)
+    assert alone["fusion"].parameters["sensors"] == ("kinect1_mesh",)
+    both = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",), sensors=("kinect2",)))}
+    assert both["fusion"].parameters["sensors"] == ("kinect2", "kinect1_mesh") and "kinect2_skeleton" in both
+    options = options_of(depth=("kinect1",), bag="bag")
+    assert played(options, {INFO, IMAGES}) == (INFO, IMAGES)
+    with pytest.raises(graph.GraphError, match=IMAGES):
+        played(options, {INFO, "/kinect1/skeleton"})
+
+
+def test_calibrations_are_compared_by_value() -> None:
+    own = recording().camera
+    assert stage._alike(own, replace(own, matrix=own.matrix.copy()))
+    assert not stage._alike(own, Camera(own.frame_id, own.width, own.height, own.matrix, np.zeros(5)))
