@@ -19,7 +19,8 @@ dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematic
 ====== ================================================================================================================
 
 Uncertainty is propagated by the analytic Jacobian. Near a singular pose it grows as 1 / sin, up to that of a uniform
-angle, and the angles are held continuous (``kinematics.euler``). An unobserved angle has the standard deviation of its
+angle, and the angles are held continuous (``kinematics.euler``). It grows up to the same before angles that have left
+their usual ranges, after a path through a singular pose, jump back into them. An unobserved angle has the standard deviation of its
 prior.
 """
 
@@ -169,6 +170,7 @@ class Convention:
         values = np.zeros(self._size)
         values[self._scalar_row] = estimate.q[self._scalar]
         gradients, rates = self._identity.copy(), self._identity.copy()
+        doubt = np.zeros(self._size)
         for stage, (sequences, parents, children, rows) in enumerate(self.stages):
             if stage == 1 and self._frames:
                 rotations, turning = self._extend(rotations, turning, values, gradients)
@@ -181,11 +183,12 @@ class Convention:
                 back @ rotations[children], uncertain, None if before is None else before[rows].reshape(-1, 3)
             )
             values[rows] = split.angles.reshape(-1)
+            doubt[rows] = np.repeat(split.doubt, 3)
             gradients[rows] = (split.gradients @ turned).reshape(-1, nv - 6)
             rates[rows] = (split.rates @ turned).reshape(-1, nv - 6)
 
         gradient, rate_gradient = gradients[self.rows], rates[self.rows]
-        stddev = _stddev(gradient, covariance, unknown)
+        stddev = np.hypot(_stddev(gradient, covariance, unknown), doubt[self.rows] * UNIFORM_STDDEV)
         lost_angle = self._redundant | np.isinf(stddev)
         velocity_stddev = _stddev(gradient, velocity_covariance, unknown_rate)
         return JointAngles(

@@ -42,6 +42,8 @@ MARGIN = np.radians(60.0)
 A continuous path through singular poses can end in angles such as -180, 180, 180 deg for hanging arms. An arm that
 swings back through hanging needs 60 deg (extension).
 """
+_ANNOUNCED = np.radians(40.0)
+"""Radians beyond its usual range from which an angle is the less certain the nearer the jump at :data:`MARGIN` is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +69,13 @@ class Split:
         angles: (n, 3) radians.
         gradients: (n, 3, 3) of the angles by the angular velocity, in the parent's frame; huge at a singular pose.
         rates: (n, 3, 3) the same for angles that are held as :attr:`angles` are.
+        doubt: (n,) from 0 to 1: how near the three angles are to a jump back into their usual ranges.
     """
 
     angles: FloatArray
     gradients: FloatArray
     rates: FloatArray
+    doubt: FloatArray
 
 
 class EulerSequences:
@@ -137,23 +141,29 @@ class EulerSequences:
         angles[..., 1] = b + self._offset
         angles[..., 2] = self._sign * c
         chosen, best = self._choose(angles, previous)
-        return Split(chosen, *self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold))
+        derivatives = self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold)
+        beyond = self._excess(chosen)[:, :2].max(axis=1) - _ANNOUNCED
+        return Split(chosen, *derivatives, np.clip(beyond / (MARGIN - _ANNOUNCED), 0.0, 1.0))
 
     def _choose(self, angles: FloatArray, previous: FloatArray | None) -> tuple[FloatArray, BoolArray]:
-        """(n, 3) the better of (2, n, 3) solutions, with their full turns, and (n,) whether it is the first."""
+        """(n, 3) the better of (2, n, 3) solutions, with their full turns, and (n,) whether it is the first.
+
+        The last angle's range does not choose: the direction that the first two are is better known, and a straight arm
+        that noise has rotated beyond its range is not to have its direction reversed.
+        """
         near = self._centre if previous is None else previous
         angles = angles + _TURN * np.rint((near - angles) / _TURN)
         if previous is None:
             cost = np.abs(angles) + 100.0 * self._excess(angles)
         else:
             excess = self._excess(angles)
-            # continuity first; of two solutions as near the more usual one
-            cost = np.abs(angles - previous) + 0.1 * excess
             if excess.max() > MARGIN:
                 usual = angles + _TURN * np.rint((self._centre - angles) / _TURN)
                 angles = np.where(excess > MARGIN, usual, angles)
                 excess = self._excess(angles)
-                cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
+            excess[..., 2] = 0.0
+            # continuity first; of two solutions as near the more usual one
+            cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
         total = cost.sum(axis=-1)
         best: BoolArray = total[0] <= total[1]
         return np.where(best[:, None], angles[0], angles[1]), best
