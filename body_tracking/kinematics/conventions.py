@@ -20,8 +20,8 @@ dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematic
 
 Uncertainty is propagated by the analytic Jacobian. Near a singular pose it grows as 1 / sin, up to that of a uniform
 angle, and the angles are held continuous (``kinematics.euler``). It grows up to the same before angles that have left
-their usual ranges, after a path through a singular pose, jump back into them. An unobserved angle has the standard deviation of its
-prior.
+their usual ranges, after a path through a singular pose, jump back into them. An unobserved angle has the standard
+deviation of its prior.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
@@ -46,6 +47,10 @@ _STEPS, _TOLERANCE = 4, 2e-3
 """Largest number of steps of a fit that starts from the frame before, and the step size that ends it, rad and m."""
 _MAX_RATE = 10.0
 """rad/s and m/s: prior standard deviation of a rate."""
+_BAND = 1.96
+"""Standard deviations of a 95 % band."""
+_DOUBT_S = 0.2
+"""Seconds in which the doubt about an angle that has jumped falls to 1 / e."""
 _TRUNK = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
 
 
@@ -159,6 +164,38 @@ class SkeletonFit:
         return velocity, covariance
 
 
+class JumpDoubt:
+    """Adds to the deviations of angles that have jumped.
+
+    Where two successive estimates of an angle lie farther apart than both their 95 % bands allow, one of them was
+    wrong, and nothing says which: sides were swapped, a limb was found again, or the convention's angles jumped back
+    into their usual ranges. The deviation then covers the value before, and returns to the stated one within half a
+    second or so.
+    """
+
+    def __init__(self) -> None:
+        self._last: JointAngles | None = None
+        self._doubt: FloatArray = np.zeros(0)
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._last = None
+
+    def __call__(self, angles: JointAngles) -> JointAngles:
+        """The angles of the next instant, with their deviations, radians."""
+        last, self._last = self._last, angles
+        if last is None or last.names != angles.names:
+            self._doubt = np.zeros(len(angles.names))
+            return angles
+        seconds = (angles.stamp_ns - last.stamp_ns) / NANOSECONDS
+        moved = np.nan_to_num(0.5 * seconds * (last.velocity + angles.velocity))
+        step = np.abs(np.remainder(angles.position - last.position - moved + np.pi, 2.0 * np.pi) - np.pi)
+        jumped = step > _BAND * np.hypot(last.position_stddev, angles.position_stddev)  # never where one is NaN
+        self._doubt *= math.exp(-max(seconds, 0.0) / _DOUBT_S)
+        self._doubt = np.where(jumped, np.maximum(self._doubt, step / _BAND), self._doubt)
+        return replace(angles, position_stddev=np.hypot(angles.position_stddev, self._doubt))
+
+
 class AngleStream:
     """Joint angles in one convention, of skeletons or of states of ``upper_body``, one instant after the other.
 
@@ -177,18 +214,21 @@ class AngleStream:
         self.model = UpperBody()
         self.fit = SkeletonFit(self.model)
         self._previous: JointAngles | None = None
+        self._doubt = JumpDoubt()
         self._forget_after_ns = forget_after * NANOSECONDS
 
     def reset(self) -> None:
         """Forget the person."""
         self.fit.reset()
+        self._doubt.reset()
         self._previous = None
 
     def of_skeleton(self, skeleton: Skeleton) -> JointAngles | None:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
-        if self.convention == POSITIONAL:
-            return positional_angles(skeleton)
         self._reset_after_gap(skeleton.stamp_ns)
+        if self.convention == POSITIONAL:
+            self._previous = positional_angles(skeleton)
+            return self._doubt(self._previous)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)
 
@@ -201,7 +241,7 @@ class AngleStream:
         self._reset_after_gap(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)
         self._previous = angles
-        return angles
+        return self._doubt(angles)
 
     def _reset_after_gap(self, stamp_ns: int) -> None:
         if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:

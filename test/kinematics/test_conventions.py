@@ -345,6 +345,31 @@ def test_angles_are_continuous_through_singular_poses(name: str, kind: str, offs
         before = angles
 
 
+def test_an_arm_that_noise_rotates_beyond_its_range_keeps_its_direction() -> None:
+    """Seen on a real pair of Kinects (p07_45deg): abduction of a hanging arm went from -34 to 213 deg."""
+    before: JointAngles | None = None
+    for rotation in np.arange(0.0, -400.0, -5.0):
+        before = angles_of(estimate(arms(20.0, -34.0, rotation), 8.0 * DEGREE), MODEL, "model", before)
+        values = by_name(before)
+        for side, _ in SIDES:
+            shoulder = np.degrees([values[f"shoulder_flexion_{side}"], values[f"shoulder_abduction_{side}"]])
+            np.testing.assert_allclose(shoulder, [20.0, -34.0], atol=1e-6)
+
+
+def test_the_deviation_announces_a_jump_back_into_the_usual_ranges() -> None:
+    """An arm that swings through hanging and on by 90 deg, farther than its elevation stays positive."""
+    before: JointAngles | None = None
+    jumps = 0
+    for flexion in np.arange(50.0, -90.1, -3.0):
+        angles = angles_of(estimate(arms(flexion, 0.5), 3.0 * DEGREE), MODEL, "isb", before)
+        if before is not None:
+            jumped = np.abs(angles.position - before.position) > 60.0 * DEGREE
+            jumps += int(jumped.sum())
+            assert (before.position_stddev[jumped] > 60.0 * DEGREE).all()
+        before = angles
+    assert jumps > 0
+
+
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_rates_of_held_angles_are_the_derivatives_of_the_held_angles(name: str) -> None:
     """One degree from the singular pose, known to 3 deg: the first angle is held, the last takes the whole turn."""

@@ -9,10 +9,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.conventions import ConventionError, angles_of
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, LengthChanges, SkeletonFit, segment_poses
+from body_tracking.kinematics.tracking import (
+    ALL_CONVENTIONS,
+    AngleStream,
+    JumpDoubt,
+    LengthChanges,
+    SkeletonFit,
+    segment_poses,
+)
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 
 MODEL = UpperBody()
@@ -140,6 +148,24 @@ def test_a_stream_has_the_same_names_from_frame_to_frame_and_starts_anew_when_to
         np.testing.assert_array_equal(again.position, before.position)
     if convention == "positional":
         np.testing.assert_array_equal(first[3].position, positional_angles(seen(3 * FRAME)).position)
+
+
+def stated(seconds: float, degrees: float, rate: float = 0.0, stddev: float = 5.0) -> JointAngles:
+    one = np.radians([1.0])
+    return JointAngles(round(seconds * 1e9), ("elbow",), degrees * one, rate * one, stddev * one, 30.0 * one)
+
+
+def test_a_jump_that_contradicts_the_deviations_is_doubted_for_a_while() -> None:
+    doubt = JumpDoubt()
+    moving = [doubt(stated(k * FRAME, 600.0 * k * FRAME, 600.0)) for k in range(6)]  # 20 deg a frame, as stated
+    still = [doubt(stated(k * FRAME, 100.0 + noise)) for k, noise in zip(range(6, 9), (0.0, 12.0, 0.0), strict=True)]
+    for angles in (*moving, *still[1:]):
+        assert angles.position_stddev == pytest.approx(np.radians(5.0))
+    jumped = doubt(stated(9 * FRAME, 180.0))
+    assert abs(np.radians(100.0) - jumped.position[0]) <= 1.96 * jumped.position_stddev[0]
+    later = [np.degrees(doubt(stated(k * FRAME, 180.0)).position_stddev[0]) for k in range(10, 40)]
+    assert (np.diff(later) < 0.0).all() and later[0] > 30.0 and later[-1] < 5.1
+    assert np.degrees(doubt(stated(40 * FRAME, -179.0)).position_stddev[0]) < 5.1  # the same angle, a full turn on
 
 
 def test_another_convention_is_refused() -> None:
