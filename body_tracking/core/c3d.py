@@ -43,7 +43,6 @@ class C3dPoints:
         rate: frames per second.
         stamps: (n,) seconds.
         computed: labels of points that are angles, forces, moments, powers or scalars.
-        angle_unit: radians per unit of an angle.
         processing: the numbers in the group PROCESSING.
     """
 
@@ -54,18 +53,16 @@ class C3dPoints:
     rate: float
     stamps: FloatArray
     computed: frozenset[str]
-    angle_unit: float
     processing: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One subject of a file: (n, 3) metres per point, z up (angles in the file's units), NaN where it is not seen."""
+    """One subject of a file: (n, 3) metres per point, z up, NaN where it is not seen."""
 
     points: dict[str, FloatArray]
     rate: float
     stamps: FloatArray
-    angle_unit: float
     processing: dict[str, float]
 
     @property
@@ -127,7 +124,6 @@ def read_points(path: Path) -> C3dPoints:
         rate,
         (int(header["first_frame"]) + np.arange(len(data))) / rate,
         frozenset(label for name in _COMPUTED for label in all_of(name)),
-        1.0 if str(value("POINT", "ANGLE_UNITS", "deg")).startswith("rad") else np.radians(1.0),
         {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
     )
 
@@ -150,12 +146,8 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
     if up not in UP_FIRST:
         raise MarkerError(f"{path}: the axis that points up (POINT:Y_SCREEN) is {up!r}, expected +X, +Y or +Z")
     chosen = _of_subject(path, list(file.labels), subject, wanted)
-    angles = file.computed | {label for label in file.labels if label.endswith("Angles")}
-    points = {
-        name: file.data[:, index] if file.labels[index] in angles else file.scale * file.data[:, index][:, UP_FIRST[up]]
-        for name, index in chosen.items()
-    }
-    return Trial(points, file.rate, file.stamps, file.angle_unit, file.processing)
+    points = {name: file.scale * file.data[:, index][:, UP_FIRST[up]] for name, index in chosen.items()}
+    return Trial(points, file.rate, file.stamps, file.processing)
 
 
 def _announced_frames(path: Path) -> int:

@@ -1,6 +1,6 @@
-"""Marker trajectories as truth: joint centres and arm angles from C3D files with Vicon's Plug-in Gait markers.
+"""Marker trajectories as truth: joint centres from C3D files with Vicon's Plug-in Gait markers.
 
-Source: Vicon, "Plug-in Gait Reference Guide" (marker placement, joint centres by the chord function, segments, angles);
+Source: Vicon, "Plug-in Gait Reference Guide" (marker placement, joint centres by the chord function);
 Davis, Ounpuu, Tyburski and Gage, Human Movement Science 10 (1991), for the hip. Gaps shorter than 0.2 s are filled by
 splines and the trajectories smoothed by splines under generalised cross-validation (Woltring 1986), as Schlagenhauf
 did (2017, section 5.6.3).
@@ -33,13 +33,6 @@ Where not to trust it. The elbow is set off from ELB at a right angle to the pla
 along the flexion axis only while the elbow is bent. Of a straight arm in a T-pose, palm down and the markers in their
 places, Plug-in Gait makes a flexion of 27 degrees and an elbow that is off by 64 mm; of a true flexion of 30 degrees 37
 (16 mm), of 60 degrees 63 (7 mm), of 90 degrees 91 (3 mm). What Vicon writes is computed so, too.
-
-Angles. Elbow flexion: between the lines from shoulder to elbow and from elbow to wrist, 0 straight. Shoulder: the
-rotation of the humerus (z from elbow to shoulder, x towards the wrist at a right angle to z, y to the left) against the
-thorax is ``Rx(a) Ry(b) Rz(c)`` about x, then the turned y, then the twice turned z; flexion = -b, and abduction and
-internal rotation = a, -c on the left and -a, c on the right. This is what Vicon writes as ``LShoulderAngles`` (to a few
-ten-thousandths of a degree from Vicon's own segments), although its guide names the order flexion, abduction, rotation.
-All are 0 for a hanging arm with the forearm forward; at a flexion of 90 degrees the other two are undetermined.
 """
 
 from __future__ import annotations
@@ -85,16 +78,6 @@ _ELBOWS = (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT)
 _WRISTS = (Joint.WRIST_LEFT, Joint.WRIST_RIGHT)
 _HANDS = (Joint.HAND_LEFT, Joint.HAND_RIGHT)
 _HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
-
-_MODELLED: tuple[tuple[tuple[Joint, Joint], str, str], ...] = (
-    (_SHOULDERS, "SJC", "CLO"),
-    (_ELBOWS, "EJC", "HUO"),
-    (_WRISTS, "WJC", "RAO"),
-    (_HIPS, "HJC", "FEP"),
-)
-"""Vicon's joint centres, without L and R: points of that name, or the origin of the segment that begins there."""
-_HAND_END = "HNO"
-"""Vicon's hand centre is half way from the wrist to here."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,19 +155,6 @@ class Measurements:
         return replace(self, **used, asis_distance=width), estimated
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmAngles:
-    """Plug-in Gait's angles of both arms (module docstring), radians, NaN where unknown.
-
-    Attributes:
-        elbow: (n, 2) flexion, left and right.
-        shoulder: (n, 2, 3) flexion, abduction, internal rotation, left and right.
-    """
-
-    elbow: FloatArray
-    shoulder: FloatArray
-
-
 @dataclass(frozen=True, slots=True)
 class Gap:
     """A marker that is not seen for so long that nothing is made up for it; ends are stamps of unseen frames, s."""
@@ -203,29 +173,19 @@ class MarkerTruth:
 
     Attributes:
         stamps: (n,) s since the start of the trial, of which the file may be a part.
-        rate: frames per second.
         positions: (n, 25, 3) metres, z up, in the axes of the marker system; NaN where unknown.
-        thorax: (n, 3, 3) axes of the thorax as columns: forward, left, up.
-        angles: of the arms, from ``positions`` and ``thorax``.
         missing: the names of :data:`MARKERS` that the file does not hold or that are never seen.
         gaps: what was left open.
         measurements: those used.
         estimated: the names of the measurements that are estimates.
-        vicon_positions: (n, 25, 3) metres, the joint centres that Vicon wrote into the file; NaN where none.
-        vicon_angles: those that Vicon wrote into the file; NaN where none.
     """
 
     stamps: FloatArray
-    rate: float
     positions: FloatArray
-    thorax: FloatArray
-    angles: ArmAngles
     missing: tuple[str, ...]
     gaps: tuple[Gap, ...]
     measurements: Measurements
     estimated: tuple[str, ...]
-    vicon_positions: FloatArray
-    vicon_angles: ArmAngles
 
 
 def read_plug_in_gait(
@@ -235,7 +195,7 @@ def read_plug_in_gait(
     measurements: Measurements | None = None,
     smoothing: bool = True,
 ) -> MarkerTruth:
-    """Joint centres and arm angles from a C3D file.
+    """Joint centres from a C3D file.
 
     Args:
         path: of the file.
@@ -265,24 +225,13 @@ def read_plug_in_gait(
     if smoothing:
         markers = {name: smooth(each) for name, each in markers.items()}
     used, estimated = (measurements or Measurements.from_parameters(trial.processing)).completed(markers)
-    positions, thorax = joint_centres(markers, used)
+    positions = joint_centres(markers, used)
     if not np.isfinite(positions[:, _WRISTS]).any():
         raise MarkerError(
             f"{path}: no arm can be placed in any of {trial.frames} frames"
             + (f"; markers not seen for {LONGEST_GAP} s or longer: {'; '.join(map(str, gaps))}" if gaps else "")
         )
-    return MarkerTruth(
-        trial.stamps,
-        trial.rate,
-        positions,
-        thorax,
-        arm_angles(positions, thorax),
-        missing,
-        gaps,
-        used,
-        estimated,
-        *_vicon(trial),
-    )
+    return MarkerTruth(trial.stamps, positions, missing, gaps, used, estimated)
 
 
 def read_measurements(path: Path | str) -> Measurements:
@@ -335,7 +284,7 @@ def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, t
     return centre
 
 
-def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> tuple[FloatArray, FloatArray]:
+def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> FloatArray:
     """Joint centres as the module's docstring tells; the truth of Jatesiktat et al. (2018), section IV-A.
 
     Args:
@@ -343,7 +292,7 @@ def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements)
         measurements: NaN where unknown; what depends on these is unknown, but for the hips.
 
     Returns:
-        (n, 25, 3) positions, metres, and (n, 3, 3) axes of the thorax as columns; NaN where unknown.
+        (n, 25, 3) metres, NaN where unknown.
     """
     positions = np.full((len(markers["CLAV"]), N_JOINTS, 3), np.nan)
     radius = 0.5 * measurements.marker_diameter
@@ -355,7 +304,6 @@ def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements)
     up, down = markers["C7"] + markers["CLAV"], markers["T10"] + markers["STRN"]
     z = _unit(up - down)
     x = _rejected(markers["CLAV"] + markers["STRN"] - markers["C7"] - markers["T10"], z)
-    thorax = np.stack([x, np.cross(z, x), z], axis=-1)
     origin = (markers["CLAV"] - radius * x)[:, None]
 
     acromion, lateral = both("SHO"), both("ELB")
@@ -385,7 +333,7 @@ def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements)
     positions[:, Joint.SPINE_SHOULDER] = 0.5 * up
     positions[:, Joint.SPINE_MID] = 0.5 * down
     positions[:, Joint.HEAD] = 0.5 * (both("FHD") + both("BHD")).mean(axis=1)
-    return positions, thorax
+    return positions
 
 
 def _hips(anterior: FloatArray, posterior: FloatArray, measurements: Measurements) -> FloatArray:
@@ -415,26 +363,6 @@ def _hips(anterior: FloatArray, posterior: FloatArray, measurements: Measurement
     return hips
 
 
-def arm_angles(positions: FloatArray, thorax: FloatArray) -> ArmAngles:
-    """Angles of both arms by Plug-in Gait's convention (module docstring).
-
-    Args:
-        positions: (n, 25, 3).
-        thorax: (n, 3, 3) its axes as columns: forward, left, up.
-    """
-    upper = positions[:, _SHOULDERS] - positions[:, _ELBOWS]
-    forearm = positions[:, _WRISTS] - positions[:, _ELBOWS]
-    elbow = np.arctan2(np.linalg.norm(np.cross(upper, forearm), axis=-1), -(upper * forearm).sum(axis=-1))
-    z = _unit(upper)
-    x = _rejected(forearm, z)
-    humerus = np.einsum("nji,nsjk->nsik", thorax, np.stack([x, np.cross(z, x), z], axis=-1))
-    a = np.arctan2(-humerus[..., 1, 2], humerus[..., 2, 2])
-    b = np.arctan2(humerus[..., 0, 2], np.hypot(humerus[..., 0, 0], humerus[..., 0, 1]))
-    c = np.arctan2(-humerus[..., 0, 1], humerus[..., 0, 0])
-    shoulder = np.stack([-b, _SIDE * a, -_SIDE * c], axis=-1)
-    return ArmAngles(elbow, shoulder)
-
-
 def _require(path: Path, trial: Trial, missing: tuple[str, ...]) -> None:
     lacking = [name for name in THORAX_MARKERS if name in missing]
     arms = [[side + name for name in ARM_MARKERS if side + name in missing] for side in "LR"]
@@ -452,23 +380,6 @@ def _require(path: Path, trial: Trial, missing: tuple[str, ...]) -> None:
         f"{text}; needed are {listed(THORAX_MARKERS)} and of one side {listed(ARM_MARKERS)}; found "
         f"{listed(found)} of Plug-in Gait's and {len(others)} other points ({listed(others, 10)})"
     )
-
-
-def _vicon(trial: Trial) -> tuple[FloatArray, ArmAngles]:
-    """What Vicon computed itself."""
-    unknown = np.full((trial.frames, 3), np.nan)
-    positions = np.full((trial.frames, N_JOINTS, 3), np.nan)
-    for joints, centre, origin in _MODELLED:
-        for joint, side in zip(joints, "LR", strict=True):
-            positions[:, joint] = trial.points.get(side + centre, trial.points.get(side + origin, unknown))
-    for hand, wrist, side in zip(_HANDS, _WRISTS, "LR", strict=True):
-        positions[:, hand] = 0.5 * (positions[:, wrist] + trial.points.get(side + _HAND_END, unknown))
-    positions[:, Joint.SPINE_BASE] = positions[:, _HIPS].mean(axis=1)
-
-    def angles(name: str) -> FloatArray:
-        return trial.angle_unit * np.stack([trial.points.get(f"{side}{name}Angles", unknown) for side in "LR"], axis=1)
-
-    return positions, ArmAngles(angles("Elbow")[..., 0], angles("Shoulder"))
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
