@@ -205,25 +205,19 @@ def _measure(job: tuple[str, Any, str]) -> dict[str, float]:
     return _FIGURES[part](run, name)
 
 
-def table(part: str, names: Sequence[str], runs: Sequence[Any], processes: int) -> tuple[dict[str, Any], str]:
-    """Measure one part; the figures of each mechanism, and a table of them."""
+def figures_of(part: str, names: Sequence[str], runs: Sequence[Any], processes: int) -> dict[str, dict[str, Any]]:
+    """Of each mechanism that is off the mean of each figure, and how it differs from that with all mechanisms."""
     jobs = [(part, run, name) for run in runs for name in names]
     results = dict(zip(jobs, common.mapped(_measure, jobs, processes), strict=True))
-    columns = list(next(iter(results.values())))
-    lines = [f"\n{part}: {len(runs)} recordings", f"{'without':24}" + "".join(f"{each:>20}" for each in columns)]
-    figures: dict[str, Any] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for name in names:
-        cells, figures[name] = [], {}
-        for column in columns:
+        row = figures[f"without {name}" if name != ALL else ALL] = {}
+        for column in next(iter(results.values())):
             values = np.array([results[part, run, name][column] for run in runs])
-            mean, apart = (
-                common.Mean.of(each) for each in (values, values - [results[part, run, ALL][column] for run in runs])
-            )
-            figures[name][column] = {"mean": mean.value, "difference": apart}
-            change = f" ({apart.value:+.1f} ±{apart.half:.1f})" if name != ALL and len(runs) > 1 else ""
-            cells.append(f"{f'{mean.value:.1f}{change}':>20}")
-        lines.append(f"{name:24}" + "".join(cells))
-    return figures, "\n".join(lines)
+            row[column] = float(np.nanmean(values))
+            if name != ALL:
+                row[f"{column}, change"] = common.Mean.of(values - [results[part, run, ALL][column] for run in runs])
+    return figures
 
 
 def main() -> int:
@@ -248,12 +242,9 @@ def main() -> int:
         if not of_part.get(part, runs):
             common.progress(f"{part}: left out, no recordings in {args.data}")
             continue
-        figures[part], text = table(
-            part, list(POSTURE if part == "posture" else SIDES), of_part.get(part, runs), args.jobs
-        )
-        if not common.prints_json(args):
-            print(text)
-    common.report(args, figures, lambda: None)
+        names = list(POSTURE if part == "posture" else SIDES)
+        figures[part] = figures_of(part, names, of_part.get(part, runs), args.jobs)
+    common.report(args, figures)
     return 0
 
 

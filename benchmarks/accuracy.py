@@ -138,7 +138,7 @@ def outputs_of(recording: SimulatedRecording, methods: Sequence[str]) -> dict[st
     hers = [name for name in (LKF1, LKF2, EKF) if name in methods]
     if hers:
         names = [sensor.pose.sensor for sensor in recording.sensors]
-        outputs |= {name: run_thesis(recording.frames, names, hers).outputs[name] for name in hers}
+        outputs |= {name: own for name, own in run_thesis(recording.frames, names, hers).items() if name in hers}
     for name, filter_name in ((DEFAULT, DEFAULT_FILTER), (OURS, "ekf")):
         if name in methods:
             fused, outputs[name] = run_ours(recording, filter_name)
@@ -275,18 +275,6 @@ def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
     ]
     kinds = [f"{run.parameter} x{run.factor:g}" for run in runs]
     return table_of(kinds, common.mapped(_measure, [(run, (LKF2, EKF, DEFAULT, OURS)) for run in runs], workers))
-
-
-def show(table: Table, figures: Sequence[str]) -> None:
-    """Print a table for each figure."""
-    for figure in figures:
-        print(f"\n{figure}")
-        methods = list(next(iter(table.values())))
-        width = max(len(kind) for kind in table) + 2
-        print(" " * width + "".join(f"{method[:15]:>17}" for method in methods))
-        for kind, row in table.items():
-            cells = (f"{row[method][figure].value:9.2f} ±{row[method][figure].half:6.2f}" for method in methods)
-            print(f"{kind:<{width}}" + "".join(cells))
 
 
 # --- the page
@@ -453,7 +441,6 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write docs/accuracy.md and its figure")
     args = parser.parse_args()
     parts = _read(args.out) if args.out and args.out.exists() else {}
-    everything = [item.name for item in fields(Figures)]
     for part in args.parts:
         if part == "main":
             parts[part] = main_part(args.seeds, args.jobs, args.motions)
@@ -463,9 +450,7 @@ def main() -> int:
             parts[part] = sensitivity_part(args.sensitivity_seeds, args.jobs, [TWIST, "reaching"])
         else:
             parser.error(f"no such part: {part}")
-        if not common.prints_json(args):
-            show(parts[part], everything if part == "main" else ["error", "fixed"])
-    common.report(args, parts, lambda: None)
+    common.report(args, parts)
     if args.write:
         (DOCS / "accuracy.md").write_text(page(parts))
         if "layouts" in parts:

@@ -114,7 +114,7 @@ def subject(seed: int, errors: KinectErrors) -> Subject:
     for motion in E1_MOTIONS:
         recording = _subject(motion, seed, errors)
         names = [sensor.pose.sensor for sensor in recording.sensors]
-        estimate, curve = _in_seconds(run_thesis(recording.frames, names, (LKF2,)).outputs[LKF2], recording)
+        estimate, curve = _in_seconds(run_thesis(recording.frames, names, (LKF2,))[LKF2], recording)
         delay = find_delay(estimate, curve)
         times = grid(max(estimate.times[0], curve.span[0] + delay), min(estimate.times[-1], curve.span[1] + delay))
         found.append(estimate.at(times, 0.2).positions)
@@ -207,30 +207,18 @@ def main() -> int:
     errors = KinectErrors() if args.config is None else read_errors(args.config)
     mae = table_e1(subjects_of(errors, args.subjects))
     tables = table_4_4(errors, args.subjects)
-    common.report(args, {"E.1": mae, "4.4": tables}, lambda: (show_e1(mae), show_4_4(tables)))
+    text = page(mae, tables, args.subjects)
+    common.report(args, {"E.1": mae, "4.4": tables}, lambda: print(text))
     if args.write:
-        write_page(mae, tables, args.subjects)
+        # what ``simulated_pairs`` wrote there stays
+        kept = PAGE.read_text().partition(PAIRS)[1:] if PAGE.exists() else ()
+        PAGE.write_text(f"{_HEAD}\n{text}\n{''.join(kept)}")
     return int(off_by_too_much(mae).any())
 
 
 def off_by_too_much(mae: FloatArray) -> BoolArray:
     """(10, 3) which figures of table E.1 are off by more than they may be."""
     return np.abs(mae / np.array(list(E1.values())) - 1.0) > WITHIN
-
-
-def show_e1(mae: FloatArray) -> None:
-    """Print table E.1."""
-    print(f"\ntable E.1, LKF2, MAE in mm: simulated (thesis)\n{'':16}{'x':>16}{'y':>16}{'z':>16}")
-    far = off_by_too_much(mae)
-    for (joint, hers), row, marks in zip(E1.items(), mae, far, strict=True):
-        cells = (
-            f"{own:7.1f} ({other:5.1f}){'*' if mark else ' '}"
-            for own, other, mark in zip(row, hers, marks, strict=True)
-        )
-        print(f"{joint.name.lower():16}" + " ".join(cells))
-    means = np.array(list(E1.values())).mean(axis=0)
-    print(f"{'mean':16}" + " ".join(f"{a:7.1f} ({b:5.1f}) " for a, b in zip(mae.mean(axis=0), means, strict=True)))
-    print(f"{far.sum()} of 30 are off by more than {WITHIN:.0%}")
 
 
 def table_4_4(errors: KinectErrors, subjects: int) -> dict[str, dict[str, list[list[float]]]]:
@@ -248,21 +236,6 @@ def table_4_4(errors: KinectErrors, subjects: int) -> dict[str, dict[str, list[l
     return tables
 
 
-def show_4_4(tables: dict[str, dict[str, list[list[float]]]]) -> None:
-    """Print table 4.4."""
-    print("\ntable 4.4, RMSE in degrees against yaw: simulated (thesis)")
-    for motion, table in tables.items():
-        print(f"{motion:18}" + "".join(f"{yaw:>11} deg  " for yaw in YAWS))
-        for name, row in zip(TABLE_4_4[motion], table["angles"], strict=True):
-            hers = TABLE_4_4[motion][name]
-            print(f"  {name:16}" + "".join(f"{a:7.1f} ({b:5.1f})  " for a, b in zip(row, hers, strict=True)))
-        means = np.mean(table["angles"], axis=0)
-        hers = np.mean(list(TABLE_4_4[motion].values()), axis=0)
-        print(f"  {'mean':16}" + "".join(f"{a:7.1f} ({b:5.1f})  " for a, b in zip(means, hers, strict=True)))
-        print(f"  {'3D error, mm':16}" + "".join(f"{value:7.0f}          " for value in table["error"][0]))
-    print(f"(3D errors of {JOINT_ERROR[0]:.0f} to {JOINT_ERROR[1]:.0f} mm are reported of one sensor)")
-
-
 PAGE = common.ROOT / "docs" / "simulator.md"
 PAIRS = "## Real and simulated pairs"
 _HEAD = """# How realistic the simulated sensors are
@@ -277,10 +250,9 @@ against Vicon, and the offsets of the spine follow table E.1 of Schlagenhauf (20
 """
 
 
-def write_page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]], count: int) -> None:
-    """docs/simulator.md; what ``simulated_pairs`` wrote there stays."""
+def page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]], count: int) -> str:
+    """The two tables in Markdown."""
     lines = [
-        _HEAD,
         "## Table E.1",
         "",
         f"Mean absolute error of the thesis's LKF2 in layout 4, mm: the median of {count} simulated subjects, and in",
@@ -313,8 +285,7 @@ def write_page(mae: FloatArray, tables: dict[str, dict[str, list[list[float]]]],
         means = zip(np.mean(table["angles"], axis=0), np.mean(list(TABLE_4_4[motion].values()), axis=0), strict=True)
         lines.append(f"| **{motion}, mean** | {' | '.join(f'{own:.1f} ({hers:.1f})' for own, hers in means)} |")
         lines.append(f"| {motion}, 3D error, mm | {' | '.join(f'{value:.0f}' for value in table['error'][0])} |")
-    kept = PAGE.read_text().partition(PAIRS)[1:] if PAGE.exists() else ()
-    PAGE.write_text("\n".join(lines) + "\n\n" + "".join(kept))
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import multiprocessing
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
@@ -190,13 +190,70 @@ class Mean:
 # --- what is printed
 
 
-def report(args: argparse.Namespace, figures: Any, show: Callable[[], None]) -> None:
-    """Print tables, or the figures as JSON, or write these to a file, as ``--out`` asks."""
-    if not prints_json(args):
+def report(args: argparse.Namespace, figures: Any, show: Callable[[], None] | None = None) -> None:
+    """Print figures as tables (or what ``show`` prints), or as JSON, or write them to a file, as ``--out`` asks."""
+    text = json.dumps(figures, indent=2, default=_plain)
+    if prints_json(args):
+        print(text)
+        return
+    if show is not None:
         show()
+    else:
+        print("\n".join(tables(json.loads(text))))
     if args.out is not None:
-        text = json.dumps(figures, indent=2, default=_plain)
-        print(text) if prints_json(args) else args.out.write_text(text + "\n", encoding="utf-8")
+        args.out.write_text(text + "\n", encoding="utf-8")
+
+
+def tables(figures: Any, title: str = "") -> Iterator[str]:
+    """Lines that show plain figures (of JSON): mappings of values as rows of a table, what is deeper below titles."""
+    if isinstance(figures, list):
+        figures = {str(number): each for number, each in enumerate(figures, 1)}
+    deep = {name: each for name, each in figures.items() if not _is_value(each)}
+    if values := {name: each for name, each in figures.items() if name not in deep}:
+        yield f"{title}{': ' * bool(title)}{', '.join(f'{name} {_cell(each)}' for name, each in values.items())}"
+    flat = {name: each for name, each in deep.items() if isinstance(each, dict) and all(map(_is_value, each.values()))}
+    groups: list[dict[str, dict[str, Any]]] = []
+    for name, row in flat.items():
+        if not groups or not any(row.keys() & other.keys() for other in groups[-1].values()):
+            groups.append({})
+        groups[-1][name] = row
+    for group in groups:
+        yield from _table(title, group)
+    for name, each in deep.items():
+        if name not in flat:
+            yield from tables(each, f"{title}{', ' * bool(title)}{name}")
+
+
+def _table(title: str, rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """An empty line, the title and the names of columns, and the rows; numbers to the right, texts to the left."""
+    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+    cells = [
+        [title, *columns],
+        *([name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()),
+    ]
+    texts = [any(type(row.get(column)) is str for row in rows.values()) for column in columns]
+    sides = ["<" if is_text else ">" for is_text in (True, *texts)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    yield ""
+    for line in cells:
+        yield "  ".join(f"{c:{side}{width}}" for c, side, width in zip(line, sides, widths, strict=True)).rstrip()
+
+
+def _is_value(each: Any) -> bool:
+    """A number, a text, a mean, or a list of numbers and texts."""
+    if isinstance(each, dict):
+        return each.keys() == {"value", "half", "count"}
+    return not isinstance(each, list) or not any(isinstance(item, dict | list) for item in each)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{_cell(value['value'])} ± {_cell(value['half'])}"
+    if isinstance(value, list):
+        return " ".join(map(_cell, value))
+    if isinstance(value, float):
+        return "-" if np.isnan(value) else f"{value:.4g}"
+    return "-" if value is None else str(value)
 
 
 def prints_json(args: argparse.Namespace) -> bool:

@@ -225,49 +225,6 @@ def _delays(
     return result
 
 
-# --- the command
-
-
-def bars(result: dict[str, Any]) -> dict[str, bool]:
-    """Which are met."""
-    rows = result["sensors"].values()
-    whole = all(row["recorded"] == row["sent"] == row["taken"] for row in rows) and not any(result["refused"].values())
-    return {"no_frame_lost": whole, "filter_below_30_percent": result["filter_percent_of_all"] < 100.0 * LIMIT}
-
-
-def show(result: dict[str, Any]) -> None:
-    """The table."""
-    print(f"four sensors at 30 Hz live, filter {result['filter']}, {result['seconds']:g} s steady")
-    print("  sensor     recorded   sent  taken   delay median    max")
-    for name, row in result["sensors"].items():
-        print(
-            f"  {name:10} {row['recorded']:8} {row['sent']:6} {row['taken']:6}      "
-            f"{row['delay_median_ms']:5.1f} ms {row['delay_max_ms']:5.1f} ms"
-        )
-    print("  refused by the filter: " + ", ".join(f"{name} {count}" for name, count in result["refused"].items()))
-    late = result["late"]
-    print(
-        f"  frames delivered after later ones: {late['delivered']}; that the filter took after later ones: "
-        f"{late['late_frames']} of {late['frames']}, with {late['taken_again']} taken again "
-        f"({late['taken_again'] / max(1, late['frames']):.3f} per frame)"
-    )
-    for name, row in result["outputs"].items():
-        print(
-            f"  {name:12} {row['count']} messages   from capture median {row['capture_median_ms']:6.1f} ms  "
-            f"99 % {row['capture_p99_ms']:6.1f} ms   from delivery {row['delivery_median_ms']:6.1f} ms  "
-            f"{row['delivery_p99_ms']:6.1f} ms"
-        )
-    print("  processor time, % of one core: " + ", ".join(f"{k} {v:.1f}" for k, v in result["cpu_percent"].items()))
-    print(
-        f"  the filter: {result['filter_user_s']:.2f} s of user and {result['filter_system_s']:.2f} s of system time; "
-        f"with an output for every frame {result['filter_percent_of_all']:.1f} % of one core"
-    )
-    print(
-        f"  everything else on this machine: {result['others_percent']:.0f} % of one core, stolen by its host "
-        f"{result['steal_percent']:.0f} %; it has {result['cores']}"
-    )
-
-
 def main() -> int:
     """The command: 0, or 1 when a bar is missed."""
     parser = common.parser(__doc__)
@@ -276,9 +233,12 @@ def main() -> int:
     if not 1.0 <= args.seconds <= 600.0:
         parser.error(f"--seconds {args.seconds:g}: expected 1 to 600")
     result = measure(args.seconds)
-    result["bars"] = bars(result)
-    common.report(args, result, lambda: show(result))
-    return common.verdicts(args, result["bars"])
+    common.report(args, result)
+    rows = result["sensors"].values()
+    whole = all(row["recorded"] == row["sent"] == row["taken"] for row in rows) and not any(result["refused"].values())
+    share = result["filter_percent_of_all"]
+    met = {"no frame lost": whole, f"filter {share} %, at most {100 * LIMIT:.0f}": share < 100.0 * LIMIT}
+    return common.verdicts(args, met)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
@@ -190,57 +191,45 @@ def measure(run: Run) -> Figures:
     )
 
 
-def show(fault: str, results: list[Figures], usual: list[Figures]) -> bool:
-    """Print what some runs with a fault show, beside the same without; whether the bars are met."""
+def judge(fault: str, results: list[Figures], usual: list[Figures]) -> tuple[dict[str, Any], bool]:
+    """Figures of some runs with a fault, beside the same without: degrees, percent; whether the bars are met."""
     since = SETTLED if fault == "exchanged" else BEGIN
     until = max(float(each.times[-1]) for each in results)
-    arm = [np.mean([each.arm(*span) for each in results]) for span in ((SETTLED, BEGIN), (since,), (until - LAST,))]
     right, as_usual = (float(np.mean([each.right(since) for each in some])) for some in (results, usual))
-    line = f"{fault:10s}" + "".join(f"{value:9.1f}" for value in arm) + f"{100 * right:9.1f} %{100 * as_usual:9.1f} %  "
+    spans = {"before": (SETTLED, BEGIN), "after": (since,), f"last {LAST:.0f} s": (until - LAST,)}
+    figures: dict[str, Any] = {
+        **{name: float(np.mean([each.arm(*span) for each in results])) for name, span in spans.items()},
+        "right": 100.0 * right,
+        "without": 100.0 * as_usual,
+    }
     if fault == "none":
-        lines = sorted({f"{line} ({when:.0f} s)" for each in results for line, when in each.named.items()})
-        print(line + (f"named: {'; '.join(lines)}" if lines else "nothing is named"))
-        return True
+        named = sorted({f"{line} ({when:.0f} s)" for each in results for line, when in each.named.items()})
+        return figures | {"named": "; ".join(named)}, True
     first = [each.first(NAMED[fault]) for each in results]
     begin = 0.0 if fault == "exchanged" else BEGIN
-    after = [f"{when - begin:.1f}" if np.isfinite(when) else "never" for when in first]
-    back = [each.oriented > until - 1.0 for each in results]
-    print(f"{line}named after {', '.join(after)} s; orientations at the end: {sum(back)} of {len(back)}")
-    return all(begin <= when < np.inf for when in first) and right >= min(RIGHT, as_usual - LESS)
+    figures["named"] = f"after {', '.join(f'{when - begin:.1f}' for when in first)} s"
+    figures["runs with orientations at the end"] = sum(each.oriented > until - 1.0 for each in results)
+    return figures, all(begin <= when < np.inf for when in first) and right >= min(RIGHT, as_usual - LESS)
 
 
 def main() -> int:
     """The benchmark: 1 where a bar is missed."""
     parser = common.parser(__doc__, seeds=2, motions=MOTIONS, jobs=True)
-    parser.add_argument("--first-seed", type=int, default=_FIRST_SEED, metavar="N", help="default: %(default)s")
     parser.add_argument("--faults", type=common.names, default=FAULTS[1:], metavar="A,B", help="(default: all)")
     parser.add_argument("--seconds", type=float, default=90.0, metavar="S", help="of each run (default: %(default)g)")
-    parser.add_argument("--raw", action="store_true", help="each run, and all that diagnostics named in it")
     args = parser.parse_args()
     faults = ["none", *args.faults]
     if unknown := set(faults) - set(FAULTS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(FAULTS)}")
-    people = [(motion, args.first_seed + seed) for seed in range(args.seeds) for motion in args.motions]
+    people = [(motion, _FIRST_SEED + seed) for seed in range(args.seeds) for motion in args.motions]
     runs = [Run(motion, seed, fault, args.seconds) for fault in faults for motion, seed in people]
     results = common.mapped(measure, runs, args.jobs)
     by_fault = {
         fault: [each for run, each in zip(runs, results, strict=True) if run.fault == fault] for fault in faults
     }
-    print(f"{len(people)} people, {args.seconds:g} s each, fault at {BEGIN:g} s; degrees RMS of the right arm's angles")
-    print(f"{'fault':10s}{'before':>9s}{'after':>9s}{f'last {LAST:.0f} s':>9s}{'right':>11s}{'without':>11s}")
-    met = {fault: show(fault, each, by_fault["none"]) for fault, each in by_fault.items()}
-    if args.raw:
-        for run, each in zip(runs, results, strict=True):
-            since = SETTLED if run.fault in ("none", "exchanged") else BEGIN
-            print(
-                f"{run.fault} {run.motion} {run.seed}: {each.arm(SETTLED, BEGIN):.1f} deg before, "
-                f"{each.arm(since):.1f} after, {100 * each.right(since).mean():.1f} % right"
-            )
-            right = zip(ANGLES, each.right(since), strict=True)
-            print("  " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in right))
-            for line, when in each.named.items():
-                print(f"  {when:5.1f} s: {line}")
-    return common.verdicts(args, {fault: met[fault] for fault in faults[1:]})
+    judged = {fault: judge(fault, each, by_fault["none"]) for fault, each in by_fault.items()}
+    common.report(args, {"degrees RMS of the right arm": {fault: figures for fault, (figures, _) in judged.items()}})
+    return common.verdicts(args, {fault: judged[fault][1] for fault in faults[1:]})
 
 
 if __name__ == "__main__":

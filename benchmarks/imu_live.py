@@ -135,7 +135,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=40.0, metavar="S", help="to measure (default: %(default)g)")
     args = parser.parse_args()
     result = measure(args.seconds)
-    common.report(args, result, lambda: print("\n".join(f"{name}: {value}" for name, value in result.items())))
+    common.report(args, result)
     if result["sending late ms (99 %)"] > LATE_MS:
         common.progress(f"no verdict: the sending itself was late by more than {LATE_MS:.0f} ms; too busy a machine")
         return 2

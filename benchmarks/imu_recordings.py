@@ -129,8 +129,6 @@ XSENS_SEGMENTS = {"pelvis": "Pelvis", "upper_trunk": "T8", "head": "Head"} | {
     for ours, theirs in (("clavicle", "Shoulder"), ("upper_arm", "UpperArm"), ("forearm", "ForeArm"), ("hand", "Hand"))
 }
 ALIGNED_FRAMES = 30
-_TO_ISB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Vectors of frames with z up to ISB's: x forward, y up, z to the right."""
 
 
 def read_xsens(path: Path) -> dict[str, Any]:
@@ -237,48 +235,9 @@ def xsens(path: Path) -> dict[str, Any]:
     return figures
 
 
-def show_two_arm(figures: dict[str, Any]) -> None:
-    """Print them."""
-    print("two_arm_imus")
-    if not figures["clock_found"]:
-        print("  clock offset: none found")
-        return
-    print(
-        f"  clock offset {figures['offset_s']:.4f} +- {figures['offset_stddev_s']:.4f} s, "
-        f"{1e3 * figures['offset_error_s']:+.1f} ms off (bar {1e3 * CLOCK_BAR_S:.0f}); "
-        f"drift {figures['drift_ppm']:+.0f} +- {figures['drift_stddev_ppm']:.0f} ppm"
-    )
-    print(f"  still periods: {figures['still_periods']}, so the T-pose is taken at the first 0.1 s")
-    for segment in ("upper_arm_right", "forearm_right"):
-        row = figures[segment]
-        low, high = row["range_deg"]
-        print(
-            f"  {segment:<16} swings {low:.0f} to {high:.0f} deg; {row['passages']} times back: median "
-            f"{row['median_deg']:.1f}, last {row['last_deg']:.1f}, worst {row['worst_deg']:.1f} deg off the start"
-        )
-
-
 def angles_in(figures: dict[str, Any]) -> dict[str, dict[str, float]]:
     """The angles among the figures of the suit."""
     return {name: row for name, row in figures.items() if isinstance(row, dict) and "rms_deg" in row}
-
-
-def show_xsens(figures: dict[str, Any]) -> None:
-    """Print them."""
-    print(f"\nxsens_upper_body: {figures['frames']} frames, deg (bar: RMS {ANGLE_BAR_DEG:.0f})")
-    print(f"  {'':<36}{'RMS':>8}{'bias':>8}{'worst':>8}{'convention':>12}")
-    for name, row in angles_in(figures).items():
-        print(
-            f"  {name:<36}{row['rms_deg']:>8.2f}{row['bias_deg']:>+8.2f}{row['worst_deg']:>8.2f}"
-            f"{row['convention_deg']:>12.4f}"
-        )
-    print("  convention: largest difference between the file's segments in our convention and its joint angles")
-    for title, key in (
-        ("sensor against its segment, RMS", "sensor_to_segment_deg"),
-        ("T-pose against ours", "tpose_deg"),
-    ):
-        row = figures[key]
-        print(f"  {title}: " + ", ".join(f"{name} {value:.1f}" for name, value in row.items()))
 
 
 def bars(two: dict[str, Any], suit: dict[str, Any]) -> dict[str, bool]:
@@ -295,7 +254,7 @@ def main() -> int:
     args = common.parser(__doc__, data=True).parse_args()
     two_arm_file, xsens_file = common.recordings(args.data / "imu", [TWO_ARM, XSENS])
     two, suit = two_arm(two_arm_file), xsens(xsens_file)
-    common.report(args, {"two_arm_imus": two, "xsens_upper_body": suit}, lambda: (show_two_arm(two), show_xsens(suit)))
+    common.report(args, {"two_arm_imus": two, "xsens_upper_body": suit})
     return common.verdicts(args, bars(two, suit))
 
 

@@ -177,25 +177,6 @@ def measure(seconds: float, warm_up: float) -> dict[str, Any]:
     return result
 
 
-def show(result: Mapping[str, Any]) -> None:
-    """The table."""
-    print(
-        f"capture to joint angles, {result['sensors']} sensors at 30 Hz, {result['processes']} processes, "
-        f"{result['seconds']:g} s"
-    )
-    for chain, text in (("graph", "the graph"), ("relay", "bare relays")):
-        row = result[chain]
-        lost = f", {row['lost']} lost" if row["lost"] else ""
-        figures = f"median {row['median_ms']:7.2f} ms   99 % {row['p99_ms']:7.2f} ms"
-        print(f"  {text:12} {figures}   ({row['frames']} frames{lost})")
-    ratio = result["ratio"]
-    met = all(ratio[key] <= target for key, target in TARGETS.items())
-    print(
-        f"  ratio        median {ratio['median']:7.2f}      99 % {ratio['p99']:7.2f}      "
-        f"(targets {TARGETS['median']} and {TARGETS['p99']}: {'met' if met else 'missed'})"
-    )
-
-
 def main() -> int:
     """The command: 0, also when a target is missed; the figures say it."""
     parser = common.parser(__doc__)
@@ -207,7 +188,9 @@ def main() -> int:
         relay(args.relay)
         return 0
     result = measure(args.seconds, args.warm_up)
-    common.report(args, result, lambda: show(result))
+    common.report(args, result)
+    ratio = result["ratio"]
+    common.verdicts(args, {f"ratio of the {key} at most {bar}": ratio[key] <= bar for key, bar in TARGETS.items()})
     return 0
 
 

@@ -4,7 +4,7 @@ Balls with modelled noise of the centroids (0.1 pixels, his section 6.1) and cor
 
 a. a target of five balls, 98 mm, at 0.5 to 3 m, calibration exact: RMS of position and orientation (3D), the
    Cramer-Rao bound of the same noise, his unweighted fit of the same points, and what he states at 1 m; a single ball,
-   and the same by the direct linear transform (his eq. 3.4-3.5). ``--picture``.
+   and the same by the direct linear transform (his eq. 3.4-3.5).
 b. his tables 6.1 (a target moved by 400 mm, five times) and 6.2 (a still arm, the cameras moved around it over 2,000
    frames), each over several calibrations of 13 boards.
 d. angles at 1 m, over calibrations, each with its own boards, measured targets and fitted chain: RMS, the share of
@@ -23,8 +23,6 @@ The exit code is 1 where a bar is missed.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import common
@@ -148,33 +146,10 @@ def lab_rng(part: int, number: int = 0) -> np.random.Generator:
     return np.random.default_rng([2011, part, number])
 
 
-def draw(rows: Mapping[str, list[float]], path: Path) -> None:
-    """The picture of part a."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.2), dpi=100, layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for axis, names, unit in (
-        (left, ("position, mm", "its floor", "unweighted", "ball's depth, mm"), "mm"),
-        (right, ("orientation, deg", "the floor", "unweighted, deg"), "deg"),
-    ):
-        labels = ("this package", "Cramer-Rao bound", "unweighted fit, as Gaschler's", "depth of a single ball")
-        for name, label, style in zip(names, labels, ("o-", "k--", "s:", "^-."), strict=False):
-            axis.plot(DISTANCES, rows[name], style, label=label, markersize=4)
-        stated = STATED["position, mm" if unit == "mm" else "orientation, deg"]
-        axis.plot(1.0, stated, "*", color="#d1571b", markersize=11, label="Gaschler states at 1 m")
-        axis.set(xlabel="distance, m", ylabel=f"RMS, {unit}", yscale="log")
-        axis.grid(alpha=0.3, which="both")
-        axis.legend(fontsize=8)
-    left.set_title("position of a target of five balls, 98 mm", fontsize=10)
-    right.set_title("orientation", fontsize=10)
-    figure.savefig(path)
-
-
 # --- b: his experiments
 
 
-def displacements(number: int) -> dict[str, Any]:
+def displacements(number: int) -> FloatArray:
     """Table 6.1 with one calibration: (3, 3, times) measured lengths of moves of 400 mm along x, y, z, less that."""
     rng = lab_rng(2, number)
     room = lab.Lab.make(make_targets(), rng)
@@ -204,7 +179,7 @@ def displacements(number: int) -> dict[str, Any]:
             )
             for index, (one, other) in enumerate(zip(here, there, strict=True)):
                 result[index, axis, time] = np.linalg.norm(other.translation - one.translation) - MOVED
-    return {"moves": result}
+    return result
 
 
 def around(number: int, frames: int) -> dict[str, tuple[float, float]]:
@@ -416,38 +391,14 @@ def pooled(results: list[dict[str, Any]]) -> dict[str, Any]:
 # --- the command
 
 
-def _displaced(jobs: list[int]) -> dict[str, tuple[FloatArray, FloatArray]]:
-    moves = np.stack([displacements(job)["moves"] for job in jobs])  # (c, target, axis, times)
+def _displaced(jobs: list[int]) -> dict[str, dict[str, list[float]]]:
+    """Of each target along x, y, z: standard deviation of the moves, RMS against the true length, and his; mm."""
+    moves = 1e3 * np.stack([displacements(job) for job in jobs])  # (c, target, axis, times)
     spread, total = np.sqrt(moves.var(axis=3, ddof=1).mean(axis=0)), np.sqrt((moves**2).mean(axis=(0, 3)))
-    return {name: (1e3 * spread[index], 1e3 * total[index]) for index, name in enumerate(TABLE_6_1)}
-
-
-def show(figures: Mapping[str, Any]) -> None:
-    """The tables."""
-    print("a. target of five balls by distance (modelled noise, exact calibration); he states at 1 m:", STATED)
-    print(f"{'m':>18}" + "".join(f"{distance:>8.2f}" for distance in DISTANCES))
-    for name, values in figures["distance"].items():
-        print(f"{name:>18}" + "".join(f"{value:8.3f}" for value in values))
-    print("b. table 6.1: standard deviation of 5 moves of 400 mm, mm, x y z; RMS against 400 mm; his")
-    for name, (spread, total) in figures["table 6.1"].items():
-        cells = ("  ".join(f"{v:.3f}" for v in some) for some in (spread, total, TABLE_6_1[name]))
-        print(f"   {name:24}" + "   |  ".join(cells))
-    print("   table 6.2: standard deviation over all frames, mm and degrees (3D); his")
-    for name, (shift, turn) in figures["table 6.2"].items():
-        print(f"   {name:24}{shift:8.3f} {turn:8.4f}   |  {TABLE_6_2[name][0]:.4f} {TABLE_6_2[name][1]:.4f}")
-    print("c. rendered images, calibration from rendered boards, 1 m")
-    for number, row in enumerate(figures["rendered"]):
-        print(f"   calibration {number}: " + ", ".join(f"{name} {value:.4f}" for name, value in row.items()))
-    print(f"d. angles at 1 m, {figures['calibrations']} calibrations")
-    for name, row in figures["angles"].items():
-        print(f"   {name:10}" + ", ".join(f"{key} {value:.4f}" for key, value in row.items()))
-    print("e. joints, RMS over calibrations, both targets")
-    for motion, row in figures["joints"].items():
-        print(
-            f"   {'+-60 deg' if motion == 'joints' else f'+-{SMALL:g} deg'}: "
-            + ", ".join(f"{k} {v:.3f}" for k, v in row.items())
-        )
-    print(f"   +-{SMALL:g} deg: warned in {figures['warned']} of {figures['calibrations']}")
+    return {
+        name: {"spread": spread[index].tolist(), "RMS": total[index].tolist(), "his": list(his)}
+        for index, (name, his) in enumerate(TABLE_6_1.items())
+    }
 
 
 def main() -> int:
@@ -456,23 +407,27 @@ def main() -> int:
     parser.add_argument("--calibrations", type=int, default=12, metavar="N", help="of d and e (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=2000, metavar="N", help="of a recording (default: %(default)s)")
     parser.add_argument("--poses", type=int, default=120, metavar="N", help="of c (default: %(default)s)")
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw a into this file")
     args = parser.parse_args()
-    figures: dict[str, Any] = {"calibrations": args.calibrations, "distance": by_distance(400)}
-    if args.picture is not None:
-        draw(figures["distance"], args.picture)
+    figures: dict[str, Any] = {
+        "calibrations": args.calibrations,
+        "by distance, m": {"m": list(DISTANCES)} | by_distance(400),
+    }
     figures["table 6.1"] = _displaced(list(range(12)))
     sets = [around(number, args.frames) for number in range(2)]
     figures["table 6.2"] = {
-        name: tuple(common.rms(np.array([each[name][part] for each in sets])) for part in range(2))
-        for name in TABLE_6_2
+        name: {
+            f"{unit}{own}": value
+            for part, unit in enumerate(("mm", "deg"))
+            for own, value in (("", common.rms(np.array([each[name][part] for each in sets]))), (", his", his[part]))
+        }
+        for name, his in TABLE_6_2.items()
     }
     figures["rendered"] = [rendered(number, args.poses) for number in range(3)]
     jobs = [(number, args.frames, 300) for number in range(args.calibrations)]
     figures |= pooled(common.mapped(calibration, jobs, args.jobs))
-    common.report(args, figures, lambda: show(figures))
+    common.report(args, figures)
 
-    rows = figures["distance"]
+    rows = figures["by distance, m"]
     ratio = max(
         np.max(np.divide(rows["position, mm"], rows["its floor"])),
         np.max(np.divide(rows["orientation, deg"], rows["the floor"])),

@@ -21,6 +21,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
@@ -87,6 +88,22 @@ def cluster(trial: dict[str, FloatArray], names: tuple[str, ...], noise: float =
         TargetPose(name, 10_000_000 * row, "lab", rotations[row], centre[row, 0], covariance[row], seen, residual[row])
         for row in range(len(points))
     ]
+
+
+def figures_of(fit: JointFit) -> dict[str, Any]:
+    """Figures of a fit; stated deviations are lengths."""
+    deviations = np.sqrt(fit.joint.covariance.diagonal())
+    return {
+        "frames": fit.frames,
+        "motion, deg": np.degrees(fit.motion).tolist(),
+        "scale": fit.scale,
+        "gap, mm": 1e3 * fit.gap,
+        "turn, deg": np.degrees(fit.turn),
+        "centre +-, mm": 1e3 * np.linalg.norm(deviations[:3]),
+        "axis +-, deg": np.degrees(np.linalg.norm(deviations[3:6])),
+        "verdict": fit.verdict.value,
+        "warnings": "; ".join(fit.warnings),
+    }
 
 
 def axis_angle(first: FloatArray, second: FloatArray) -> float:
@@ -188,31 +205,9 @@ def main() -> int:
         if peer.ours == "closed form":
             near = max(peer.parent_mm, peer.child_mm) <= PEER_BAR_MM
             met[f"{peer.joint}: as biobuddy"] = near and max(peer.parent_deg, peer.child_deg) <= PEER_BAR_DEG
-    common.report(args, {"fits": fits, "halves": halves, "peers": beside}, lambda: show(fits, halves, beside))
+    figures = {name: figures_of(fit) for name, fit in fits.items()}
+    common.report(args, {"knee's axis, first against second half, deg": halves, "fits": figures, "biobuddy": beside})
     return common.verdicts(args, met)
-
-
-def show(fits: dict[str, JointFit], halves: dict[str, float], beside: list[Peer]) -> None:
-    """The tables."""
-    names = ("frames", "motion, deg", "scale", "gap, mm", "turn, deg", "centre +-, mm", "axis +-, deg")
-    print(f"{'':<18}" + "".join(f"{name:>18}" for name in names) + "  verdict")
-    for name, fit in fits.items():
-        deviations = np.sqrt(fit.joint.covariance.diagonal())
-        motion = "/".join(f"{value:.1f}" for value in np.degrees(fit.motion))
-        values = fit.scale, 1e3 * fit.gap, np.degrees(fit.turn)
-        stated = 1e3 * np.linalg.norm(deviations[:3]), np.degrees(np.linalg.norm(deviations[3:6]))
-        cells = "".join(f"{value:>18.2f}" for value in (*values, *stated))
-        print(f"{name:<18}{fit.frames:>18}{motion:>18}{cells}  {fit.verdict.value}")
-        for warning in fit.warnings:
-            print(f"    {warning}")
-    print("knee's axis, first against second half: " + ", ".join(f"{v:.2f} deg {k}" for k, v in halves.items()))
-    if not beside:
-        print("biobuddy is not installed: no comparison")
-    for peer in beside:
-        print(
-            f"biobuddy against our {peer.ours}, {peer.joint}: {peer.parent_mm:.2g} and {peer.child_mm:.2g} mm, "
-            f"{peer.parent_deg:.2g} and {peer.child_deg:.2g} deg (parent, child)"
-        )
 
 
 if __name__ == "__main__":

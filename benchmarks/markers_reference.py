@@ -202,34 +202,11 @@ def _rms(vectors: FloatArray) -> float:
     return float(np.degrees(np.sqrt((vectors**2).sum(axis=1).mean())))
 
 
-def show(cases: list[Case], links: list[Pendulum]) -> None:
-    """The tables."""
-    print(f"{'people':32}{'clock':>7}{'+-':>6}" + "".join(f"{name:>26}" for name in SHOWN))
-    print(f"{'degrees, ms':45}" + f"{'by markers        true':>26}" * len(SHOWN))
-    for case in cases:
-        by_name = {angle.name: angle for angle in case.angles}
-        cells = ""
-        for name in SHOWN:
-            angle = by_name[name]
-            error = "-" if np.isnan(angle.error) else f"{angle.error:.1f}"
-            low = "-" if np.isnan(angle.low) else f"{angle.low:.1f}"
-            cells += f"{f'{error} [{low}, {angle.high:.1f}] {angle.true:6.1f}':>26}"
-        name = f"{case.job.motion}, {case.job.filter} {case.job.seed}"
-        print(f"{name:32}{case.clock_error:>7.1f}{case.clock_stddev:>6.1f}{cells}")
-    stated = [angle for case in cases for angle in case.angles if np.isfinite(angle.error)]
-    inside = [angle.low <= angle.true <= angle.high for angle in stated]
-    ratios = [angle.error / angle.true for angle in stated]
-    count = sum(len(case.angles) for case in cases)
-    print(
-        f"{len(stated)} of {count} angles stated; inside {np.mean(inside):.0%}; by markers / true: median "
-        f"{np.median(ratios):.2f}, 10 to 90 % {np.percentile(ratios, 10):.2f} to {np.percentile(ratios, 90):.2f}"
-    )
-    if links:
-        print(f"\n{'pendulum':10}{'refused':>8}{'offset, ms':>12}{'+-':>6}{'other half':>12}{'1 offset':>10}")
-    for each in links:
-        refused = "yes" if each.refused else "no"
-        clock = f"{each.offset_ms:>12.1f}{each.offset_stddev_ms:>6.1f}"
-        print(f"link {each.link:<5}{refused:>8}{clock}{each.other_half:>12.2f}{each.one_offset:>10.2f}")
+def row_of(case: Case) -> dict[str, object]:
+    """Degrees and milliseconds; of the angles that are shown the error by markers, its interval, and the true one."""
+    by_name = {angle.name: angle for angle in case.angles}
+    shown = {name: [by_name[name].error, by_name[name].low, by_name[name].high, by_name[name].true] for name in SHOWN}
+    return {"clock": case.clock_error, "+-": case.clock_stddev, **shown}
 
 
 def main() -> None:
@@ -239,7 +216,16 @@ def main() -> None:
     cases = common.mapped(judge, jobs, args.jobs)
     folder = args.data / "imu" / "pendulum_with_reference"
     links = pendulum(folder) if folder.is_dir() else []
-    common.report(args, {"people": cases, "pendulum": links}, lambda: show(cases, links))
+    stated = [angle for case in cases for angle in case.angles if np.isfinite(angle.error)]
+    ratios = np.array([angle.error / angle.true for angle in stated])
+    figures = {
+        "stated of all angles": [len(stated), sum(len(case.angles) for case in cases)],
+        "inside": np.mean([angle.low <= angle.true <= angle.high for angle in stated]),
+        "by markers / true, 10, 50 and 90 %": np.percentile(ratios, [10.0, 50.0, 90.0]),
+        "people": {f"{each.job.motion}, {each.job.filter} {each.job.seed}": row_of(each) for each in cases},
+        "pendulum": links,
+    }
+    common.report(args, figures)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ The exit code is 1 where a bar is missed.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from typing import Any
 
 import common
@@ -119,14 +118,6 @@ def pooled(results: list[dict[str, tuple[FloatArray, FloatArray]]]) -> dict[str,
     return rows
 
 
-def show(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
-    """The tables."""
-    for title, rows in figures.items():
-        print(title)
-        for name, row in rows.items():
-            print(f"   lenses {name:6}" + ", ".join(f"{key} {value:.3f}" for key, value in row.items()))
-
-
 def main() -> int:
     """The benchmark."""
     parser = common.parser(__doc__, jobs=True)
@@ -139,7 +130,7 @@ def main() -> int:
     for index, (count, places) in enumerate(kinds):
         own = results[index * args.draws : (index + 1) * args.draws]
         figures[f"{count} cameras, {places} places of the wand"] = pooled(own)
-    common.report(args, figures, lambda: show(figures))
+    common.report(args, figures)
     met = {}
     for title, rows in figures.items():
         row = rows["prior"]

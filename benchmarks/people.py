@@ -14,7 +14,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 import time
@@ -307,7 +306,7 @@ def main() -> int:
     if args.only in (None, "live"):
         recording = crossing(0, 2, args.people, seconds=10.0)
         result["live"] = [run_live(name, recording, args.people, args.seconds) for name in args.filters]
-    common.report(args, result, lambda: print(json.dumps(result, indent=2)))
+    common.report(args, result)
     return int(any(row["switches while all were visible to a sensor"] for row in result.get("crossings", ())))
 
 

@@ -17,24 +17,21 @@ surprise   greatest error of an observed angle over its stated standard deviatio
 
 With ``--standing`` instead a person who stands still: by how much each angle that nothing observes, averaged over a
 second, leaves its average over the first one. White noise of 20 mm is measured.
-
-  python benchmarks/robustness.py                  1,000 runs
-  python benchmarks/robustness.py --only 123       that run alone, frame by frame
 """
 
 from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import common
 import numpy as np
-from honesty import NAMES, OBSERVED, all_runs, new_filter
+from honesty import NAMES, OBSERVED, Settings, all_runs, new_filter
 
-from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint
+from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
@@ -65,20 +62,9 @@ WRONG_START = np.radians(60.0)
 LONGEST_DROPOUT, LONGEST_GAP = 2.0, 1.0
 """Seconds."""
 _GRID = 0.01
-END = 0.5
-"""Seconds at the end over which medians are taken."""
+END, WORST = 0.5, 5
+"""Seconds at the end over which medians are taken; runs that are listed of each kind."""
 RANGES = Ranges(MODEL)
-POINTS = [Joint(joint).name.lower() for joint in MODEL.joints]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What all runs share; see the command line's help."""
-
-    seed: int
-    seconds: float
-    overlap: bool
-    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +106,13 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one run went; see the module's text.
+    """How one run went; see the module's text. Angles in degrees, errors in millimetres.
 
     Attributes:
         back_after: seconds of good data; infinity for never.
         start_back_after: seconds from a wrong start to being back, where good data follow it; NaN elsewhere.
-        end_error, end_noise: metres, RMS over the 19 points of the estimate and of the measurements.
-        end_worst: metres, of the worst point, and which point it is.
+        end_error, end_noise: RMS over the 19 points of the estimate and of the measurements.
+        end_worst: of the worst point.
     """
 
     number: int
@@ -140,17 +126,8 @@ class Outcome:
     end_error: float
     end_noise: float
     end_worst: float
-    end_worst_point: str
     surprise: float
     surprise_at: str
-    frames_without: int
-    counters: dict[str, int]
-
-    @property
-    def failed(self) -> bool:
-        """Any bar is missed."""
-        slow = self.back_after > BACK_WITHIN or self.start_back_after > BACK_WITHIN
-        return self.nan or self.diverged or self.excess > EXCESS_BAR or slow
 
 
 def _longest(missing: BoolArray) -> float:
@@ -175,8 +152,8 @@ def _bearable(dropouts: Sequence[Dropout], gaps: Sequence[tuple[float, float]], 
     return _longest(frames[:, None]) <= LONGEST_GAP + _GRID and _longest(joints) <= LONGEST_DROPOUT + _GRID
 
 
-def draw_scenario(rng: np.random.Generator, seconds: float, overlap: bool) -> Scenario:
-    """What happens in a run; ``overlap``: see the command line's help."""
+def draw_scenario(rng: np.random.Generator, seconds: float) -> Scenario:
+    """What happens in a run."""
     noise = 0.002 * 30.0 ** rng.random()
     # half of the wrong starts are followed by good data, so that the way back from them is seen alone
     trouble = (0.0 if rng.random() < 0.5 else 1.5, seconds - GOOD)
@@ -187,7 +164,7 @@ def draw_scenario(rng: np.random.Generator, seconds: float, overlap: bool) -> Sc
             length = rng.uniform(0.1, LONGEST_GAP)
             begin = rng.uniform(trouble[0], trouble[1] - length)
             gaps.append((begin, begin + length))
-        if overlap or _bearable(dropouts, gaps, seconds):
+        if _bearable(dropouts, gaps, seconds):
             break
     outliers = 0.05 if rng.random() < 0.6 else 0.0
     return Scenario(
@@ -229,36 +206,29 @@ class Course:
     """What the filter said in one run, n frames that arrived.
 
     Attributes:
-        frames: (n,) of the truth.
         q, stddev: (n, 35) and (n, 32); NaN before the first estimate.
         error: (n, 19) metres, of the points.
         nan: something that must be a number was none.
-        without: frames without an estimate.
-        counters: of the filter.
     """
 
-    frames: IntArray
     q: FloatArray
     stddev: FloatArray
     error: FloatArray
     nan: bool
-    without: int
-    counters: dict[str, int]
 
 
-def track(scenario: Scenario, truth: Truth, seen: Observation, parameters: Mapping[str, float], start: Any) -> Course:
+def track(truth: Truth, seen: Observation, parameters: Mapping[str, float], start: Any) -> Course:
     """The filter over one run; ``start`` is a configuration to begin with, or None."""
     estimator = new_filter(parameters)
     count = len(seen.frames)
     q, stddev = np.full((count, MODEL.nq), np.nan), np.full((count, MODEL.nv), np.nan)
     error = np.full((count, len(MODEL.joints)), np.nan)
-    nan, without = False, 0
+    nan = False
     if start is not None:
         estimator.start(start, stamp_ns=seen.skeletons[0].stamp_ns - 33_000_000)
     for k, (skeleton, frame) in enumerate(zip(seen.skeletons, seen.frames, strict=True)):
         output, estimate = estimator.update(skeleton), estimator.estimate
         if output is None or estimate is None:
-            without += 1
             continue
         variance = np.diag(estimate.covariance)
         tracked = output.states[MODEL.joints] > 0
@@ -268,19 +238,7 @@ def track(scenario: Scenario, truth: Truth, seen: Observation, parameters: Mappi
         q[k], stddev[k] = estimate.q, np.sqrt(np.maximum(variance[: MODEL.nv], 0.0))
         positions = MODEL.forward(estimate.q, estimate.lengths).positions
         error[k] = np.linalg.norm(positions - truth.positions[frame], axis=1)
-    return Course(seen.frames, q, stddev, error, nan, without, dict(estimator.counters))
-
-
-def prepare(number: int, settings: Settings) -> tuple[Scenario, Truth, Observation, FloatArray | None]:
-    """Everything that is drawn for a run, from its number."""
-    rng = np.random.default_rng([settings.seed, number])
-    scenario = draw_scenario(rng, settings.seconds, settings.overlap)
-    person = RandomPerson.draw(rng)
-    motion = RandomMotion(rng, settings.seconds, postures=scenario.postures, full_turns=scenario.full_turns)
-    truth = truth_of(person, motion, capture_times(settings.seconds, rng))
-    seen = observe(truth, scenario.errors, rng)
-    start = wrong_start(truth.q[seen.frames[0]], scenario.wrong_start, rng) if scenario.wrong_start else None
-    return scenario, truth, seen, start
+    return Course(q, stddev, error, nan)
 
 
 def first_lasting(times: FloatArray, good: BoolArray, begin: float, end: float) -> float:
@@ -294,18 +252,24 @@ def first_lasting(times: FloatArray, good: BoolArray, begin: float, end: float) 
 
 def run(settings: Settings, number: int) -> Outcome:
     """One run from its number."""
-    scenario, truth, seen, start = prepare(number, settings)
-    course = track(scenario, truth, seen, settings.parameters, start)
-    times = truth.times[course.frames]
+    rng = np.random.default_rng([0, number])
+    scenario = draw_scenario(rng, settings.seconds)
+    person = RandomPerson.draw(rng)
+    motion = RandomMotion(rng, settings.seconds, postures=scenario.postures, full_turns=scenario.full_turns)
+    truth = truth_of(person, motion, capture_times(settings.seconds, rng))
+    seen = observe(truth, scenario.errors, rng)
+    start = wrong_start(truth.q[seen.frames[0]], scenario.wrong_start, rng) if scenario.wrong_start else None
+    course = track(truth, seen, settings.parameters, start)
+    times = truth.times[seen.frames]
     rms = np.sqrt((course.error**2).mean(axis=1))
-    good = rms <= bound(scenario)
+    good = rms <= np.sqrt(3.0) * scenario.noise + 0.03
     last = times >= settings.seconds - END
     worst = np.median(course.error[last], axis=0)
     back_after = first_lasting(times, good, scenario.trouble[1], np.inf)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # runs in which the filter said nothing at all
         excess = np.degrees(np.nan_to_num(np.abs(RANGES.excess(course.q)), nan=0.0))
-        surprise = np.abs(MODEL.difference(course.q[last], truth.q[course.frames[last]])) / course.stddev[last]
+        surprise = np.abs(MODEL.difference(course.q[last], truth.q[seen.frames[last]])) / course.stddev[last]
         surprise = np.median(surprise, axis=0)[OBSERVED]
     frame, coordinate = np.unravel_index(excess.argmax(), excess.shape)
     measured = np.stack([skeleton.positions for skeleton in seen.skeletons])[:, MODEL.joints]
@@ -321,20 +285,17 @@ def run(settings: Settings, number: int) -> Outcome:
         else np.nan,
         excess=float(excess.max()),
         excess_at=f"{NAMES[6 + int(coordinate)]} at {times[frame]:.2f} s",
-        end_error=float(np.sqrt((course.error[last] ** 2).mean())),
-        end_noise=float(np.sqrt((raw[last] ** 2).mean())),
-        end_worst=float(worst.max()),
-        end_worst_point=POINTS[int(np.argmax(worst))],
+        end_error=1e3 * common.rms(course.error[last]),
+        end_noise=1e3 * common.rms(raw[last]),
+        end_worst=1e3 * float(worst.max()),
         surprise=float(surprise.max()),
         surprise_at=NAMES[int(OBSERVED[surprise.argmax()])],
-        frames_without=course.without,
-        counters=course.counters,
     )
 
 
-def standing(minutes: float, seed: int, parameters: Mapping[str, float]) -> dict[str, float]:
+def standing(minutes: float, parameters: Mapping[str, float]) -> dict[str, float]:
     """Greatest departure of each unobserved angle from its start, degrees, for a person who stands still."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     lengths, times = RandomPerson.draw(rng).lengths, capture_times(60.0 * minutes, rng, STANDING_RATE)
     # upright to some degrees, the arms hanging with slightly bent elbows
     tangent = np.zeros(MODEL.nv)
@@ -354,128 +315,62 @@ def standing(minutes: float, seed: int, parameters: Mapping[str, float]) -> dict
     return dict(zip(UNOBSERVED, np.abs(averages - averages[0]).max(axis=0).tolist(), strict=True))
 
 
-def bound(scenario: Scenario) -> float:
-    """Metres: greatest RMS error of the 19 points of a filter that is back."""
-    return float(np.sqrt(3.0) * scenario.noise + 0.03)
-
-
-def frame_by_frame(number: int, settings: Settings) -> None:
-    """What happened in one run."""
-    scenario, truth, seen, start = prepare(number, settings)
-    course = track(scenario, truth, seen, settings.parameters, start)
-    print(f"run {number}: {scenario}")
-    print(f"good data from {scenario.trouble[1]} s; back is below {1e3 * bound(scenario):.0f} mm")
-    print(f"{'time, s  points  outliers  rms, mm  worst, mm':62}{'excess, deg':34}largest error, deg")
-    for k, frame in enumerate(course.frames):
-        line = f"{truth.times[frame]:7.3f} {seen.seen[frame].sum():7} {seen.outlier[frame].sum():9}  "
-        if np.isnan(course.q[k]).any():
-            print(line + "no estimate")
-            continue
-        point, error = int(course.error[k].argmax()), course.error[k]
-        excess = np.degrees(np.abs(RANGES.excess(course.q[k])))
-        wrong = np.degrees(MODEL.difference(course.q[k], truth.q[frame]))
-        wrong[:3] = 0.0
-        angle = int(np.abs(wrong).argmax())
-        print(
-            line + f"{1e3 * np.sqrt((error**2).mean()):7.0f} {1e3 * error[point]:7.0f} {POINTS[point]:16}"
-            f" {excess.max():6.1f} {NAMES[6 + int(excess.argmax())] if excess.max() > 0.0 else '':26}"
-            f" {wrong[angle]:7.1f} +- {np.degrees(course.stddev[k, angle]):5.1f} {NAMES[angle]}"
-        )
-    print(f"counters: {course.counters}\n{run(settings, number)}")
-
-
-def quantiles(values: list[float]) -> str:
-    """Median, 95 %, 99 % and greatest."""
-    if not values:
-        return "none"
-    ordered = np.sort(values)
-    picks = [ordered[min(int(share * len(ordered)), len(ordered) - 1)] for share in (0.5, 0.95, 0.99, 1.0)]
-    return "median {:.2f}, 95 % {:.2f}, 99 % {:.2f}, greatest {:.2f}".format(*picks)
-
-
-def show(outcomes: list[Outcome], broken: dict[int, str], worst: int) -> None:
-    """The figures, and the runs to look into."""
-    back = [outcome.back_after for outcome in outcomes]
-    start = [outcome.start_back_after for outcome in outcomes if not np.isnan(outcome.start_back_after)]
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Quantiles over all runs, and the worst runs of each kind."""
     ratio = [outcome.end_error / outcome.end_noise for outcome in outcomes]
-    print(f"{len(outcomes) + len(broken)} runs")
-    print(f"  ended in an error                  {len(broken)}")
-    print(f"  NaN                                {sum(outcome.nan for outcome in outcomes)}")
-    apart = sum(outcome.diverged and np.isfinite(outcome.back_after) for outcome in outcomes)
-    print(f"  diverged                           {sum(outcome.diverged for outcome in outcomes)}"
-          f" ({apart} of them by single points only)")  # fmt: skip
-    over = sum(outcome.excess > EXCESS_BAR for outcome in outcomes)
-    print(f"  beyond a range by over {EXCESS_BAR:.0f} deg      {over}")
-    print(f"  not back within {BACK_WITHIN:g} s of good data  {sum(not after <= BACK_WITHIN for after in back)}")
-    late = sum(not after <= BACK_WITHIN for after in start)
-    print(f"  nor within {BACK_WITHIN:g} s of a wrong start   {late} of {len(start)}")
-    print(f"excess, deg:                  {quantiles([outcome.excess for outcome in outcomes])}")
-    print(f"back after, s:                {quantiles(back)}")
-    print(f"back after a wrong start, s:  {quantiles(start)}")
-    print(f"error at the end / raw error: {quantiles(ratio)}")
-    print(f"surprise, standard deviations: {quantiles([outcome.surprise for outcome in outcomes])}")
-
-    def listed(title: str, value: Callable[[Outcome], float], text: Callable[[Outcome], str], beyond: float) -> None:
-        chosen = [outcome for outcome in outcomes if not value(outcome) <= beyond and not np.isnan(value(outcome))]
-        if chosen:
-            print(f"\n{title}")
-        for outcome in sorted(chosen, key=lambda each: -value(each))[:worst]:
-            print(f"  --only {outcome.number:<5} {text(outcome)}; {outcome.scenario}")
-
-    listed(
-        "diverged or NaN:",
-        lambda o: float(o.diverged or o.nan),
-        lambda o: (
-            f"rms {1e3 * o.end_error:.0f} mm (raw {1e3 * o.end_noise:.0f}), "
-            f"{o.end_worst_point} {1e3 * o.end_worst:.0f} mm"
+    columns = {
+        name: np.array([getattr(each, name) for each in outcomes]) for name in ("excess", "back_after", "surprise")
+    }
+    columns |= {
+        "start_back_after": np.array(
+            [each.start_back_after for each in outcomes if not np.isnan(each.start_back_after)]
         ),
-        0.0,
-    )
-    listed("longest until back:", lambda o: o.back_after, lambda o: f"{o.back_after:.2f} s", BACK_WITHIN)
-    listed(
-        "longest until back from a wrong start:",
-        lambda o: o.start_back_after,
-        lambda o: f"{o.start_back_after:.2f} s",
-        BACK_WITHIN,
-    )
-    listed("greatest excess:", lambda o: o.excess, lambda o: f"{o.excess:.1f} deg, {o.excess_at}", -1.0)
-    listed(
-        "greatest surprise:",
-        lambda o: float(np.nan_to_num(o.surprise, nan=np.inf)),
-        lambda o: f"{o.surprise:.1f} standard deviations, {o.surprise_at}",
-        -1.0,
-    )
-    for number, problem in sorted(broken.items())[:worst]:
-        print(f"\n--only {number} ended in an error:\n{problem}")
+        "error at the end / raw error": np.array(ratio),
+    }
+    shares = {"median": 0.5, "95 %": 0.95, "99 %": 0.99, "greatest": 1.0}
+    quantiles = {
+        name: {key: float(np.quantile(values, share, method="higher")) for key, share in shares.items()}
+        for name, values in columns.items()
+        if len(values)
+    }
+    worst = {
+        f"greatest {name}": {
+            f"run {outcomes[k].number}": {"": columns[name][k], "scenario": outcomes[k].scenario}
+            for k in np.argsort(-np.nan_to_num(columns[name], nan=np.inf))[:WORST]
+        }
+        for name in ("excess", "back_after", "surprise")
+    }
+    return {"quantiles": quantiles, **worst}
 
 
 def main() -> int:
     """The benchmark; exit code 1 where any run misses a bar."""
     parser = common.parser(__doc__, jobs=True)
     parser.add_argument("--runs", type=int, default=1000, metavar="N", help="random runs (default: %(default)s)")
-    parser.add_argument("--only", type=int, metavar="N", help="this run alone, frame by frame")
-    parser.add_argument("--seed", type=int, default=0, help="of all chance (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=6.0, help="length of a run (default: %(default)g)")
-    parser.add_argument("--worst", type=int, default=5, metavar="N", help="runs to list of a kind (default: 5)")
-    parser.add_argument("--overlap", action="store_true", help="dropouts and gaps may add up to longer ones: harder")
     parser.add_argument("--standing", type=float, metavar="MINUTES", help="a person who stands still, instead")
     common.add_set(parser)
     args = parser.parse_args()
     if args.seconds < GOOD + 3.0:
         parser.error(f"--seconds {args.seconds:g}: at least {GOOD + 3.0:g}")
-    settings = Settings(args.seed, args.seconds, args.overlap, dict(args.set))
+    settings = Settings(args.seconds, dict(args.set))
     new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
     if args.standing is not None:
-        drift = standing(args.standing, args.seed, settings.parameters)
-        text = "\n".join(f"{name}: up to {value:.1f} deg from its first second" for name, value in drift.items())
-        common.report(args, drift, lambda: print(text))
+        drift = standing(args.standing, settings.parameters)
+        common.report(args, {"greatest departure from the first second, deg": drift})
         return common.verdicts(args, {f"{name} below {DRIFT_BAR:g} deg": x <= DRIFT_BAR for name, x in drift.items()})
-    if args.only is not None:
-        frame_by_frame(args.only, settings)
-        return 0
-    outcomes, broken = all_runs(run, settings, list(range(args.runs)), args.jobs)
-    common.report(args, {"runs": outcomes, "broken": broken}, lambda: show(outcomes, broken, args.worst))
-    return bool(broken) or any(outcome.failed for outcome in outcomes)
+    outcomes, broken = all_runs(run, settings, range(args.runs), args.jobs)
+    common.report(args, summary(outcomes) | {"broken runs": list(broken)})
+    started = [each for each in outcomes if not np.isnan(each.start_back_after)]
+    missed = {
+        "ended in an error": len(broken),
+        "NaN": sum(each.nan for each in outcomes),
+        "diverged": sum(each.diverged for each in outcomes),
+        f"beyond a range by over {EXCESS_BAR:.0f} deg": sum(each.excess > EXCESS_BAR for each in outcomes),
+        f"not back within {BACK_WITHIN:g} s of good data": sum(each.back_after > BACK_WITHIN for each in outcomes),
+        f"nor within {BACK_WITHIN:g} s of a wrong start": sum(each.start_back_after > BACK_WITHIN for each in started),
+    }
+    return common.verdicts(args, {f"{count} of {args.runs} runs {name}": not count for name, count in missed.items()})
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ python benchmarks/run.py --all                all that can run here, one after t
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -31,165 +32,83 @@ class Need(NamedTuple):
     there: Callable[[], bool]
 
 
-NOTHING = Need("", lambda: True)
-ROOT_RIGHTS = Need("root, or user namespaces", lambda: True)  # it finds out by itself
-CHROMIUM = Need("chromium", lambda: any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
-
-
 def recordings(folder: str) -> Need:
     """Real recordings."""
     return Need(f"recordings `{folder}`", (DATA / folder).is_dir)
+
+
+NOTHING = Need("", lambda: True)
+ROOT_RIGHTS = Need("root, or user namespaces", lambda: True)  # it finds out by itself
+CHROMIUM = Need("chromium", lambda: any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+MAKEHUMAN = Need(f"MakeHuman's data, `${WHEEL_VARIABLE}`", lambda: find_wheel() is not None)
+PAIRS, IMU = recordings("kinect_pairs"), recordings("imu")
 
 
 class Benchmark(NamedTuple):
     """One of them.
 
     Attributes:
-        name: of its file.
-        shows: what it measures.
-        need: what it needs.
         minutes: that it takes about, with its own defaults, on two cores.
+        need: what it needs.
         options: with which ``--all`` runs it.
     """
 
-    name: str
-    shows: str
-    need: Need
     minutes: float
+    need: Need = NOTHING
     options: str = ""
 
 
-MAKEHUMAN = Need(f"MakeHuman's data, `${WHEEL_VARIABLE}`", lambda: find_wheel() is not None)
-PAIRS = recordings("kinect_pairs")
-BENCHMARKS = (
-    Benchmark(
-        "real_pairs",
-        "two real sensors: yaw, agreement, left and right; with `--ekf` lengths and innovations",
-        PAIRS,
-        5,
-        "--ekf",
-    ),
-    Benchmark(
-        "kinect_vs_vicon",
-        "arm angles of a real Kinect, raw and filtered, against Vicon",
-        recordings("kinect_vs_vicon"),
-        1,
-    ),
-    Benchmark(
-        "depth_images",
-        "a real depth image beside simulated ones, and the time of the depth input",
-        MAKEHUMAN,
-        1,
-    ),
-    Benchmark("imu_pendulum", "orientations from raw inertial data against Vicon", recordings("imu"), 1),
-    Benchmark(
-        "imu_recordings",
-        "clocks, alignment and angles of inertial sensors in two real recordings",
-        recordings("imu"),
-        1,
-    ),
-    Benchmark("people", "who is who: crossings, two real people, six people live", PAIRS, 10),
-    Benchmark(
-        "accuracy",
-        "errors of one sensor, of the thesis's methods and of this package, on simulated people",
-        NOTHING,
-        120,
-        "--seeds 2 --layout-seeds 1 --sensitivity-seeds 1",
-    ),
-    Benchmark(
-        "ablation", "what each mechanism is worth: the same people without it", NOTHING, 40, "--seeds 1 --layouts 2,4"
-    ),
-    Benchmark(
-        "honesty", "whether the standard deviations of `ekf` are true, over random people", NOTHING, 3, "--runs 40"
-    ),
-    Benchmark(
-        "robustness", "whether `ekf` survives wrong starts, dropouts, gaps and outliers", NOTHING, 10, "--runs 100"
-    ),
-    Benchmark(
-        "imu_and_camera",
-        "inertial sensors on both wrists beside one Kinect, against the Kinect alone",
-        NOTHING,
-        40,
-        "--seeds 1",
-    ),
-    Benchmark(
-        "imu_only", "arm angles of seven inertial sensors without a camera", NOTHING, 25, "--motions reaching,punching"
-    ),
-    Benchmark(
-        "imu_faults",
-        "what becomes of angles when an inertial sensor fails, and whether it is named",
-        NOTHING,
-        20,
-        "--seeds 1",
-    ),
-    Benchmark(
-        "calibrate_simulator",
-        "the simulated Kinect beside the errors that the thesis published; writes docs/simulator.md",
-        NOTHING,
-        1,
-    ),
-    Benchmark(
-        "simulated_pairs",
-        "statistics of real pairs of sensors beside simulated ones; writes docs/simulator.md",
-        PAIRS,
-        4,
-    ),
-    Benchmark(
-        "markers_detection",
-        "centroids of rendered balls: apart, touching, overlapping, cut by the border, hidden",
-        NOTHING,
-        2,
-    ),
-    Benchmark("markers_targets", "poses, recognition and tracking of targets among simulated points", NOTHING, 3),
-    Benchmark(
-        "markers_functional",
-        "joints of real marker clusters on skin, beside biobuddy where it is installed",
-        recordings("marker_functional"),
-        1,
-    ),
-    Benchmark(
-        "markers_accuracy",
-        "targets by distance, joints and angles with calibration estimated, beside the figures of Gaschler's thesis",
-        NOTHING,
-        10,
-        "--calibrations 10",
-    ),
-    Benchmark("markers_wand", "cameras around a room, placed by a waved wand, and their stated deviations", NOTHING, 1),
-    Benchmark("markers_time", "time from a pair of images to joint angles, computed and live", NOTHING, 2),
-    Benchmark(
-        "markers_reference",
-        "a Kinect judged by the marker system beside the truth, and a real pendulum by Vicon",
-        NOTHING,
-        6,
-    ),
-    Benchmark("latency", "delay from capture to angles through the live graph, beside bare relays", NOTHING, 1),
-    Benchmark("four_sensors", "four sensors live with `ekf`: frames lost, processor time, delay", NOTHING, 1),
-    Benchmark("imu_live", "ten inertial sensors and two Kinects live: delay, and whether it grows", NOTHING, 2),
-    Benchmark("viewer", "how much later angles come while a browser shows the viewer", CHROMIUM, 4),
-    Benchmark("two_hosts", "a network that loses, delays and is cut: angles, stamps, recovery", ROOT_RIGHTS, 3),
-    Benchmark(
-        "soak", "an hour of the live graph at ten times the rate: memory, deaths, latency", NOTHING, 62, "--minutes 10"
-    ),
-)
+BENCHMARKS = {
+    "real_pairs": Benchmark(5, PAIRS, "--ekf"),
+    "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
+    "depth_images": Benchmark(1, MAKEHUMAN),
+    "imu_pendulum": Benchmark(1, IMU),
+    "imu_recordings": Benchmark(1, IMU),
+    "people": Benchmark(10, PAIRS),
+    "accuracy": Benchmark(120, options="--seeds 2 --layout-seeds 1 --sensitivity-seeds 1"),
+    "ablation": Benchmark(40, options="--seeds 1 --layouts 2,4"),
+    "honesty": Benchmark(3, options="--runs 40"),
+    "robustness": Benchmark(10, options="--runs 100"),
+    "imu_and_camera": Benchmark(40, options="--seeds 1"),
+    "imu_only": Benchmark(25, options="--motions reaching,punching"),
+    "imu_faults": Benchmark(20, options="--seeds 1"),
+    "calibrate_simulator": Benchmark(1),
+    "simulated_pairs": Benchmark(4, PAIRS),
+    "markers_detection": Benchmark(2),
+    "markers_targets": Benchmark(3),
+    "markers_functional": Benchmark(1, recordings("marker_functional")),
+    "markers_accuracy": Benchmark(10, options="--calibrations 10"),
+    "markers_wand": Benchmark(1),
+    "markers_time": Benchmark(2),
+    "markers_reference": Benchmark(6),
+    "latency": Benchmark(1),
+    "four_sensors": Benchmark(1),
+    "imu_live": Benchmark(2),
+    "viewer": Benchmark(4, CHROMIUM),
+    "two_hosts": Benchmark(3, ROOT_RIGHTS),
+    "soak": Benchmark(62, options="--minutes 10"),
+}
+"""By the name of the file, whose first line says what it shows."""
 
 
 def rows() -> Iterator[tuple[str, str, str, str]]:
     """Name, what it shows, what it needs, how long it takes."""
-    for each in BENCHMARKS:
-        yield f"`{each.name}`", each.shows, each.need.name, f"{each.minutes:g} min"
+    for name, each in BENCHMARKS.items():
+        text = ast.get_docstring(ast.parse((FOLDER / f"{name}.py").read_text(encoding="utf-8"))) or ""
+        yield f"`{name}`", text.partition("\n")[0].removesuffix("."), each.need.name, f"{each.minutes:g} min"
 
 
 def run_all() -> int:
     """Run them; 1 where one missed its bar."""
     missed = []
-    for each in BENCHMARKS:
-        print(f"\n== {each.name} {each.options}", flush=True)
+    for name, each in BENCHMARKS.items():
+        print(f"\n== {name} {each.options}", flush=True)
         if not each.need.there():
             print(f"left out: no {each.need.name}")
             continue
-        code = subprocess.run([sys.executable, FOLDER / f"{each.name}.py", *each.options.split()]).returncode
+        code = subprocess.run([sys.executable, FOLDER / f"{name}.py", *each.options.split()]).returncode
         if code and code not in LEFT_OUT:
-            missed.append(each.name)
+            missed.append(name)
     print(f"\nmissed: {', '.join(missed) or 'nothing'}")
     return 1 if missed else 0
 
@@ -199,13 +118,11 @@ def main() -> int:
     name, *options = sys.argv[1:] or ["--help"]
     if name == "--all":
         return run_all()
-    if name in {each.name for each in BENCHMARKS}:
+    if name in BENCHMARKS:
         os.execv(sys.executable, [sys.executable, str(FOLDER / f"{name}.py"), *options])
     print(__doc__)
-    for each in BENCHMARKS:
-        print(
-            f"{each.name:20} {each.minutes:4g} min  {each.shows}{f' (needs {each.need.name})' * bool(each.need.name)}"
-        )
+    for each, shows, need, minutes in rows():
+        print(f"{each.strip('`'):20} {minutes:>7}  {shows}{f' (needs {need})' * bool(need)}")
     return 0 if name in ("-h", "--help") else 2
 
 

@@ -26,15 +26,6 @@ turn           between the views of the two sensors, about the vertical through 
                them shows them, while kinect1 sees the body within 20 degrees of its front; and by the calibration
 slow errors    correlation of the disagreement (less its median, at most 100 mm per axis, nobody turned round) with
                itself one second later, while people move
-
-Seen when the error model was new (nothing was tuned by this): the trunk's disagreement, the overall medians, the gaps
-and the persistence of the trunk's errors agree. Arms of parallel sensors, and of sensors 90 degrees apart, have lighter
-tails than real ones (95th percentile 36 for 96 mm, and 246 for 373). Legs are too wrong in the median, by a fifth to a
-half. Lengths except the upper arms' vary too little, those of legs seen from the side half as much as they should. A
-real Kinect calms down before somebody who stands still (0.04 mm on the trunk) and the simulated one does not (0.23);
-before people who move both are alike, except that from the side the simulated hand tips are noisier. A real Kinect
-turns shoulders towards itself in slightly oblique views too (2 degrees between parallel sensors for true 7), the
-simulated one only in very oblique ones. How often bodies are turned round takes more than three people to compare.
 """
 
 from __future__ import annotations
@@ -452,16 +443,6 @@ def section(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def printed(rows: Sequence[Row]) -> str:
-    """The rows as plain text."""
-    lines = [f"{'layout':9} {'statistic':48} {'unit':4} {'real':>18} {'simulated':>18}"]
-    for row in rows:
-        real, simulated, mark = row.cells()
-        line = f"{row.layout:9} {row.quantity.name:48} {row.quantity.unit:4} {real:>18} {simulated:>18} {mark}"
-        lines.append(line.rstrip())
-    return "\n".join(lines)
-
-
 def main() -> int:
     """The benchmark; it has no bar, the rows say where real and simulated differ."""
     parser = common.parser(__doc__, data=True)
@@ -479,7 +460,7 @@ def main() -> int:
         rows += rows_of(layout, real, simulated)
     if args.write:
         PAGE.write_text(PAGE.read_text().partition(PAIRS)[0] + section(rows))
-    common.report(args, [{**asdict(row), "differs": row.differs} for row in rows], lambda: print(printed(rows)))
+    common.report(args, [{**asdict(row), "differs": row.differs} for row in rows], lambda: print(section(rows)))
     return 0
 
 

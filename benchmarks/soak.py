@@ -4,10 +4,10 @@
 again and again, and records. At each beginning stamps jump back, and every node starts anew. Once a minute the recorder
 closes its bag by its service, the bag is deleted, and the next one begins.
 
-Memory is the private part of each process (USS), which others that share its libraries cannot change; beside it the
-table has RSS and PSS. Latency is from the writer's time of a reference sensor's frame to that of the angles with its
-stamp, both by this machine's clock and both noted by the middleware, so that nothing depends on how busy the listener
-is. The rate is what the player reached: it sends everything, later if need be.
+Memory is the private part of each process (USS), which others that share its libraries cannot change. Latency is from
+the writer's time of a reference sensor's frame to that of the angles with its stamp, both by this machine's clock and
+both noted by the middleware, so that nothing depends on how busy the listener is. The rate is what the player reached:
+it sends everything, later if need be.
 
 The bars: the private memory of no process grows by more than 5 % from the second minute to the last tenth, no process
 dies by itself, and the median latency of the last tenth is that of the first one after the first minute, within a
@@ -72,14 +72,14 @@ class Samples:
     """What was seen of the graph.
 
     Attributes:
-        memory: of each process, rows of (seconds since the start, USS, PSS, RSS), bytes.
+        memory: of each process, rows of (seconds since the start, USS in bytes).
         latency: (seconds, seconds) of frames.
         progress: (seconds, seconds of the bag played, frames sent, frames that the fusion took).
         machine: (seconds, load average).
         deaths: what died by itself, or did not answer.
     """
 
-    memory: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=lambda: defaultdict(list))
+    memory: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
     latency: list[tuple[float, float]] = field(default_factory=list)
     progress: list[tuple[float, float, float, float]] = field(default_factory=list)
     machine: list[tuple[float, float]] = field(default_factory=list)
@@ -167,8 +167,7 @@ def sample(samples: Samples, now: float, processes: Mapping[str, psutil.Process]
     """One look at everything."""
     for name, process in processes.items():
         with contextlib.suppress(psutil.Error):
-            memory = process.memory_full_info()
-            samples.memory[name].append((now, memory.uss, memory.pss, memory.rss))
+            samples.memory[name].append((now, process.memory_full_info().uss))
     samples.latency += [(now, each) for each in ear.latencies]
     ear.latencies.clear()
     ear.sent.clear()
@@ -267,20 +266,15 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
     rows = {}
     for name, values in samples.memory.items():
         table = np.array(values)
-        times, megabytes = table[:, 0], table[:, 1:] / 2**20
+        times, megabytes = table[:, 0], table[:, 1] / 2**20
         warm = min(WARM_UP, total / 2)
         early, late = (times >= warm) & (times < 2 * warm), times >= min(_edges(total)[-2], times[-1])
         if not early.any() or not late.any():
             continue
-        first, last = np.median(megabytes[early], axis=0), np.median(megabytes[late], axis=0)
-        counted = times >= warm
-        slope = np.polyfit(times[counted] / 60.0, megabytes[counted, 0], 1)[0] if counted.sum() > 2 else 0.0
+        first, last = (float(np.median(megabytes[part])) for part in (early, late))
         rows[name] = {
-            "uss_mb": [round(float(first[0]), 2), round(float(last[0]), 2)],
-            "pss_mb": [round(float(first[1]), 2), round(float(last[1]), 2)],
-            "rss_mb": [round(float(first[2]), 2), round(float(last[2]), 2)],
-            "growth_percent": round(100.0 * float(last[0] / first[0] - 1.0), 2),
-            "kb_per_minute": round(1024.0 * float(slope), 1),
+            "uss_mb": [round(first, 2), round(last, 2)],
+            "growth_percent": round(100.0 * (last / first - 1.0), 2),
             "cpu_percent": round(100.0 * more["cpu"].get(name, 0.0), 1),
         }
     progress = np.array(samples.progress)
@@ -316,55 +310,6 @@ def bars(result: Mapping[str, Any]) -> dict[str, bool]:
     return met
 
 
-def show(result: Mapping[str, Any]) -> None:
-    """The table."""
-    came = "" if result["taken_percent"] is None else f", the fusion took {result['taken_percent']} % of the frames"
-    print(
-        f"{result['minutes']:g} minutes, filter {result['filter']}{', inertial sensors' if result['imus'] else ''}: "
-        f"asked for {result['rate_asked']:g} times the rate, ran at {result['rate']:g}{came}; load average "
-        f"{result['load_average']} of {result['cores']} cores"
-    )
-    print("  process          USS MB at 1 min     last   growth   per minute       PSS MB        RSS MB   one core")
-    for name, row in result["processes"].items():
-        pss, rss = row["pss_mb"], row["rss_mb"]
-        print(
-            f"  {name:16} {row['uss_mb'][0]:15.1f} {row['uss_mb'][1]:8.1f} {row['growth_percent']:6.1f} % "
-            f"{row['kb_per_minute']:9.1f} kB {pss[0]:6.1f} {pss[1]:6.1f} {rss[0]:6.1f} {rss[1]:6.1f} "
-            f"{row['cpu_percent']:7.1f} %"
-        )
-    print("  latency, from minute   median ms    99 % ms   frames")
-    for row in result["latency"]:
-        print(f"  {row['minute']:20.1f} {row['median_ms']:11.2f} {row['p99_ms']:10.2f} {row['frames']:8}")
-    print(f"  died by itself, or gave no answer: {', '.join(result['deaths']) or 'nothing'}")
-    if result["back_s"]:
-        texts = [f"{name} {'never' if at is None else f'{at:g} s'}" for name, at in result["back_s"].items()]
-        print(f"  killed, and back with angles after: {', '.join(texts)}")
-
-
-def draw(samples: Samples, path: Path) -> None:
-    """Memory and latency over time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 7), sharex=True, height_ratios=(2, 1), layout="constrained")
-    for name, values in samples.memory.items():
-        table = np.array(values)
-        top.plot(table[:, 0] / 60.0, table[:, 2] / 2**20, label=f"{name} {table[-1, 2] / 2**20:.0f} MB")
-    top.set(ylabel="PSS, MB", ylim=(0, None), title="Memory of each process")
-    top.legend(loc="lower right", ncols=2, fontsize="small")
-    latency = np.array(samples.latency).reshape(-1, 2)
-    times = np.unique(latency[:, 0])
-    for percent, style in ((50, "-"), (99, ":")):
-        values = [1e3 * np.percentile(latency[latency[:, 0] == time, 1], percent) for time in times]
-        bottom.plot(times / 60.0, values, style, color="tab:blue", label="median" if percent == 50 else "99 %")
-    bottom.set(xlabel="minutes", ylabel="frame to angles, ms", yscale="log")
-    bottom.legend(loc="upper right", fontsize="small")
-    figure.savefig(path)
-    plt.close(figure)
-
-
 def main() -> int:
     """The command: 0, or 1 when a bar is missed."""
     parser = common.parser(__doc__)
@@ -374,9 +319,6 @@ def main() -> int:
     parser.add_argument("--imus", action="store_true", help="inertial sensors on the forearms, too")
     parser.add_argument("--bag", type=Path, help="play this one (default: a minute is simulated)")
     parser.add_argument("--no-kill", dest="kill", action="store_false", help="kill no node at the end")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("soak.png"), help="the picture (default: %(default)s)"
-    )
     args = parser.parse_args()
     if not 0.5 <= args.minutes <= 1440.0:
         parser.error(f"--minutes {args.minutes:g}: expected 0.5 to 1440")
@@ -384,9 +326,7 @@ def main() -> int:
         samples, more = soak(args, Path(folder))
     result = result_of(samples, more, args)
     result["bars"] = bars(result)
-    draw(samples, args.output)
-    common.report(args, result, lambda: show(result))
-    common.progress(f"picture: {args.output}")
+    common.report(args, result)
     return common.verdicts(args, result["bars"])
 
 

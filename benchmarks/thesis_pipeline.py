@@ -10,7 +10,6 @@ them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -33,21 +32,14 @@ FUSED: Final = "thesis fused"
 _FILTERS: Final = {LKF1: THESIS_LKF1, LKF2: THESIS_LKF2, EKF: SCHLAGENHAUF_EKF}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ThesisResult:
-    """What her system makes of a recording, in ``world`` as its first sensor, which stands level, defines it.
-
-    Attributes:
-        outputs: of each method, one skeleton per frame of the first sensor, stamped by it.
-    """
-
-    outputs: dict[str, list[Skeleton]]
-
-
 def run_thesis(
     frames: Sequence[RecordedFrame], sensors: Sequence[str], methods: Sequence[str] = (LKF1, LKF2, EKF)
-) -> ThesisResult:
+) -> dict[str, list[Skeleton]]:
     """Her pipeline (figure 5.1) over frames in the order of receipt.
+
+    Returns:
+        Of each method one skeleton per frame of the first sensor, stamped by it, in ``world`` as this sensor, which
+        stands level, defines it.
 
     Args:
         frames: of all sensors.
@@ -77,7 +69,7 @@ def run_thesis(
         for name, filter_ in filters.items():
             if (out := filter_.update(fused)) is not None:
                 outputs[name].append(out)
-    return ThesisResult(outputs)
+    return outputs
 
 
 def _opening(frames: Sequence[RecordedFrame], sensor: str) -> tuple[FloatArray, np.ndarray]:

@@ -451,7 +451,7 @@ def main() -> int:
     link = Link(args.loss / 100.0, args.jitter / 1e3)
     result = measure(Options(args.seconds, args.cut, args.shift, link, args.filter, args.keep))
     result["bars"] = bars(result)
-    common.report(args, result, lambda: show(result))
+    common.report(args, result)
     return common.verdicts(args, result["bars"])
 
 
@@ -467,32 +467,6 @@ def _inside() -> int:
         return process.wait()
     except KeyboardInterrupt:
         return process.wait()
-
-
-def show(result: dict[str, Any]) -> None:
-    """For people."""
-    print(
-        f"two sensors over a network that loses {100 * result['loss']:g} %, delays up to {result['jitter_ms']:g} ms "
-        f"and is cut for {result['cut_s']:g} s; filter {result['filter']}; clocks {result['shift_ms']:g} ms apart"
-    )
-    for name, row in result["sensors"].items():
-        print(
-            f"  {name}: {row['received']} of {row['recorded']} frames, {row['lost_percent']} % lost beside the cut or "
-            f"not sent ({row['not_sent']}); "
-            f"stamps {row['stamp_rms_ms']} ms RMS, at most {row['stamp_max_ms']} ms off; round trip "
-            f"{row['round trip ms']} ms"
-        )
-    angles = result["angles"]
-    print("  off by, degrees RMS         from the recording   loss alone, offline   from it without lost frames")
-    for name, row in sorted(angles["by_angle"].items(), key=lambda item: -item[1]["rms_to_whole_deg"]):
-        print(f"    {name:26}{row['rms_to_whole_deg']:16.3f}{row['loss_alone_deg']:21.3f}{row['rms_deg']:26.3f}")
-    print(f"    {'all':26}{angles['all_to_whole_deg']:16.3f}{angles['loss_alone_deg']:21.3f}{angles['all_deg']:26.3f}")
-    if result["cut_s"]:
-        print(
-            f"  after the cut: first angles {angles['first_angles_after_s']} s, within "
-            f"{angles['recovery_limit_deg']} deg from {angles['recovery_s']} s on"
-        )
-    print(f"  restarts: {result['restarts']}")
 
 
 if __name__ == "__main__":

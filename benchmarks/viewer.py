@@ -22,7 +22,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -143,25 +143,7 @@ def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
     result["cpu_percent"] = {name: round(100.0 * float(np.mean(shares)), 1) for name, shares in used.items()}
     result["load"] = round(os.getloadavg()[0], 1)
     result["cores"] = os.cpu_count()
-    result["met"] = all(result[f"ratio_{key}"] <= LIMIT for key in ("median", "p95"))
     return result
-
-
-def show(result: Mapping[str, Any]) -> None:
-    """The table."""
-    print(
-        f"capture to joint angles, {result['pairs']} times {result['seconds']:g} s with the viewer, each between two "
-        "without"
-    )
-    for name, text in (("off", "without"), ("on", "with a browser")):
-        row = result[name]
-        print(
-            f"  {text:16} median {row['median_ms']:7.2f} ms   95 % {row['p95_ms']:7.2f} ms   ({row['frames']} frames)"
-        )
-    ratios = f"median {result['ratio_median']:7.3f}      95 % {result['ratio_p95']:7.3f}"
-    print(f"  ratio            {ratios}      (bar {LIMIT}: {'met' if result['met'] else 'missed'})")
-    shares = ", ".join(f"{name} {share:.1f}" for name, share in result["cpu_percent"].items())
-    print(f"  processor time, % of one core: {shares}; load {result['load']} on {result['cores']} cores")
 
 
 def main() -> int:
@@ -174,8 +156,10 @@ def main() -> int:
     )
     args = parser.parse_args()
     result = measure(args.seconds, args.pairs, args.sharpness)
-    common.report(args, result, lambda: show(result))
-    return 0 if result["met"] else 1
+    common.report(args, result)
+    return common.verdicts(
+        args, {f"{key} at most {LIMIT} times": result[f"ratio_{key}"] <= LIMIT for key in ("median", "p95")}
+    )
 
 
 if __name__ == "__main__":

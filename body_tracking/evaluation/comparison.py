@@ -44,6 +44,8 @@ from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 MAX_GAP = 0.15
 """Samples farther apart have a gap between them, seconds."""
+BEYOND = 0.15
+"""A joint farther from the truth is off track, metres."""
 WINDOW = 0.5
 """Half width of the search for the delay, seconds."""
 
@@ -51,19 +53,6 @@ _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
 """True angles that 10 mm of noise in every joint would make unknown, as the plane of a hanging arm, do not count."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class EvaluationParameters:
-    """Parameters of the comparison.
-
-    Attributes:
-        beyond: a joint farther from the truth is off track, metres.
-        own_clock: the truth has a clock and a frame of its own: compare aligned only.
-    """
-
-    beyond: float = 0.15
-    own_clock: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +129,6 @@ class Evaluation:
     Attributes:
         estimate: the evaluated recording.
         truth: its reference.
-        parameters: of the comparison.
         span: (first, last) s in the truth's time, covered by both.
         delay: s by which the estimate follows the truth; NaN where it is not observable.
         comparisons: as it is (where clock and frame are shared), and aligned.
@@ -152,7 +140,6 @@ class Evaluation:
 
     estimate: Recorded
     truth: Recorded
-    parameters: EvaluationParameters
     span: tuple[float, float]
     delay: float
     comparisons: tuple[Comparison, ...]
@@ -165,7 +152,7 @@ class Evaluation:
 def evaluate(
     estimate: Recorded,
     truth: Recorded,
-    parameters: EvaluationParameters | None = None,
+    own_clock: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
     """Compare an estimate with the truth.
@@ -173,31 +160,30 @@ def evaluate(
     Args:
         estimate: of one person.
         truth: of the same person.
-        parameters: the defaults where None.
+        own_clock: the truth has a clock and a frame of its own: compare aligned only.
         progress: called with the completed share, from 0 to 1.
 
     Raises:
         EvaluationError: no joint is known in both, no overlap in time, or too little to compare.
     """
-    p = parameters or EvaluationParameters()
     done = progress or (lambda share: None)
     notes = _notes(estimate, truth)
-    if estimate.frame_id != truth.frame_id and not p.own_clock:
+    if estimate.frame_id != truth.frame_id and not own_clock:
         notes.append(f"{AS_IT_IS!r} compares {estimate.frame_id!r} with {truth.frame_id!r}, which may be other frames")
     zero_ns = int(truth.stamps_ns[0])
     whole = Trajectory(
-        estimate.seconds(int(estimate.stamps_ns[0]) if p.own_clock else zero_ns),
+        estimate.seconds(int(estimate.stamps_ns[0]) if own_clock else zero_ns),
         estimate.positions,
         estimate.covariances,
     )
     curve = Curve(truth.seconds(zero_ns), truth.positions, MAX_GAP)
     if np.isnan(curve.span).any():
         raise EvaluationError(f"{truth.source}: no joint is known twice within {MAX_GAP:g} s")
-    around = _own_clock_offset(whole, curve, estimate, truth) if p.own_clock else 0.0
+    around = _own_clock_offset(whole, curve, estimate, truth) if own_clock else 0.0
     span = _span(whole.times - around, curve.span, estimate, truth)
     done(0.1)
     delay = find_delay(whole, curve, WINDOW, around)
-    if np.isnan(delay) and p.own_clock:
+    if np.isnan(delay) and own_clock:
         raise EvaluationError(
             f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
             "of their frames belong together"
@@ -205,11 +191,11 @@ def evaluate(
     if np.isnan(delay):
         notes.append(f"no delay within {WINDOW:g} s could be found (still, or another clock?): aligned in space only")
     done(0.3)
-    alignments = {} if p.own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
+    alignments = {} if own_clock else {AS_IT_IS: Alignment(0.0, np.eye(3), np.zeros(3))}
     try:
         alignments[ALIGNED] = align(whole, curve, 0.0 if np.isnan(delay) else delay)
     except MetricsError as error:
-        if p.own_clock:
+        if own_clock:
             raise EvaluationError(f"{estimate.source} and {truth.source}: {error}") from error
         notes.append(f"not aligned: {error}")
     mine = estimate.angles
@@ -218,7 +204,7 @@ def evaluate(
         notes.append("estimate and truth have different sets of angles: one name may mean two things")
     comparisons = []
     for number, (name, alignment) in enumerate(alignments.items()):
-        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, truly, p))
+        comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, truly, own_clock))
         done(0.3 + 0.7 * (number + 1) / len(alignments))
     last = comparisons[-1]
     moved = last.alignment.apply(whole)
@@ -226,13 +212,12 @@ def evaluate(
     return Evaluation(
         estimate,
         truth,
-        p,
         span,
-        float("nan") if p.own_clock else delay,
+        float("nan") if own_clock else delay,
         tuple(comparisons),
         jitter(moved.times, moved.positions, true),
         length_errors(moved.positions, true),
-        () if p.own_clock else _calibration(estimate, truth, zero_ns),
+        () if own_clock else _calibration(estimate, truth, zero_ns),
         tuple(notes),
     )
 
@@ -313,7 +298,7 @@ def _compare(
     estimate: Recorded,
     truth: Recorded,
     true_angles: AngleSeries | None,
-    p: EvaluationParameters,
+    own_clock: bool,
 ) -> Comparison:
     moved = alignment.apply(whole)
     first, last = max(moved.times[0], curve.span[0]), min(moved.times[-1], curve.span[1])
@@ -340,9 +325,9 @@ def _compare(
     # From the first estimate on every frame of the truth counts, including those without estimate; after the last
     # estimate only where both share a clock.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
-    lost = (all_times > last + MAX_GAP) & (not p.own_clock)
+    lost = (all_times > last + MAX_GAP) & (not own_clock)
     counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
-    off = off_track(moved.at(counted, MAX_GAP).positions, curve.at(counted), p.beyond)
+    off = off_track(moved.at(counted, MAX_GAP).positions, curve.at(counted), BEYOND)
     return Comparison(
         name,
         alignment,
@@ -352,7 +337,7 @@ def _compare(
         errors,
         np.where(estimate.joints, off, np.nan),
         _positional(own, curve),
-        _named(estimate, true_angles, whole, moved, int(truth.stamps_ns[0]), p),
+        _named(estimate, true_angles, whole, moved, int(truth.stamps_ns[0])),
     )
 
 
@@ -390,7 +375,6 @@ def _named(
     whole: Trajectory,
     moved: Trajectory,
     zero_ns: int,
-    p: EvaluationParameters,
 ) -> AngleComparison | None:
     """The angles with the same names in both; frame-dependent angles are not transformed by the alignment."""
     mine = estimate.angles

@@ -1,4 +1,4 @@
-"""``body_tracking evaluate``: errors against the truth as tables, CSV, JSON and a page with pictures."""
+"""``body_tracking evaluate``: errors against the truth as tables, JSON and a page with pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from body_tracking.evaluation import reference_report
-from body_tracking.evaluation.comparison import EvaluationParameters, evaluate
+from body_tracking.evaluation.comparison import evaluate
 from body_tracking.evaluation.estimated_segments import read_segments
 from body_tracking.evaluation.marker_reference import (
     is_marker_reference,
@@ -17,11 +17,9 @@ from body_tracking.evaluation.marker_reference import (
 from body_tracking.evaluation.pictures import LEGEND, angle_picture, pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
-from body_tracking.evaluation.report import as_csv, as_json, facts, page, text, write
+from body_tracking.evaluation.report import as_json, facts, page, text, write
 from body_tracking.recording.replay import Progress
 from body_tracking.recording.rig import RigReader
-
-_DEFAULTS = EvaluationParameters()
 
 
 def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
@@ -86,14 +84,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--save-mountings", type=Path, metavar="FILE", help="likewise: write how the targets are mounted by EST"
     )
-    parser.add_argument(
-        "--off-track",
-        type=float,
-        default=1e3 * _DEFAULTS.beyond,
-        metavar="MM",
-        help="a joint farther from the truth is off track (default: %(default).0f)",
-    )
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every number into this file")
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with tables and pictures")
     parser.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
     parser.set_defaults(run=run)
@@ -133,15 +123,11 @@ def _judge_by_markers(args: argparse.Namespace) -> ReferenceEvaluation:
 
 
 def run(args: argparse.Namespace) -> int:
-    if not 0.0 < args.off_track < float("inf"):
-        raise EvaluationError(f"--off-track {args.off_track:g}: must be more than 0 mm, and finite")
     if _by_markers(args):
         judged = _judge_by_markers(args)
         if args.html is not None:
             drawn = [(f"Angles, degrees; {LEGEND}", angle_picture(judged.curves))] if judged.angles else []
             write(args.html, reference_report.page(judged, drawn).encode())
-        if args.csv is not None:
-            write(args.csv, reference_report.as_csv(judged).encode())
         lines = f"{reference_report.facts(judged)}\n{reference_report.text(judged)}"
         _print(args, reference_report.as_json(judged) if args.json else lines)
         return 0
@@ -149,14 +135,11 @@ def run(args: argparse.Namespace) -> int:
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)
         truth, own_clock = truth_from(args)
-        parameters = EvaluationParameters(beyond=1e-3 * args.off_track, own_clock=own_clock)
-        result = evaluate(estimate, truth, parameters, lambda share: progress.at(int(1000 * share)))
+        result = evaluate(estimate, truth, own_clock, lambda share: progress.at(int(1000 * share)))
     finally:
         progress.end()
     if args.html is not None:
         write(args.html, page(result, pictures(result)).encode())
-    if args.csv is not None:
-        write(args.csv, as_csv(result).encode())
     _print(args, as_json(result) if args.json else f"{facts(result)}\n{text(result)}")
     return 0
 
@@ -164,6 +147,6 @@ def run(args: argparse.Namespace) -> int:
 def _print(args: argparse.Namespace, content: str) -> None:
     print(content)
     if not args.json:
-        for name, path in (("numbers", args.csv), ("report", args.html), ("mountings", args.save_mountings)):
+        for name, path in (("report", args.html), ("mountings", args.save_mountings)):
             if path is not None:
                 print(f"\n{name}: {path}")

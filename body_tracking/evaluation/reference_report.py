@@ -1,4 +1,4 @@
-"""Writes what :mod:`body_tracking.evaluation.reference_comparison` finds: tables, CSV, JSON and a page."""
+"""Writes what :mod:`body_tracking.evaluation.reference_comparison` finds: tables, JSON and a page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
 from body_tracking.evaluation.reference_error import Judged
-from body_tracking.evaluation.report import Column, Table, numbered, tables_as_csv, tables_as_json, tables_as_page
+from body_tracking.evaluation.report import Column, Table, numbered, tables_as_json, tables_as_page
 
 _NOTE = (
     "difference: RMS of estimate minus reference. reference: its own RMS deviation (poses, calibration, clock, "
@@ -100,15 +100,6 @@ def facts(result: ReferenceEvaluation) -> str:
 def text(result: ReferenceEvaluation) -> str:
     """The tables as text."""
     return "\n".join(f"\n{each.text()}\n{each.note}" for each in tables(result))
-
-
-def as_csv(result: ReferenceEvaluation) -> str:
-    """As of an evaluation by the truth."""
-    clock = [
-        ("recording", "all", "clock_offset", "ms", 1e3 * result.offset_s),
-        ("recording", "all", "clock_offset_stddev", "ms", 1e3 * result.clock_stddev),
-    ]
-    return tables_as_csv(clock, tables(result))
 
 
 def as_json(result: ReferenceEvaluation) -> str:

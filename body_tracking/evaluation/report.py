@@ -1,10 +1,8 @@
-"""Writes the results of an evaluation: tables on a terminal, CSV, JSON and one page of HTML."""
+"""Writes the results of an evaluation: tables on a terminal, JSON and one page of HTML."""
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, IntArray, Joint
-from body_tracking.evaluation.comparison import AngleComparison, Comparison, Evaluation
+from body_tracking.evaluation.comparison import BEYOND, AngleComparison, Comparison, Evaluation
 from body_tracking.evaluation.reading import EvaluationError
 
 THESIS_JOINTS = (
@@ -23,7 +21,6 @@ THESIS_JOINTS = (
     *(Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT, Joint.HAND_TIP_RIGHT),
 )
 """The ten over which the thesis averages (section 5.7.2, tables 5.3 and E.1)."""
-_DIGITS = {"mm": 1, "deg": 1, "%": 1, "ms": 1}
 
 
 def _rms(values: FloatArray) -> float:
@@ -34,12 +31,12 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        key: in CSV and JSON.
+        key: in JSON.
         title: in text.
         unit: mm, deg, % or ms.
         values: (rows,) in the unit; NaN for no value.
         pool: combines rows into one.
-        digits: behind the point in text; None for those that are usual for the unit.
+        digits: behind the point in text.
     """
 
     key: str
@@ -47,17 +44,17 @@ class Column(NamedTuple):
     unit: str
     values: FloatArray
     pool: Callable[[FloatArray], float] = np.mean
-    digits: int | None = None
+    digits: int = 1
 
     def text(self, row: int) -> str:
         """The formatted value of a row."""
         value = self.values[row]
-        return "-" if np.isnan(value) else f"{value:.{_DIGITS[self.unit] if self.digits is None else self.digits}f}"
+        return "-" if np.isnan(value) else f"{value:.{self.digits}f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Rows of numbers; ``key`` is used in CSV and JSON, ``title`` and ``note`` in text."""
+    """Rows of numbers; ``key`` is used in JSON, ``title`` and ``note`` in text."""
 
     key: str
     title: str
@@ -126,7 +123,7 @@ def _joint_table(result: Evaluation, comparison: Comparison) -> Table:
     )
     note = (
         "offset: constant in the frame of the joint's segment; mean-o, RMS-o: without it. jitter: as white noise along "
-        f"an axis.\noff: missing or more than {1e3 * result.parameters.beyond:.0f} mm away. in 95%: the truth lies in "
+        f"an axis.\noff: missing or more than {1e3 * BEYOND:.0f} mm away. in 95%: the truth lies in "
         "the stated 95 % ellipsoid."
     )
     table = Table(
@@ -208,26 +205,6 @@ def text(result: Evaluation) -> str:
     return "\n".join(f"\n{each.text()}\n{each.note}" for each in shown)
 
 
-def as_csv(result: Evaluation) -> str:
-    """A line per number: table, row, column, unit, value; the value is empty for NaN."""
-    return tables_as_csv([("recording", "all", "delay", "ms", 1e3 * result.delay)], tables(result))
-
-
-def tables_as_csv(others: Iterable[tuple[str, str, str, str, float]], shown: Iterable[Table]) -> str:
-    """As :func:`as_csv`, of other numbers (table, row, column, unit, value) and of tables."""
-    lines = io.StringIO()
-    writer = csv.writer(lines, lineterminator="\n")
-    writer.writerow(("table", "row", "column", "unit", "value"))
-    numbers = [*others] + [
-        (table.key, name, column.key, column.unit, column.values[row])
-        for table in shown
-        for row, name in enumerate(table.names)
-        for column in table.columns
-    ]
-    writer.writerows((*where, "" if np.isnan(value) else f"{value:.6g}") for *where, value in numbers)
-    return lines.getvalue()
-
-
 def numbered(value: float) -> float | None:
     """A number for JSON; null for NaN and infinity."""
     return round(float(value), 6) if np.isfinite(value) else None
@@ -251,10 +228,7 @@ def tables_as_json(content: Mapping[str, object], shown: Iterable[Table]) -> str
     by_key = {
         table.key: {
             "units": {column.key: column.unit for column in table.columns},
-            "rows": {
-                name: {column.key: numbered(column.values[row]) for column in table.columns}
-                for row, name in enumerate(table.names)
-            },
+            "rows": {name: {key: numbered(value) for key, value in table.row(name).items()} for name in table.names},
         }
         for table in shown
     }

@@ -17,7 +17,6 @@ from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Joint
 from body_tracking.evaluation.comparison import (
     ALIGNED,
     AS_IT_IS,
-    EvaluationParameters,
     evaluate,
 )
 from body_tracking.evaluation.metrics import Curve
@@ -177,7 +176,7 @@ def test_a_truth_with_a_clock_and_a_frame_of_its_own_is_found_by_its_movement() 
     zero = int(truth().stamps_ns[0])
     positions = Curve(truth().seconds(zero), truth().positions).at(times) @ TURN.T + [5.0, 1.0, 0.0]
     markers = truth_of_markers(Path("trial.c3d"), times - 1.0, positions)
-    result = evaluate(estimate(noise=0.005), markers, EvaluationParameters(own_clock=True))
+    result = evaluate(estimate(noise=0.005), markers, own_clock=True)
     (aligned,) = result.comparisons
     assert aligned.name == ALIGNED and np.isnan(result.delay)
     assert aligned.joints.rms.max() < 0.02
@@ -191,7 +190,7 @@ def test_without_motion_alignment_is_in_space_only_and_needs_a_common_clock() ->
     assert np.isnan(result.delay) and any("aligned in space only" in note for note in result.notes)
     assert result.comparisons[1].alignment.delay == 0.0
     with pytest.raises(EvaluationError, match="do not show the same movement"):
-        evaluate(mine, replace(truth(), positions=still), EvaluationParameters(own_clock=True))
+        evaluate(mine, replace(truth(), positions=still), own_clock=True)
 
 
 def test_calibration_is_judged_where_the_person_is() -> None:

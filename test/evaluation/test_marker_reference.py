@@ -64,8 +64,8 @@ def judged(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str
 def test_known_errors_clock_and_scatter_are_found(
     made: Scene, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files = ["--html", str(tmp_path / "page.html"), "--csv", str(tmp_path / "numbers.csv")]
-    content = judged([str(folder / "estimate"), "--truth", str(folder / "markers"), *files], capsys)
+    page = tmp_path / "page.html"
+    content = judged([str(folder / "estimate"), "--truth", str(folder / "markers"), "--html", str(page)], capsys)
     clock = content["clock"]
     middle = float(np.mean(made.times))
     assert abs(clock["offset_ms"] - 1e3 * (OFFSET + DRIFT * middle)) < 3.0 * clock["stddev_ms"] < 50.0  # type: ignore[index]
@@ -76,9 +76,7 @@ def test_known_errors_clock_and_scatter_are_found(
         assert rows[name]["low"] <= np.degrees(true[name].std()) <= rows[name]["high"], name
         assert rows[name]["error"] == pytest.approx(np.degrees(true[name].std()), rel=0.4), name
     assert any("constant offsets of the estimate do not show" in note for note in content["notes"])  # type: ignore[attr-defined]
-    page, numbers = (tmp_path / "page.html").read_text(), (tmp_path / "numbers.csv").read_text()
-    assert "elbow_flexion_left" in page and "data:image/png" in page
-    assert re.search(r"^reference_angles,elbow_flexion_left,error,deg,\d", numbers, re.MULTILINE)
+    assert "elbow_flexion_left" in page.read_text() and "data:image/png" in page.read_text()
 
 
 @pytest.mark.slow
