@@ -8,6 +8,8 @@ DEMO_BAG := bags/tpose_torso_twist
 DEMO := demo_output
 MARKERS_BAG := bags/markers_arm
 DEMO_MARKERS := demo_markers_output
+MESH_BAG := bags/mesh_reaching
+DEMO_MESH := demo_mesh_output
 
 # Nothing of a sourced ROS install or of another virtual environment may leak into this one. The ROS wheels re-execute
 # Python once to find their libraries and mark that in the environment; with another environment's mark set they
@@ -28,7 +30,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-markers test test-all lint ros2-workspace bench docs clean
+.PHONY: help setup demo demo-markers demo-mesh test test-all lint ros2-workspace bench docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -63,6 +65,14 @@ demo-markers: $(STAMP) ## the same with images of infrared markers: from balls t
 	$(BIN)/body_tracking up --sensors none --bag $(MARKERS_BAG) --marker-setup config/marker_setup --record $(DEMO_MARKERS)/recording --log-dir $(DEMO_MARKERS)/log
 	$(BIN)/body_tracking show $(DEMO_MARKERS)/recording --truth $(MARKERS_BAG) --output $(DEMO_MARKERS)/joint_angles.png
 	@echo "recording: $(DEMO_MARKERS)/recording"
+
+demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to joint angles, and a picture of the mesh
+	@rm -rf $(DEMO_MESH) && mkdir $(DEMO_MESH)
+	$(BIN)/body_tracking mesh personalise $(MESH_BAG) -o $(DEMO_MESH)/person.yaml
+	$(BIN)/body_tracking up --bag $(MESH_BAG) --depth kinect1 --person $(DEMO_MESH)/person.yaml --reliable --record $(DEMO_MESH)/recording --log-dir $(DEMO_MESH)/log
+	$(BIN)/body_tracking show $(DEMO_MESH)/recording --truth $(MESH_BAG) --output $(DEMO_MESH)/joint_angles.png
+	$(BIN)/body_tracking mesh show $(DEMO_MESH)/recording -o $(DEMO_MESH)/mesh.png
+	@echo "recording: $(DEMO_MESH)/recording"
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes and mostly wait; the
 # latter run several at a time, and one at a time where they state how soon something happens. All of it runs, whatever

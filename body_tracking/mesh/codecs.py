@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import IMAGE
 from body_tracking.core.skeleton import FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthError, to_metres
-from body_tracking.messages.base import MessageError, to_header
+from body_tracking.messages.base import MessageError, to_header, to_nanoseconds
 from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
 from body_tracking.messages.codecs import Codec, Wire
 from body_tracking.messages.images import BRIGHTNESS, DEPTH, array_to_image, image_to_array
@@ -72,7 +73,7 @@ class DepthInfo(Codec):
 
 
 class MeshMarker(Codec):
-    """A mesh as a marker of triangles: stamp in nanoseconds, frame, (F, 3, 3) corners in metres; written only."""
+    """A mesh as a marker of triangles: stamp in nanoseconds, frame, (F, 3, 3) corners in metres."""
 
     type_name = MARKER
 
@@ -87,3 +88,10 @@ class MeshMarker(Codec):
         scale = types.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0)
         given = to_header(stamp_ns, frame_id, types), "mesh", 0, _TRIANGLES, scale, to_colour(_SKIN, types), pose, types
         return wire.serialize(MARKER, marker(*given, points=to_points(corners.reshape(-1, 3), types)))
+
+    def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, FloatArray]:
+        message = wire.deserialize(MARKER, cdr)
+        if message.type != _TRIANGLES or not message.points or len(message.points) % 3:
+            raise MessageError(f"marker of type {message.type} with {len(message.points)} points, expected triangles")
+        corners = np.array([(point.x, point.y, point.z) for point in message.points])
+        return to_nanoseconds(message.header.stamp), str(message.header.frame_id), corners.reshape(-1, 3, 3)

@@ -272,8 +272,12 @@ class DepthSensor:
             PersonFileError: it cannot be written.
         """
         if self._file is not None and self._changed:
-            storage.save(self._file, self.body.shape, self._covariance)
+            self.save_to(self._file)
         self._changed = False
+
+    def save_to(self, file: Path) -> None:
+        """Write the shape of the body; errors as of :meth:`save`."""
+        storage.save(file, self.body.shape, self._covariance)
 
 
 def _alike(one: Camera, other: Camera) -> bool:

@@ -15,6 +15,7 @@ from body_tracking.mesh.topics import (
 )
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
+    Command,
     NodeSpec,
     NodeType,
     Option,
@@ -94,6 +95,9 @@ SYSTEM = System(
             "mesh_tracker",
             "estimate the shape of the person's body anew from the next different poses",
         ),
+    ),
+    commands=(
+        Command("mesh", "body_tracking.recording.mesh_commands", "the shape of a person, and pictures of the mesh"),
     ),
     prepare="body_tracking.mesh.tracking:prepare",
 )
