@@ -6,10 +6,12 @@ that is equal in both and in all directions. It is global: all six roots of the 
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray
 
 _POLISH: Final = 2
@@ -69,93 +71,89 @@ def correct(
     unit = 1.0 + max(np.abs(first).max(initial=0.0), np.abs(second).max(initial=0.0))
     scale = np.array([unit, unit, 1.0])
     matrix, a_epipole, b_epipole = matrix * scale * scale[:, None], epipoles[0] / scale, epipoles[1] / scale
-    a_frame, f = _frame(first / unit, a_epipole)
-    b_frame, g = _frame(second / unit, b_epipole)
-    # eq. 3.8 to 3.10: F in frames with the pixels at the origin and the epipoles on the x axis
-    moved = b_frame.transpose(0, 2, 1) @ matrix @ a_frame
-    moved /= np.abs(moved).max(axis=(1, 2), keepdims=True)
-    a, b, c, d = moved[:, 1, 1], moved[:, 1, 2], moved[:, 2, 1], moved[:, 2, 2]
-    t, one = _minimum(a, b, c, d, f, g)
-    # eq. 3.11; for an infinite t its direction
-    p, q = a * t + b * one, c * t + d * one
-    a_line, b_line = np.stack([t * f, one, -t], axis=-1), np.stack([-g * q, p, q], axis=-1)
-    return unit * _nearest(a_line, a_frame), unit * _nearest(b_line, b_frame)
+    one, other = _corrected(np.ascontiguousarray(matrix), a_epipole, b_epipole, first / unit, second / unit)
+    return unit * one, unit * other
 
 
-def _minimum(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray
+@compiled
+def _corrected(
+    matrix: FloatArray, a_epipole: FloatArray, b_epipole: FloatArray, first: FloatArray, second: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t; (n,) each.
+    """:func:`correct`, of pixels in a unit of the size of the image."""
+    one, other = np.empty_like(first), np.empty_like(second)
+    for n in range(len(first)):
+        (x1, y1), (x2, y2) = first[n], second[n]
+        cos1, sin1, f = _frame(x1, y1, a_epipole)
+        cos2, sin2, g = _frame(x2, y2, b_epipole)
+        # eq. 3.8 to 3.10: F in frames with the pixels at the origin and the epipoles on the x axis
+        u, v = np.empty(3), np.empty(3)
+        for i in range(3):
+            u[i] = cos1 * matrix[i, 1] - sin1 * matrix[i, 0]
+            v[i] = x1 * matrix[i, 0] + y1 * matrix[i, 1] + matrix[i, 2]
+        a, b = cos2 * u[1] - sin2 * u[0], cos2 * v[1] - sin2 * v[0]
+        c, d = x2 * u[0] + y2 * u[1] + u[2], x2 * v[0] + y2 * v[1] + v[2]
+        size = max(abs(a), abs(b), abs(c), abs(d))
+        a, b, c, d = a / size, b / size, c / size, d / size
+        t, finite = _minimum(a, b, c, d, f, g)
+        # eq. 3.11; for an infinite t its direction
+        p, q = a * t + b * finite, c * t + d * finite
+        one[n, 0], one[n, 1] = _nearest(t * f, finite, -t, cos1, sin1, x1, y1)
+        other[n, 0], other[n, 1] = _nearest(-g * q, p, q, cos2, sin2, x2, y2)
+    return one, other
+
+
+@compiled
+def _frame(x: float, y: float, epipole: FloatArray) -> tuple[float, float, float]:
+    """Cosine and sine of the frame with a pixel at the origin and the epipole at (1, 0, f), and f (eq. 3.8, 3.9)."""
+    across, along = epipole[0] - epipole[2] * x, epipole[1] - epipole[2] * y
+    length = math.hypot(across, along)
+    least = _ON_EPIPOLE * abs(epipole[2])
+    if length < least:  # a pixel on the epipole: any direction does
+        return 1.0, 0.0, epipole[2] / least
+    length = max(length, 1e-300)
+    return across / length, along / length, epipole[2] / length
+
+
+@compiled
+def _minimum(a: float, b: float, c: float, d: float, f: float, g: float) -> tuple[float, float]:
+    """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t.
 
     The cost is at most that of t = 0, the line through the first pixel, which bounds the size of t. Where the pixels
     are near their epipolar lines against the distance to the epipoles, the cost is a parabola within that bound, and
     Newton's method finds its one minimum; all roots are computed for the others.
     """
     coefficients = _polynomial(a, b, c, d, f, g)
-    t, one = np.zeros_like(a), np.ones_like(a)
-    with np.errstate(all="ignore"):
-        start = d * d / (b * b + g * g * d * d)
-        bound = np.sqrt(start / (1.0 - f * f * start))
-        near = (bound * np.abs(f) < _PARABOLA) & (bound * np.abs(a) < _PARABOLA * np.abs(b))
-        near &= np.abs(g) * (np.abs(c) * bound + np.abs(d)) < _PARABOLA * np.abs(b)
+    start = d * d / (b * b + g * g * d * d)
+    bound = math.sqrt(start / (1.0 - f * f * start)) if f * f * start < 1.0 else math.inf
+    near = bound * abs(f) < _PARABOLA and bound * abs(a) < _PARABOLA * abs(b)
+    if near and abs(g) * (abs(c) * bound + abs(d)) < _PARABOLA * abs(b):
+        t, step = 0.0, 0.0
         for _ in range(_NEWTON):
             value, slope = _value(coefficients, t)
             step = value / slope
-            t = t - step
-        near &= (np.abs(step) <= 1e-9 * bound + 1e-15) & (np.abs(t) <= 1.001 * bound + 1e-15)
-    others = np.flatnonzero(~near)
-    if len(others):
-        rest = [each[others] for each in (a, b, c, d, f, g)]
-        t[others], one[others] = _global_minimum(coefficients[:, others], *rest)
-    return t, one
+            t -= step
+        if abs(step) <= 1e-9 * bound + 1e-15 and abs(t) <= 1.001 * bound + 1e-15:
+            return t, 1.0
+    best, least = 0.0, math.inf
+    for t in _roots(coefficients):
+        p, q = a * t + b, c * t + d
+        cost = t * t / (1.0 + f * f * t * t) + q * q / (p * p + g * g * q * q)
+        if cost < least:
+            best, least = t, cost
+    if 1.0 / (f * f) + c * c / (a * a + g * g * c * c) < least:
+        return 1.0, 0.0
+    return best, 1.0
 
 
-def _global_minimum(
-    coefficients: FloatArray,
-    a: FloatArray,
-    b: FloatArray,
-    c: FloatArray,
-    d: FloatArray,
-    f: FloatArray,
-    g: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """As :func:`_minimum`, from all roots of the polynomial and the limit of the cost for an infinite t."""
-    roots = _roots(coefficients)
-    f2, g2 = (f * f)[:, None], (g * g)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        p, q = a[:, None] * roots + b[:, None], c[:, None] * roots + d[:, None]
-        cost = roots**2 / (1.0 + f2 * roots**2) + q * q / (p * p + g2 * q * q)
-        limit = 1.0 / (f * f) + c * c / (a * a + g * g * c * c)
-    cost = np.where(np.isfinite(cost), cost, np.inf)
-    rows = np.arange(len(a))
-    best = cost.argmin(axis=1)
-    far = limit < cost[rows, best]
-    return np.where(far, 1.0, roots[rows, best]), np.where(far, 0.0, 1.0)
-
-
-def _frame(pixels: FloatArray, epipole: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n, 3, 3) from frames with a pixel at the origin and the epipole at (1, 0, f), and (n,) f (eq. 3.8, 3.9)."""
-    moved = epipole[:2] - epipole[2] * pixels
-    length = np.hypot(moved[:, 0], moved[:, 1])
-    # a pixel on the epipole: any direction does
-    at_epipole = length < _ON_EPIPOLE * np.abs(epipole[2])
-    length = np.where(at_epipole, _ON_EPIPOLE * max(abs(float(epipole[2])), 1e-300), length)
-    cosine, sine = np.where(at_epipole, [[1.0], [0.0]], moved.T / length)
-    frame = np.zeros((len(pixels), 3, 3))
-    frame[:, 0, 0], frame[:, 0, 1] = cosine, -sine
-    frame[:, 1, 0], frame[:, 1, 1] = sine, cosine
-    frame[:, :2, 2], frame[:, 2, 2] = pixels, 1.0
-    return frame, epipole[2] / length
-
-
-def _polynomial(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
-    """(7, n) coefficients of eq. 3.12, the highest first."""
+@compiled
+def _polynomial(a: float, b: float, c: float, d: float, f: float, g: float) -> FloatArray:
+    """(7,) coefficients of eq. 3.12, the highest first."""
     f2, g2 = f * f, g * g
     # (at+b)^2 + g^2 (ct+d)^2 = s2 t^2 + s1 t + s0, and (at+b)(ct+d) = m2 t^2 + m1 t + m0
     s2, s1, s0 = a * a + g2 * c * c, 2.0 * (a * b + g2 * c * d), b * b + g2 * d * d
     m2, m1, m0 = a * c, a * d + b * c, b * d
     k = a * d - b * c
-    return np.stack(
+    return np.array(
         [
             -k * f2 * f2 * m2,
             s2 * s2 - k * f2 * f2 * m1,
@@ -168,34 +166,41 @@ def _polynomial(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, f: F
     )
 
 
-def _value(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+@compiled
+def _value(coefficients: FloatArray, t: float) -> tuple[float, float]:
     """A polynomial's value and derivative, by Horner's rule."""
-    value, slope = coefficients[0] + 0.0 * t, np.zeros_like(t)
-    for coefficient in coefficients[1:]:
+    value, slope = coefficients[0], 0.0
+    for index in range(1, len(coefficients)):
         slope = slope * t + value
-        value = value * t + coefficient
+        value = value * t + coefficients[index]
     return value, slope
 
 
+@compiled
 def _roots(coefficients: FloatArray) -> FloatArray:
-    """(n, 6) real parts of the roots of polynomials (7, n)."""
-    least = _LEADING * np.abs(coefficients).max(axis=0)
-    leading = np.where(np.abs(coefficients[0]) > least, coefficients[0], least + 1e-300)
-    companion = np.zeros((coefficients.shape[1], 6, 6))
-    companion[:, 0] = np.nan_to_num((-coefficients[1:] / leading).T, posinf=0.0, neginf=0.0)
-    companion[:, np.arange(1, 6), np.arange(5)] = 1.0
+    """(6,) real parts of the roots of a polynomial (7,)."""
+    least = _LEADING * np.abs(coefficients).max()
+    leading = coefficients[0] if abs(coefficients[0]) > least else least + 1e-300
+    companion = np.zeros((6, 6), dtype=np.complex128)
+    for index in range(6):
+        companion[0, index] = -coefficients[index + 1] / leading
+    for index in range(5):
+        companion[index + 1, index] = 1.0
+    if not np.isfinite(companion).all():  # pixels that are not finite
+        return np.zeros(6)
     roots: FloatArray = np.linalg.eigvals(companion).real.astype(np.float64)
-    with np.errstate(all="ignore"):
+    for index in range(6):
         for _ in range(_POLISH):
-            value, slope = _value(coefficients[:, :, None], roots)
+            value, slope = _value(coefficients, roots[index])
             step = value / slope
-            roots = roots - np.where(np.isfinite(step) & (np.abs(step) < 1e-2 * (1.0 + np.abs(roots))), step, 0.0)
+            if abs(step) < 1e-2 * (1.0 + abs(roots[index])):
+                roots[index] -= step
     return roots
 
 
-def _nearest(line: FloatArray, frame: FloatArray) -> FloatArray:
-    """(n, 2) pixels of the points of lines (n, 3) that are nearest to the origin of their frames."""
-    point = np.concatenate([-line[:, :2] * line[:, 2:], (line[:, :2] ** 2).sum(axis=-1, keepdims=True)], axis=-1)
-    pixels = (frame @ point[:, :, None])[:, :, 0]
-    result: FloatArray = pixels[:, :2] / pixels[:, 2:]
-    return result
+@compiled
+def _nearest(l0: float, l1: float, l2: float, cosine: float, sine: float, x: float, y: float) -> tuple[float, float]:
+    """The point of a line that is nearest to the origin of a pixel's frame, as a pixel."""
+    scale = l0 * l0 + l1 * l1
+    across, along = -l0 * l2 / scale, -l1 * l2 / scale
+    return cosine * across - sine * along + x, sine * across + cosine * along + y

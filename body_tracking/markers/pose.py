@@ -6,6 +6,7 @@ a triangulated point is several times less sure along the line of sight than acr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -14,6 +15,8 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from body_tracking.core import so3
+from body_tracking.core.compiled import compiled
+from body_tracking.core.compiled_so3 import turned
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers.observations import Points, TargetPose
@@ -91,38 +94,60 @@ def maximum_likelihood(
         noise: (b, m, 3, 3) covariance of the measured points.
         shape: (b, 3m, 3m) covariance of the targets' points; None for targets that are known.
     """
-    count, balls = model.shape[:2]
-    weights = np.linalg.inv(noise)
-    rotation: FloatArray
-    translation: FloatArray
     rotation, translation = umeyama(model, measured, 3.0 / np.trace(noise, axis1=2, axis2=3))
-    jacobian = np.zeros((count, balls, 3, 6))
-    jacobian[..., :3] = np.eye(3)
-    flat = jacobian.reshape(count, 3 * balls, 6)
-    dense = np.zeros((count, balls, 3, balls, 3))
-    if shape is not None:
-        each = np.arange(balls)
-        dense[:, each, :, each, :] = noise.swapaxes(0, 1)
-    for _ in range(_ITERATIONS):
-        turned = model @ rotation.swapaxes(1, 2)
-        missing = measured - turned - translation[:, None]
-        jacobian[..., 3:] = -so3.skew(turned)
-        if shape is None:
-            weighted = (weights @ jacobian).reshape(count, 3 * balls, 6)
-            weighted_missing = (weights @ missing[..., None]).reshape(count, 3 * balls, 1)
-        else:
-            information = np.linalg.inv(dense.reshape(count, 3 * balls, 3 * balls) + _turned(shape, rotation))
-            weighted = information @ flat
-            weighted_missing = information @ missing.reshape(count, 3 * balls, 1)
-        covariance = np.asarray(np.linalg.inv(flat.swapaxes(1, 2) @ weighted), dtype=np.float64)
-        step = np.asarray(covariance @ (weighted.swapaxes(1, 2) @ missing.reshape(count, 3 * balls, 1)))[..., 0]
-        translation += step[:, :3]
-        rotation = so3.quat_to_matrix(so3.exp(step[:, 3:])) @ rotation
-        if (np.abs(step) < _CONVERGED).all():
-            break
-    chi_square: FloatArray = (missing.reshape(count, 1, 3 * balls) @ weighted_missing)[:, 0, 0]
-    residual = np.asarray(np.sqrt((missing**2).sum(axis=(1, 2)) / balls), dtype=np.float64)
-    return Fits(rotation, translation, covariance, chi_square, residual)
+    size = 3 * model.shape[1]
+    known = np.zeros((len(model), size, size)) if shape is None else shape
+    return Fits(*_maximised(model, measured, noise, known, rotation, translation))
+
+
+@compiled
+def _maximised(
+    model: FloatArray,
+    measured: FloatArray,
+    noise: FloatArray,
+    shape: FloatArray,
+    rotations: FloatArray,
+    translations: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The fields of :class:`Fits`, by Gauss-Newton from rotations and translations near to them."""
+    count, balls = model.shape[:2]
+    size = 3 * balls
+    rotations, translations = rotations.copy(), translations.copy()
+    covariances, chi_squares, residuals = np.empty((count, 6, 6)), np.empty(count), np.empty(count)
+    # derivatives of the points by the pose, and in the last column what is missing to the measured points
+    system = np.zeros((size, 7))
+    covariance = np.empty((size, size))
+    for n in range(count):
+        for _ in range(_ITERATIONS):
+            turn = rotations[n].copy()
+            for i in range(balls):
+                x, y, z = turn @ model[n, i]
+                row = system[3 * i : 3 * i + 3]
+                row[0, 0] = row[1, 1] = row[2, 2] = 1.0
+                row[0, 4], row[0, 5], row[1, 5] = z, -y, x
+                row[1, 3], row[2, 3], row[2, 4] = -z, y, -x
+                row[0, 6] = measured[n, i, 0] - x - translations[n, 0]
+                row[1, 6] = measured[n, i, 1] - y - translations[n, 1]
+                row[2, 6] = measured[n, i, 2] - z - translations[n, 2]
+                # the target's own covariance, which turns with it, and the measured point's
+                for j in range(balls):
+                    for a in range(3):
+                        for b in range(3):
+                            total = noise[n, i, a, b] if i == j else 0.0
+                            for c in range(3):
+                                for d in range(3):
+                                    total += turn[a, c] * shape[n, 3 * i + c, 3 * j + d] * turn[b, d]
+                            covariance[3 * i + a, 3 * j + b] = total
+            normal = system.T.copy() @ np.linalg.solve(covariance, system)
+            covariances[n] = np.linalg.inv(normal[:6, :6].copy())
+            step = covariances[n] @ normal[:6, 6].copy()
+            chi_squares[n] = normal[6, 6]
+            residuals[n] = math.sqrt((system[:, 6] ** 2).sum() / balls)
+            translations[n] += step[:3]
+            rotations[n] = turned(step[3:], rotations[n])
+            if np.abs(step).max() < _CONVERGED:
+                break
+    return rotations, translations, covariances, chi_squares, residuals
 
 
 def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose:
@@ -182,15 +207,6 @@ def balls_covariance(target: Target, balls: IntArray) -> FloatArray:
     rows = (3 * balls[:, None] + np.arange(3)).ravel()
     part: FloatArray = target.covariance[np.ix_(rows, rows)]
     return part
-
-
-def _turned(shape: FloatArray, rotation: FloatArray) -> FloatArray:
-    """``rotation @ block @ rotation.T`` for every (3, 3) block of (b, 3m, 3m)."""
-    count, size = shape.shape[:2]
-    columns = (shape.reshape(count, size * size // 3, 3) @ rotation.swapaxes(1, 2)).reshape(count, size, size)
-    rows = columns.swapaxes(1, 2).reshape(count, size * size // 3, 3) @ rotation.swapaxes(1, 2)
-    result: FloatArray = rows.reshape(count, size, size).swapaxes(1, 2)
-    return result
 
 
 def _on_one_line(points: FloatArray) -> bool:

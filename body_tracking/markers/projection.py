@@ -12,6 +12,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.markers.rig import LENS, POSE, Rig
 
@@ -70,30 +71,58 @@ def by_lens(camera: Camera, flat: FloatArray) -> tuple[FloatArray, FloatArray, F
     Returns:
         (n, 2) pixels, (n, 2, 2) their derivative by the coordinates, (n, 2, q - 6) by the parameters of the lens.
     """
-    count = len(camera.distortion)
-    distorted, jacobian = camera.distort(flat)
-    focal = camera.matrix[[0, 1], [0, 1]]
-    x, y = flat[:, 0], flat[:, 1]
-    r2 = x * x + y * y
-    derivative = np.zeros((len(flat), 2, LENS + count))
-    derivative[:, 0, 0], derivative[:, 1, 1] = distorted[:, 0], distorted[:, 1]
-    derivative[:, 0, 2] = derivative[:, 1, 3] = 1.0
-    below = np.ones_like(r2)
-    if count > 5:
-        k4, k5, k6 = camera.distortion[5:8]
-        below += r2 * (k4 + r2 * (k5 + r2 * k6))
-    powers = np.stack([r2, r2 * r2, r2 * r2 * r2], axis=-1) / below[:, None]  # k1, k2, k3
-    scaled = focal * flat
-    derivative[:, :, LENS : LENS + 2] = scaled[:, :, None] * powers[:, None, :2]
-    derivative[:, :, LENS + 4] = scaled * powers[:, 2:]
-    cross, square = 2.0 * x * y, 2.0 * flat * flat + r2[:, None]
-    derivative[:, 0, LENS + 2], derivative[:, 1, LENS + 2] = focal[0] * cross, focal[1] * square[:, 1]
-    derivative[:, 0, LENS + 3], derivative[:, 1, LENS + 3] = focal[0] * square[:, 0], focal[1] * cross
-    if count > 5:
-        k1, k2, _, _, k3 = camera.distortion[:5]
+    count = len(flat)
+    pixels, by_flat = np.empty((count, 2)), np.empty((count, 2, 2))
+    derivative = np.empty((count, 2, LENS + len(camera.distortion)))
+    _by_lens(np.ascontiguousarray(camera.matrix), camera.distortion, flat, pixels, by_flat, derivative)
+    return pixels, by_flat, derivative
+
+
+@compiled
+def _by_lens(
+    matrix: FloatArray,
+    distortion: FloatArray,
+    flat: FloatArray,
+    pixels: FloatArray,
+    by_flat: FloatArray,
+    derivative: FloatArray,
+) -> None:
+    """Write the results of :func:`by_lens`; conventions as in :meth:`Camera.distort`."""
+    coefficients = np.zeros(8)
+    coefficients[: len(distortion)] = distortion
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    for n in range(len(flat)):
+        x, y = flat[n]
+        xx, xy, yy = x * x, x * y, y * y
+        r2 = xx + yy
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
         radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-        derivative[:, :, LENS + 5 :] = -(scaled * radial[:, None])[:, :, None] * powers[:, None, :]
-    return camera.to_pixels(distorted), focal[:, None] * jacobian, derivative
+        slope = (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) / below
+        seen_x = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
+        seen_y = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
+        pixels[n, 0], pixels[n, 1] = fx * seen_x + cx, fy * seen_y + cy
+        mixed = 2.0 * xy * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        by_flat[n, 0, 0] = fx * (radial + 2.0 * xx * slope + 2.0 * p1 * y + 6.0 * p2 * x)
+        by_flat[n, 0, 1], by_flat[n, 1, 0] = fx * mixed, fy * mixed
+        by_flat[n, 1, 1] = fy * (radial + 2.0 * yy * slope + 6.0 * p1 * y + 2.0 * p2 * x)
+        row = derivative[n]
+        row[0, 0], row[0, 1], row[0, 2], row[0, 3] = seen_x, 0.0, 1.0, 0.0
+        row[1, 0], row[1, 1], row[1, 2], row[1, 3] = 0.0, seen_y, 0.0, 1.0
+        for axis in range(2):
+            scaled = (fx * x, fy * y)[axis]
+            power = r2 / below
+            row[axis, LENS], row[axis, LENS + 1], row[axis, LENS + 4] = (
+                scaled * power,
+                scaled * power * r2,
+                scaled * power * r2 * r2,
+            )
+            if len(distortion) > 5:
+                for order in range(3):
+                    row[axis, LENS + 5 + order] = -scaled * radial * power
+                    power *= r2
+        row[0, LENS + 2], row[0, LENS + 3] = 2.0 * fx * xy, fx * (r2 + 2.0 * xx)
+        row[1, LENS + 2], row[1, LENS + 3] = fy * (r2 + 2.0 * yy), 2.0 * fy * xy
 
 
 def project(camera: Camera, rotation: FloatArray, translation: FloatArray, points: FloatArray) -> Projection:

@@ -6,6 +6,7 @@ camera: with fifteen balls a camera, a call costs more than its numbers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.compiled import compiled
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers import projection
@@ -173,9 +175,8 @@ def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
     cameras = np.repeat(np.arange(len(counts)), counts)
     balls = np.arange(len(pixels)) - np.asarray(first)[cameras]
     focal = geometry.focal[cameras]
-    flat, jxx, jxy, jyy = _undistort(
-        (pixels - geometry.centre[cameras]) / focal, geometry.distortion[:, cameras], bool(geometry.distortion.any())
-    )
+    flat, jacobian = _undistort((pixels - geometry.centre[cameras]) / focal, geometry.distortion, cameras)
+    jxx, jxy, jyy = jacobian.T
     # Cholesky's root of the centroid's covariance, brought into image coordinates
     root = np.zeros((len(pixels), 2, 2))
     root[:, 0, 0] = np.sqrt(xx)
@@ -201,45 +202,38 @@ def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
     )
 
 
-def _undistort(
-    seen: FloatArray, distortion: FloatArray, distorted: bool
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Ideal image coordinates of distorted ones, and the derivative of distortion there (it is symmetric).
+@compiled
+def _undistort(seen: FloatArray, distortion: FloatArray, cameras: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Ideal image coordinates (m, 2) of distorted ones, and the derivative of distortion there: (m, 3) xx, xy, yy.
 
     As :meth:`Camera.undistort`, whose conventions it follows, for points of several cameras at once.
     """
-    one = np.ones(len(seen))
-    if not distorted:
-        return seen, one, np.zeros(len(seen)), one
-    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
-    rational, tangential = bool(distortion[5:].any()), bool(distortion[2:4].any())
-    u, v = seen.T
-    x, y = u, v
-    with np.errstate(all="ignore"):
+    flat, jacobian = np.empty_like(seen), np.empty((len(seen), 3))
+    for n in range(len(seen)):
+        k1, k2, p1, p2, k3, k4, k5, k6 = distortion[:, cameras[n]]
+        u, v = seen[n]
+        x, y = u, v
+        moved, jxx, jxy, jyy, determinant = math.inf, 1.0, 0.0, 1.0, 1.0
         for _ in range(_NEWTON):
             r2 = x * x + y * y
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3)  # twice the derivative by r2
-            if rational:
-                below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-                radial = radial / below
-                slope = (slope - radial * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * r2 * k6))) / below
-            xs = x * slope
-            jxx, jxy, jyy = radial + x * xs, y * xs, radial + y * y * slope
-            du, dv = u - x * radial, v - y * radial
-            if tangential:
-                cross = 2.0 * x * y
-                du, dv = du - p1 * cross - p2 * (r2 + 2.0 * x * x), dv - p1 * (r2 + 2.0 * y * y) - p2 * cross
-                jxx, jyy = jxx + 2.0 * p1 * y + 6.0 * p2 * x, jyy + 6.0 * p1 * y + 2.0 * p2 * x
-                jxy = jxy + 2.0 * (p1 * x + p2 * y)
+            below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+            # twice the derivative by r2
+            slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3)
+            slope = (slope - radial * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * r2 * k6))) / below
+            du = u - x * radial - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)
+            dv = v - y * radial - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y
+            jxx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+            jyy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+            jxy = x * y * slope + 2.0 * (p1 * x + p2 * y)
             determinant = jxx * jyy - jxy * jxy
             dx, dy = (jyy * du - jxy * dv) / determinant, (jxx * dv - jxy * du) / determinant
             x, y = x + dx, y + dy
-            moved = np.abs(dx) + np.abs(dy)
-            if not (moved > 1e3 * _CONVERGED).any():  # the next step would be the square of this one
+            moved = abs(dx) + abs(dy)
+            if not moved > 1e3 * _CONVERGED:  # the next step would be the square of this one
                 break
         # determinant and sign: within the range where the polynomials are monotonic
-        known = (moved < 1e4 * _CONVERGED) & (determinant > 0.0) & (x * u + y * v >= 0.0)
-    flat = np.stack([x, y], axis=-1)
-    flat[~known] = np.nan
-    return flat, jxx, jxy, jyy
+        known = moved < 1e4 * _CONVERGED and determinant > 0.0 and x * u + y * v >= 0.0
+        flat[n, 0], flat[n, 1] = (x, y) if known else (math.nan, math.nan)
+        jacobian[n, 0], jacobian[n, 1], jacobian[n, 2] = jxx, jxy, jyy
+    return flat, jacobian

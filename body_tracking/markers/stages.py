@@ -15,12 +15,12 @@ from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, RELIABLE, Qos
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.markers import setup
+from body_tracking.markers import detection, setup, tracking, triangulation
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
 from body_tracking.markers.corrections import calibration_effects, centred
-from body_tracking.markers.detection import DetectionSettings, ImageError, detect, prepare
+from body_tracking.markers.detection import DetectionSettings, ImageError, detect
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.markers.pairing import FrameSets
 from body_tracking.markers.rig_monitor import Finding, RigMonitor
@@ -78,7 +78,7 @@ class DetectorStage(Stage):
         self._sizes = {} if rig is None else {setup.image_topic(each.frame_id): each for each in rig.cameras}
         self._counters: Counter[str] = Counter()
         self._problems: dict[str, str] = {}
-        prepare()
+        detection.prepare()
         waiting = _KEPT if values["reliable"] else 0
         self.inputs = tuple(
             Port(topic, CameraImage(), _IMAGES, waiting, perishable=not waiting) for topic in self._topics
@@ -160,6 +160,7 @@ class TriangulationStage(Stage):
         self._diameter = float(str(values["diameter"]))
         frames = [camera.frame_id for camera in self.rig.cameras]
         tolerance, wait = float(str(values["tolerance"])), float(str(values["max_wait"]))
+        triangulation.prepare()
         self._sets: FrameSets[ImageBalls] = FrameSets(frames, round(tolerance * NANOSECONDS), round(wait * NANOSECONDS))
         self._frames = {setup.balls_topic(frame): frame for frame in frames}
         self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True) for topic in self._frames)
@@ -257,6 +258,7 @@ class TrackerStage(Stage):
         super().__init__(values, wanted)
         self.targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
         self.tracker = TargetTracker(self.targets, deadline=float(str(values["deadline"])))
+        tracking.prepare()
         self.inputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, perishable=True),)
         self.outputs = tuple(
             Port(setup.pose_topic(target.name), PoseOfTarget(target.name), RELIABLE, measured=True)
@@ -301,6 +303,7 @@ class AnglesOfTargetsStage(Stage):
         targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
         self._shapes = {target.name: target for target in targets}
         self._angles = AngleEstimator(chain)
+        triangulation.prepare()  # its derivatives, by which errors of the calibration become those of angles
         self._sets: FrameSets[TargetPose] = FrameSets(
             chain.targets, 0, round(float(str(values["max_wait"])) * NANOSECONDS)
         )
@@ -343,3 +346,9 @@ class AnglesOfTargetsStage(Stage):
     @property
     def counters(self) -> Mapping[str, int]:
         return {"poses without a partner": self._sets.incomplete}
+
+
+def prepare() -> None:
+    """Compile the loops of all stages, or load them."""
+    for each in (detection, triangulation, tracking):
+        each.prepare()

@@ -175,7 +175,7 @@ SYSTEM = System(
             "the other cameras in the same frame, where tf2_msgs is installed",
         ),
     ),
-    prepare="body_tracking.markers.detection:prepare",
+    prepare="body_tracking.markers.stages:prepare",
     views=(View("marker_setup", "body_tracking.viewing.marker_view:MarkerView"),),
     commands=(
         Command("markers", "body_tracking.recording.marker_commands", "calibrate and use infrared cameras and markers"),

@@ -9,15 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted_together
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST, chi_square_gate
 from body_tracking.markers.recognition import Recogniser, check_points, target_pose
-from body_tracking.markers.search import GATE, Deadline, DeadlineError, Pairs, near_pairs
+from body_tracking.markers.search import Deadline, DeadlineError, Pairs, near_pairs
 from body_tracking.markers.targets import Target
+from body_tracking.markers.track import Motion as Motion
+from body_tracking.markers.track import Track
 
 _INNOVATION_GATE: Final = chi_square_gate(6, 1e-6)
 """Squared Mahalanobis distance of a pose from its prediction."""
@@ -25,25 +26,6 @@ _INNOVATION_GATE: Final = chi_square_gate(6, 1e-6)
 
 class TrackingError(BodyTrackingError):
     """Parameters are invalid."""
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """How targets move.
-
-    Attributes:
-        acceleration: m/s^2, standard deviation of what is constant between two frames.
-        angular_acceleration: rad/s^2.
-        speed: m/s, standard deviation when a target is recognised.
-        angular_speed: rad/s.
-        coast: seconds for which a target that is not seen is predicted.
-    """
-
-    acceleration: float = 15.0
-    angular_acceleration: float = 150.0
-    speed: float = 1.5
-    angular_speed: float = 6.0
-    coast: float = 0.4
 
 
 @dataclass(slots=True)
@@ -69,17 +51,6 @@ class Counters:
     given_up: int = 0
     repeated: int = 0
     resets: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Track:
-    """The motion of a target: its pose, velocity (m/s, rad/s about fixed axes), covariance (12, 12), when last seen."""
-
-    rotation: FloatArray
-    translation: FloatArray
-    velocity: FloatArray
-    covariance: FloatArray
-    seen_ns: int
 
 
 class TargetTracker:
@@ -108,7 +79,7 @@ class TargetTracker:
             if not (math.isfinite(value) and value > 0.0):
                 raise TrackingError(f"{name} is {value:g}, expected a positive number")
         self.counters = Counters()
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, Track] = {}
         self._stamp_ns: int | None = None
         self._frame_id = ""
 
@@ -145,7 +116,7 @@ class TargetTracker:
                 lambda name, each: _believed(self._targets[name], points, each, self._tracks[name]),
             )
             for name, candidate in chosen.items():
-                self._tracks[name] = _updated(self._tracks[name], candidate, points.stamp_ns)
+                self._tracks[name] = self._tracks[name].updated(_pose(candidate), points.stamp_ns)
             recognised, others = self._recognise(points, chosen, unsure, until)
             unsure |= others
         except DeadlineError:
@@ -158,27 +129,17 @@ class TargetTracker:
 
     def _predict(self, stamp_ns: int) -> None:
         """Move all tracks to a time; those that were not seen for too long are lost."""
-        elapsed = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NANOSECONDS
+        elapsed_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
-        motion = self._motion
-        transition = np.eye(12)
-        transition[:6, 6:] = elapsed * np.eye(6)
-        gain = np.concatenate([0.5 * elapsed**2 * np.eye(6), elapsed * np.eye(6)])
-        noise = (gain * np.repeat([motion.acceleration**2, motion.angular_acceleration**2], 3)) @ gain.T
         for name, track in list(self._tracks.items()):
-            if (stamp_ns - track.seen_ns) / NANOSECONDS > motion.coast:
+            if stamp_ns - track.seen_ns > self._motion.coast * NANOSECONDS:
                 del self._tracks[name]
-                continue
-            self._tracks[name] = replace(
-                track,
-                rotation=so3.quat_to_matrix(so3.exp(elapsed * track.velocity[3:])) @ track.rotation,
-                translation=track.translation + elapsed * track.velocity[:3],
-                covariance=transition @ track.covariance @ transition.T + noise,
-            )
+            else:
+                self._tracks[name] = track.predicted(elapsed_ns, self._motion)
 
     def _candidates(self, points: Points, until: Deadline) -> dict[str, list[Candidate]]:
         """Ways to see the tracked targets near where they are expected."""
-        gates = {name: _gates(self._targets[name], track, points) for name, track in self._tracks.items()}
+        gates = {name: track.gates(self._targets[name], points) for name, track in self._tracks.items()}
         near = np.zeros(len(points.positions), dtype=bool)
         for gate in gates.values():
             near |= gate.any(axis=0)
@@ -228,75 +189,37 @@ class TargetTracker:
         result = self._recogniser.recognise(left, until.remaining(), lost)
         poses = tuple(replace(pose, points=_renumbered(pose.points, rows)) for pose in result.poses)
         for pose in poses:
-            self._tracks[pose.name] = self._begun(pose)
+            self._tracks[pose.name] = Track.begun(pose, self._motion)
         self.counters.given_up += not result.complete
         return poses, set(result.ambiguous)
 
-    def _begun(self, pose: TargetPose) -> _Track:
-        covariance = np.diag(np.repeat([0.0, 0.0, self._motion.speed**2, self._motion.angular_speed**2], 3))
-        covariance[:6, :6] = pose.covariance
-        return _Track(pose.rotation, pose.translation, np.zeros(6), covariance, pose.stamp_ns)
+
+def prepare() -> None:
+    """Compile the loops, or load them, before the first points: a target, seen and seen again."""
+    balls = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.07, 0.0], [0.02, 0.03, 0.05]])
+    tracker = TargetTracker([Target("", balls, np.zeros((12, 12)))])
+    noise = np.tile(1e-6 * np.eye(3), (4, 1, 1))
+    for stamp_ns in (0, 1):
+        tracker.update(Points(stamp_ns, "", balls, noise, np.zeros((4, 0), dtype=np.intp)))
 
 
-def _gates(target: Target, track: _Track, points: Points) -> BoolArray:
-    """(k, n) whether a point may be a ball of a target, by where the ball is expected."""
-    arms = target.points @ track.rotation.T
-    jacobian = np.zeros((len(arms), 3, 6))
-    jacobian[..., :3] = np.eye(3)
-    jacobian[..., 3:] = -so3.skew(arms)
-    own = target.covariance.reshape(len(arms), 3, len(arms), 3)[np.arange(len(arms)), :, np.arange(len(arms))]
-    # turned with the target, which its trace bounds
-    expected = jacobian @ track.covariance[:6, :6] @ jacobian.swapaxes(1, 2)
-    expected += np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    difference = points.positions - (arms + track.translation)[:, None]
-    squared = (difference**2).sum(axis=2)
-    widest = np.trace(expected, axis1=1, axis2=2)[:, None] + np.trace(points.covariance, axis1=1, axis2=2)
-    gates: BoolArray = np.asarray(squared <= GATE**2 * widest)
-    ball, point = np.nonzero(gates)
-    noise = expected[ball] + points.covariance[point]
-    chosen = difference[ball, point][:, :, None]
-    distance = (chosen.swapaxes(1, 2) @ np.linalg.solve(noise, chosen))[:, 0, 0]
-    gates[ball, point] = distance <= GATE**2
-    return gates
+def _pose(candidate: Candidate) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return candidate.rotation, candidate.translation, candidate.covariance
 
 
-def _innovation(track: _Track, candidate: Candidate) -> FloatArray:
-    """(6,) from the predicted to the measured pose."""
-    turned = so3.rotation_vectors(candidate.rotation @ track.rotation.T)
-    return np.concatenate([candidate.translation - track.translation, turned])
-
-
-def _expected(track: _Track, candidate: Candidate) -> Candidate | None:
+def _expected(track: Track, candidate: Candidate) -> Candidate | None:
     """The candidate with the cost of its distance from the prediction; None outside of the gate."""
-    innovation = _innovation(track, candidate)
-    distance = float(innovation @ np.linalg.solve(track.covariance[:6, :6] + candidate.covariance, innovation))
+    distance = track.distance(_pose(candidate))
     return replace(candidate, cost=candidate.cost + distance) if distance <= _INNOVATION_GATE else None
 
 
-def _believed(target: Target, points: Points, candidate: Candidate, track: _Track) -> bool:
+def _believed(target: Target, points: Points, candidate: Candidate, track: Track) -> bool:
     """Whether chance does not explain a candidate with hidden balls, among the poses within the gate."""
     if min(candidate.assignment) >= 0:
         return True
     prior = track.covariance[:6, :6]
     poses = math.pi**3 / 6.0 * _INNOVATION_GATE**3 * math.sqrt(max(np.linalg.det(prior + candidate.covariance), 0.0))
     return expected_by_chance(target, points, candidate, poses) < MAX_CHANCE
-
-
-def _updated(track: _Track, candidate: Candidate, stamp_ns: int) -> _Track:
-    """The track with the pose as a measurement (Kalman update)."""
-    innovation = _innovation(track, candidate)
-    gain = np.linalg.solve(track.covariance[:6, :6] + candidate.covariance, track.covariance[:6]).T
-    correction = gain @ innovation
-    left = np.eye(12)
-    left[:, :6] -= gain
-    covariance = left @ track.covariance @ left.T + gain @ candidate.covariance @ gain.T
-    return _Track(
-        so3.quat_to_matrix(so3.exp(correction[3:6])) @ track.rotation,
-        track.translation + correction[:3],
-        track.velocity + correction[6:],
-        covariance,
-        stamp_ns,
-    )
 
 
 def _renumbered(points: IntArray, rows: IntArray) -> IntArray:

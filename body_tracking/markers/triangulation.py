@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.camera import Camera
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import hartley_sturm, projection
 from body_tracking.markers.observations import ImageBalls, Points
@@ -102,6 +103,20 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
         members, positions, covariance = _agreed(geometry, rays, members, positions, settings)
     indices = np.where(members >= 0, rays.balls[members] if len(rays.balls) else -1, -1)
     return Points(balls[0].stamp_ns, rig.cameras[0].frame_id, positions, covariance, indices)
+
+
+def prepare() -> None:
+    """Compile the loops, or load them, before the first images: a point before two parallel cameras."""
+    matrix = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    cameras = tuple(Camera(name, 640, 480, matrix, np.zeros(5)) for name in ("left", "right"))
+    size = sum(projection.size(camera) for camera in cameras)
+    translations = np.array([[0.0, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+    rig = Rig(cameras, np.tile(np.eye(3), (2, 1, 1)), translations, np.zeros((size, size)))
+    balls = [
+        ImageBalls(0, name, np.array([[column, 240.0]]), np.ones(1), np.eye(2)[None])
+        for name, column in (("left", 420.0), ("right", 220.0))
+    ]
+    triangulate(rig, balls)
 
 
 def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: TriangulationSettings) -> Pairs:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from body_tracking.core import so3
+from body_tracking.core.compiled import LOOPS
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS
@@ -68,9 +69,12 @@ def scene() -> MarkerScene:
     return marker_scene("slow_down", seed=1, rate=RATE, seconds=16.0)
 
 
+Published = dict[str, list[bytes]]
+
+
 @pytest.fixture(scope="module")
-def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
-    """All messages of the stages from two seconds of images, by topic."""
+def run(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Published, int]:
+    """All messages of the stages from two seconds of images, by topic, and how many loops were compiled meanwhile."""
     folder = tmp_path_factory.mktemp("lab")
     save_rig(scene.rig, folder / setup.RIG)
     save_targets(scene.targets, folder / setup.TARGETS)
@@ -84,7 +88,8 @@ def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> d
             (AnglesOfTargetsStage, {"setup": str(folder)}),
         )
     ]
-    found: dict[str, list[bytes]] = {}
+    before = compilations()
+    found: Published = {}
     runner = OfflineRunner(stages, BAG_WIRE, lambda topic, cdr, at_ns: found.setdefault(topic, []).append(cdr))
     runner.start(START_NS)
     for index in range(FRAMES):
@@ -97,7 +102,20 @@ def published(scene: MarkerScene, tmp_path_factory: pytest.TempPathFactory) -> d
             runner.push(setup.image_topic(camera.frame_id), message, at_ns)
     runner.finish(at_ns)
     assert not runner.counters
-    return found
+    return found, compilations() - before
+
+
+@pytest.fixture(scope="module")
+def published(run: tuple[Published, int]) -> Published:
+    return run[0]
+
+
+def compilations() -> int:
+    return sum(len(loop.signatures) for loop in LOOPS)
+
+
+def test_no_message_waits_for_the_compiler(run: tuple[Published, int]) -> None:
+    assert compilations() and run[1] == 0
 
 
 def test_targets_are_where_they_are(scene: MarkerScene, published: dict[str, list[bytes]]) -> None:
