@@ -103,7 +103,9 @@ class Finding:
             if self.fault is Fault.MOVED_CAMERA
             else f"{abs(self.amount) * 1e3:.1f} ms"
         )
-        return f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
+        text = f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
+        # two views show only that one turned against the other
+        return f"{text} (which of them, the images cannot tell)" if len(self.cameras) > 1 else text
 
 
 @dataclass(frozen=True, slots=True, eq=False)

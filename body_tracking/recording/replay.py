@@ -60,7 +60,7 @@ class ReplaySettings:
 
     Attributes:
         sensors: the first is the reference unless ``reference`` is set; all of the bag when empty, which may be none
-            with a ``marker_setup``.
+            with a ``marker_setup``; :data:`graph.NO_SENSORS` alone for none although the bag has some.
         reference: or empty.
         filter_name: one of the filters.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
@@ -283,8 +283,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     began = time.perf_counter()
     counters: Counter[str] = Counter()
     with RigReader(bag_path) as bag:
-        without = settings.depth or (settings.marker_setup and not graph.sensors_among(bag.topics))
-        topics = {} if without and not settings.sensors else sensor_topics(bag, settings.sensors)
+        topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
         try:
@@ -336,6 +335,20 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             {name: count for name, count in sorted(counters.items()) if count},
             tuple(bag.warnings),
         )
+
+
+def _without(settings: ReplaySettings, bag: BagReader) -> bool:
+    """Whether no skeletons of sensors are used.
+
+    Raises:
+        ReplayError: none are wanted, and nothing else is.
+    """
+    if settings.sensors == (graph.NO_SENSORS,):
+        if not (settings.marker_setup or settings.depth):
+            raise ReplayError(f"{bag.path}: sensors none, and neither a marker setup nor a depth camera")
+        return True
+    other = settings.depth or (settings.marker_setup and not graph.sensors_among(bag.topics))
+    return bool(other) and not settings.sensors
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -395,8 +408,11 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         for values in parameters.values():
             values["reference"] = args.reference
     options: dict[str, Any] = dict(chosen)
+    sensors: tuple[str, ...] = ()
+    if args.sensors:
+        sensors = tuple(each for each in options["sensors"] if each not in options["computed"]) or (graph.NO_SENSORS,)
     return ReplaySettings(
-        tuple(each for each in options["sensors"] if each not in options["computed"]) if args.sensors else (),
+        sensors,
         args.reference or "",
         options["filter"] or DEFAULT_FILTER,
         options["convention"] or graph.AUTO,
@@ -440,7 +456,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "model_covariance",
         filter=f"default: {DEFAULT_FILTER}",
         convention="of the joint angles (default: by the filter)",
-        sensors="use these, the first as reference (default: all in the bag)",
+        sensors="use these, the first as reference; none: no skeletons, markers or depth alone (default: all in the "
+        "bag)",
         calibration="start from this calibration (YAML)",
         model_covariance="with ekf: write /filtered/model_covariance, too; it is most of such a bag",
     )

@@ -20,6 +20,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.codecs import Balls, SpacePoints
 from body_tracking.markers.observations import ImageBalls
 from body_tracking.markers.rig import Rig
+from body_tracking.markers.rig_monitor import Fault, Finding
 from body_tracking.markers.rig_storage import save_rig
 from body_tracking.markers.stages import DetectorStage, TriangulationStage
 from body_tracking.messages.base import to_header
@@ -78,6 +79,13 @@ def test_a_camera_turned_in_mid_run_is_named_within_a_second(tmp_path: Path, see
     # a jump of time forgets it, and put right it is told no more
     watched.stage.reset(setup.balls_topic("a"))
     assert watched.run(RATE // 2, rig(3)) == ""
+
+
+def test_a_finding_says_where_the_images_do_not_tell_the_camera() -> None:
+    assert str(Finding(Fault.MOVED_CAMERA, ("a", "b"), 0.0035, 1e-4)) == (
+        "moved camera: a or b by 0.20 deg (which of them, the images cannot tell)"
+    )
+    assert str(Finding(Fault.OUT_OF_STEP, ("b",), 0.0167, 1e-4)) == "cameras out of step: b by 16.7 ms"
 
 
 @pytest.mark.parametrize("late", some([(0.0, 0.0, 1.0 / RATE), (0.0, 0.0, -1.0 / RATE)]))

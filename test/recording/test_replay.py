@@ -441,6 +441,17 @@ def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Co
     assert "kinect7" in command("replay", BAG, "-o", tmp_path / "out", "--sensors", "kinect1,kinect7")[2]
 
 
+def test_sensors_none_leaves_out_the_skeletons_of_a_bag(tmp_path: Path, command: Command) -> None:
+    setup = Path(__file__).resolve().parents[2] / "config" / "marker_setup"
+    for more, message in (
+        ((), "no sensors"),
+        (("--marker-setup", setup), "no topic /left/image_raw or /left/balls or /markers/points"),
+    ):
+        code, _, reported = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "none", *more)
+        assert code == 2 and message in reported
+    assert not (tmp_path / "out").exists()
+
+
 def test_errors_have_one_base() -> None:
     for error in (ReplayError, BagError, ParameterError):
         assert issubclass(error, BodyTrackingError)
