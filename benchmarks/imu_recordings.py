@@ -36,10 +36,10 @@ from body_tracking.inertial.alignment import (
     still_periods,
     wrapped,
 )
-from body_tracking.inertial.angles import SegmentAngles
 from body_tracking.inertial.clock import clock_offset, turning_of_sensor
 from body_tracking.inertial.imu_csv import ImuCsvRecording
 from body_tracking.inertial.mvnx import MvnxFrame, MvnxRecording
+from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
 
 MODEL = UpperBody()
@@ -192,6 +192,19 @@ def stated_angles(data: dict[str, Any], side: str) -> dict[str, FloatArray]:
     }
 
 
+def isb_angles(rotations: FloatArray) -> tuple[FloatArray, list[str]]:
+    """(n, 3 c) radians of the c chains of convention ``isb``, continuous over (n, 12, 3, 3), and their names or ""."""
+    isb = convention("isb", MODEL)
+    ((sequences, parents, children, rows),) = isb.stages
+    place = {row - rows.start: name for row, name in zip(isb.rows.tolist(), isb.names, strict=True)}
+    relative = np.nan_to_num(rotations[:, parents].swapaxes(-1, -2) @ rotations[:, children])
+    found: list[FloatArray] = []
+    for each in relative:
+        previous = found[-1].reshape(-1, 3) if found else None
+        found.append(sequences.split(each, np.zeros((len(each), 3)), previous).angles.reshape(-1))
+    return np.array(found), [place.get(number, "") for number in range(rows.stop - rows.start)]
+
+
 def xsens(path: Path) -> dict[str, Any]:
     """RMS of each angle from sensors against the file's own, degrees."""
     data = read_xsens(path)
@@ -210,20 +223,11 @@ def xsens(path: Path) -> dict[str, Any]:
         ours[:, number] = sensor @ alignment
         off = so3.rotation_vectors(theirs[:, number].swapaxes(-1, -2) @ ours[:, number])
         rigid[segment] = float(np.degrees(np.sqrt((off[ALIGNED_FRAMES:] ** 2).sum(axis=1).mean())))
-    angles = SegmentAngles(MODEL)
-
-    def angles_of(rotations: FloatArray) -> FloatArray:
-        found, previous = [], None
-        for each in rotations:
-            previous = angles(0, each, None, previous)
-            found.append(previous.position)
-        return np.array(found)
-
-    from_sensors, from_segments = angles_of(ours), angles_of(theirs)
+    (from_sensors, names), (from_segments, _) = isb_angles(ours), isb_angles(theirs)
     figures: dict[str, Any] = {"frames": count - ALIGNED_FRAMES, "sensor_to_segment_deg": rigid, "tpose_deg": tpose}
     for side in ("left", "right"):
         for name, stated in stated_angles(data, side).items():
-            column = angles.names.index(name)
+            column = names.index(name)
             off, exact = (wrapped(each[:, column] - stated) for each in (from_sensors, from_segments))
             judged = np.degrees(off[ALIGNED_FRAMES:])
             figures[name] = {

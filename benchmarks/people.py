@@ -118,7 +118,7 @@ def switches(recording: SimulatedRecording, worthless: bool, seed: int) -> dict[
                 counted["switches"] += 1
                 seen = stamp_ns - whole_ns <= NANOSECONDS // 10 and stamp_ns - whole_since_ns >= NANOSECONDS
                 counted["switches while all were visible to a sensor"] += seen
-    counted.update(people.counters)
+    counted.update(people.counts)
     return dict(counted)
 
 
@@ -195,7 +195,7 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
         "frames of each number": dict(sorted(numbers.items())),
         "sensors apart, median mm": round(1e3 * float(np.median(apart))),
         "sensors apart, 99 % mm": round(1e3 * float(np.percentile(apart, 99))),
-        **{f"association {name}": count for name, count in people.counters.items()},
+        **{f"association {name}": count for name, count in people.counts.items()},
     }
 
 

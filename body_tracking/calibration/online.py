@@ -24,6 +24,7 @@ from body_tracking.calibration.turned import best_estimate, half_turn_from, regi
 from body_tracking.core import so3
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.measurement import joint_stddev
+from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
 
@@ -73,6 +74,24 @@ FOREIGN_CLOCK = 5.0
 CLOCK_STEP = 1.0
 """Largest difference of a saved offset from the one by times of receipt, seconds."""
 
+CLOCK_WINDOW = 3.0
+"""Half width of the search for the clock offset around the guess by the times of receipt, seconds."""
+
+CLOCK_CORRELATION, CLOCK_MARGIN = 0.6, 0.08
+"""Least correlation of the joint speeds at the clock offset, and least difference to every other offset's."""
+
+PAIRS_PER_PLACE, CAPACITY = 20, 500
+"""Stored pairs of frames per place and heading, and in all."""
+
+SETTLE_NS = round(0.3 * NANOSECONDS)
+"""Time to wait for late frames before they are paired, nanoseconds."""
+
+ESTIMATE_PERIOD = 1.0
+"""Seconds between estimates at first; it grows to five times this."""
+
+SLEW_ROTATION, SLEW_TRANSLATION = 0.05, 0.05
+"""Fastest turn of a published pose toward a better one, rad/s, and fastest move at the person's place, m/s."""
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationParameters:
@@ -85,97 +104,16 @@ class CalibrationParameters:
             "choices": ("robust", "thesis"),
         },
     )
-    reference_height: float = field(
-        default=0.0,
-        metadata={
-            "doc": "height of the reference sensor above the origin of world",
-            "unit": "m",
-            "min": -10,
-            "max": 10,
-        },
+    reference_height: float = number_field(
+        0.0, "height of the reference sensor above the origin of world", "m", -10.0, 10.0
     )
-    reference_pitch: float = field(
-        default=0.0,
-        metadata={"doc": "angle by which the reference sensor looks down", "unit": "rad", "min": -1.6, "max": 1.6},
+    reference_pitch: float = number_field(0.0, "angle by which the reference sensor looks down", "rad", -1.6, 1.6)
+    reference_roll: float = number_field(
+        0.0, "roll of the reference sensor about its view, clockwise from behind", "rad", -3.2, 3.2
     )
-    reference_roll: float = field(
-        default=0.0,
-        metadata={
-            "doc": "roll of the reference sensor about its view, clockwise from behind",
-            "unit": "rad",
-            "min": -3.2,
-            "max": 3.2,
-        },
-    )
-    clock_window: float = field(
-        default=3.0,
-        metadata={
-            "doc": "search the clock offset this far around the guess from the times of receipt",
-            "unit": "s",
-            "min": 0.1,
-            "max": 60,
-        },
-    )
-    clock_correlation: float = field(
-        default=0.6,
-        metadata={
-            "doc": "accept a clock offset when the joint speeds correlate at least this well",
-            "min": 0.1,
-            "max": 1.0,
-        },
-    )
-    clock_margin: float = field(
-        default=0.08,
-        metadata={"doc": "and when that exceeds every other offset's correlation by this much", "min": 0.0, "max": 1.0},
-    )
-    history: float = field(
-        default=30.0,
-        metadata={"doc": "raw frames kept for finding the clock offset", "unit": "s", "min": 5, "max": 600},
-    )
-    pairs_per_place: int = field(
-        default=20,
-        metadata={"doc": "pairs of frames remembered per place (0.3 m) and heading (45 deg)", "min": 3, "max": 1000},
-    )
-    capacity: int = field(default=500, metadata={"doc": "pairs of frames remembered in all", "min": 50, "max": 20000})
-    settle_time: float = field(
-        default=0.3,
-        metadata={"doc": "wait this long for late frames before they are paired", "unit": "s", "min": 0.0, "max": 5},
-    )
-    activation_delay: float = field(
-        default=0.5,
-        metadata={"doc": "a new estimate holds from this long after it was made", "unit": "s", "min": 0.0, "max": 10},
-    )
-    estimate_period: float = field(
-        default=1.0,
-        metadata={
-            "doc": "time between estimates at first; it grows to five times this",
-            "unit": "s",
-            "min": 0.1,
-            "max": 60,
-        },
-    )
-    slew_rotation: float = field(
-        default=0.05,
-        metadata={
-            "doc": "turn a published pose toward a better one no faster than this",
-            "unit": "rad/s",
-            "min": 0.001,
-            "max": 10,
-        },
-    )
-    slew_translation: float = field(
-        default=0.05,
-        metadata={
-            "doc": "and move it at the person's place no faster than this",
-            "unit": "m/s",
-            "min": 0.001,
-            "max": 10,
-        },
-    )
-    max_rotation_stddev: float = field(
-        default=0.05,
-        metadata={"doc": "warn while a pose is known less well than this", "unit": "rad", "min": 0.001, "max": 3.2},
-    )
+    history: float = number_field(30.0, "raw frames kept for finding the clock offset", "s", 5.0, 600.0)
+    activation_delay: float = number_field(0.5, "a new estimate holds from this long after it was made", "s", 0.0, 10.0)
+    max_rotation_stddev: float = number_field(0.05, "warn while a pose is known less well than this", "rad", 0.001, 3.2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,8 +192,7 @@ class _Track:
 class _Sensor:
     """State of one sensor other than the reference; rotations and translations are sensor to reference, optical."""
 
-    def __init__(self, parameters: CalibrationParameters) -> None:
-        self.parameters = parameters
+    def __init__(self) -> None:
         self.track = _Track()
         self.rotation: FloatArray | None = None  # as published, slewing toward the target
         self.translation: FloatArray = np.zeros(3)
@@ -278,7 +215,7 @@ class _Sensor:
         self.clock_fit: ClockFit | None = None
         self.clock_window_end: int | None = None
         self.paired_clock = self.clock
-        self.pairs = Coverage(self.parameters.pairs_per_place, self.parameters.capacity)
+        self.pairs = Coverage(PAIRS_PER_PLACE, CAPACITY)
         self.paired_until: int | None = None
         self.started: tuple[FloatArray, FloatArray] | None = None
         self.next_estimate = 0
@@ -321,7 +258,7 @@ class OnlineCalibration:
             self.parameters.reference_roll,
         )
         self._track = _Track()
-        self._sensors = {name: _Sensor(self.parameters) for name in sensors if name != self.reference}
+        self._sensors = {name: _Sensor() for name in sensors if name != self.reference}
         self._anchor: int | None = None
         self._now: int | None = None
         self._last_step: int | None = None
@@ -369,7 +306,7 @@ class OnlineCalibration:
             return []
         gap = self._now is not None and now - self._now > NANOSECONDS
         self._now = now
-        horizon = now - round(self.parameters.settle_time * NANOSECONDS)
+        horizon = now - SETTLE_NS
         for name, other in self._sensors.items():
             self._process(name, other, horizon)
         self._track.forget_before(now - round(self.parameters.history * NANOSECONDS))
@@ -400,7 +337,7 @@ class OnlineCalibration:
         self._pair(other, horizon)
         if self._now is None or self._now < other.next_estimate:
             return
-        period = self.parameters.estimate_period
+        period = ESTIMATE_PERIOD
         if other.movement_since is not None:
             period *= float(np.clip(0.1 * (self._now - other.movement_since) / NANOSECONDS, 1.0, 5.0))
         other.next_estimate = self._now + round(period * NANOSECONDS)
@@ -531,12 +468,8 @@ class OnlineCalibration:
         assert self._anchor is not None
         own = self._since_anchor(self._track, ClockModel(), None, horizon)
         theirs = self._since_anchor(other.track, other.clock, None, other.clock.to_sensor(horizon))
-        found = correlate_clocks(own, theirs, 0.0, self.parameters.clock_window)
-        if (
-            found is None
-            or found.likely < self.parameters.clock_correlation
-            or found.margin < self.parameters.clock_margin
-        ):
+        found = correlate_clocks(own, theirs, 0.0, CLOCK_WINDOW)
+        if found is None or found.likely < CLOCK_CORRELATION or found.margin < CLOCK_MARGIN:
             return
         other.clock_base = replace(other.clock, offset_ns=other.clock.offset_ns + round(found.offset * NANOSECONDS))
         if other.clock_expected is not None and abs(found.offset) > FINE_RANGE:
@@ -692,9 +625,9 @@ class OnlineCalibration:
         angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(centre - place))
         if angle < 1e-9 and distance < 1e-9:
             return False
-        share = min(1.0, self.parameters.slew_rotation * elapsed / max(angle, 1e-12))
+        share = min(1.0, SLEW_ROTATION * elapsed / max(angle, 1e-12))
         other.rotation = so3.quat_to_matrix(so3.exp(share * turn)) @ other.rotation
-        place += (centre - place) * min(1.0, self.parameters.slew_translation * elapsed / max(distance, 1e-12))
+        place += (centre - place) * min(1.0, SLEW_TRANSLATION * elapsed / max(distance, 1e-12))
         other.translation = place - other.rotation @ own_centre
         return True
 
@@ -795,7 +728,7 @@ class OnlineCalibration:
     def reset(self) -> str:
         """Delete every calibration and start again."""
         for name, other in list(self._sensors.items()):
-            fresh = _Sensor(self.parameters)
+            fresh = _Sensor()
             fresh.track = other.track
             self._sensors[name] = fresh
         self._changed = True

@@ -18,13 +18,10 @@ from body_tracking.pipeline.shared import REFERENCE, RELIABLE, SENSORS, WORLD_FR
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _LEVEL = "world would tilt or move under everyone who uses it"
-_MEMORY = "the frames remembered so far were chosen by it"
-_STAMPS = "by it a recording gives offline what it gave live"
 _FIXED = {
     "method": "what one method has estimated is no start for the other",
     **dict.fromkeys(("reference_height", "reference_pitch", "reference_roll"), _LEVEL),
-    **dict.fromkeys(("history", "pairs_per_place", "capacity"), _MEMORY),
-    **dict.fromkeys(("activation_delay",), _STAMPS),
+    "activation_delay": "by it a recording gives offline what it gave live",
 }
 
 

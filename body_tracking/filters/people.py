@@ -73,7 +73,7 @@ class PeopleFilter:
         for person in self._persons:
             total.update(person.counters)
         if self.people is not None:
-            total.update({f"association {name}": count for name, count in self.people.counters.items()})
+            total.update({f"association {name}": count for name, count in self.people.counts.items()})
         return dict(total)
 
     def set_pose(self, pose: SensorPose) -> None:

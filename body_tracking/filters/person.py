@@ -21,9 +21,9 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.prediction import Prediction
 from body_tracking.fusion.alignment import SensorAlignment
-from body_tracking.fusion.fusion import WORLD
 from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.people import People
+from body_tracking.fusion.placement import WORLD
 from body_tracking.kinematics.codecs import Segments
 from body_tracking.kinematics.tracking import LengthChanges
 from body_tracking.messages.codecs import (
@@ -137,7 +137,7 @@ class PersonFilter:
             counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
             counters |= {f"waited {name}": count for name, count in self._ordering.counters.items()}
         if self.people is not None:
-            counters |= {f"association {name}": count for name, count in self.people.counters.items()}
+            counters |= {f"association {name}": count for name, count in self.people.counts.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
         return counters

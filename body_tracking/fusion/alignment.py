@@ -7,19 +7,17 @@ and late frames are passed on.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.clocks import jumped_back
 from body_tracking.core.measurement import joint_stddev, viewing_angle
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import heading_weights, headings_of, reversed_halves, swap_left_right
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
-from body_tracking.fusion.fusion import WORLD, FusionError
-from body_tracking.fusion.placement import Placement
+from body_tracking.fusion.placement import WORLD, PlacedSensors, Placement
 from body_tracking.fusion.sides import Sides
 
 FRESH = 0.1
@@ -47,17 +45,13 @@ class _Frame:
 class _Sensor(Placement):
     """Pose, clock and newest frame of a sensor."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.clear()
-
     def clear(self) -> None:
+        super().clear()
         self.last_ns: int | None = None  # in its own clock
         self.newest: _Frame | None = None
-        self.ahead = False  # its clock relation is wrong: the reference's frames are from its past
 
 
-class SensorAlignment:
+class SensorAlignment(PlacedSensors[_Sensor]):
     """Brings frames of calibrated sensors into one frame and one clock, one by one.
 
     Args:
@@ -65,20 +59,13 @@ class SensorAlignment:
         reference: the sensor whose clock is that of ``world``; the first one when None.
         world: the frame of the output.
 
-    Attributes:
-        counters: event counts since the construction, for diagnostics.
-
     Raises:
         FusionError: the reference is not among the sensors.
     """
 
     def __init__(self, sensors: Sequence[str], reference: str | None = None, world: str = WORLD) -> None:
-        self.reference = reference or (sensors[0] if sensors else "")
-        if self.reference not in sensors:
-            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {', '.join(sensors)}")
+        super().__init__(sensors, reference, _Sensor)
         self.world = world
-        self.counters: Counter[str] = Counter()
-        self._sensors = {name: _Sensor() for name in sensors}
         self._sides = Sides()
 
     def reset(self) -> None:
@@ -94,22 +81,6 @@ class SensorAlignment:
             sensor.clear()
         self._sides.reset()
 
-    def set_pose(self, pose: SensorPose) -> None:
-        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""
-        sensor = self._sensors.get(pose.sensor)
-        if sensor is None:
-            self.counters["unknown_sensor"] += 1
-        else:
-            sensor.set_pose(pose)
-
-    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
-        """Take a sensor's clock, in force from a reference time; unknown sensors are counted and ignored."""
-        known = self._sensors.get(sensor)
-        if known is None:
-            self.counters["unknown_sensor"] += 1
-        else:
-            known.set_clock(valid_from_ns, clock)
-
     def push(self, sensor: str, skeleton: Skeleton) -> Skeleton | None:
         """One frame of one sensor, in ``world``.
 
@@ -122,9 +93,8 @@ class SensorAlignment:
             ``core/measurement.py``, isotropic; joints that are not valid, and those of a body half whose axis is across
             the accepted one, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
         """
-        source = self._sensors.get(sensor)
+        source = self._known(sensor)
         if source is None:
-            self.counters["unknown_sensor"] += 1
             return None
         self._check_clock(sensor, source, skeleton.stamp_ns)
         stamp = source.stamp(skeleton.stamp_ns)
@@ -135,7 +105,7 @@ class SensorAlignment:
         if pose is None:
             self.counters["uncalibrated"] += 1
             return None
-        if not self._in_step(sensor, source, stamp):
+        if not self._in_step(sensor, stamp):
             self.counters["other_clock"] += 1
             return None
         source.forget_before(stamp - _KEEP)
@@ -158,21 +128,12 @@ class SensorAlignment:
         else:
             self.counters["late"] += 1
 
-    def _in_step(self, sensor: str, source: _Sensor, stamp: int) -> bool:
-        """Whether a frame's stamp is consistent with the reference sensor's newest one.
-
-        The clock of a restarted sensor may have another offset until the calibration has estimated it again.
-        """
-        if sensor == self.reference:
-            for other in self._sensors.values():
-                if other.newest is not None and other.newest.stamp_ns > stamp + JUMP_BACK_NS:
-                    other.ahead, other.newest = True, None
-            return True
-        reference = self._sensors[self.reference].newest
-        if reference is None:
-            return True
-        source.ahead &= stamp > reference.stamp_ns + JUMP_BACK_NS
-        return not source.ahead and not jumped_back(stamp, reference.stamp_ns)
+    def _in_step(self, sensor: str, stamp_ns: int) -> bool:
+        in_step = super()._in_step(sensor, stamp_ns)
+        for other in self._sensors.values():
+            if other.ahead:
+                other.newest = None
+        return in_step
 
     def _corrected(self, sensor: str, seen: _Frame) -> Skeleton:
         """The frame with left and right corrected by all sensors' frames near that time."""

@@ -10,24 +10,22 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
 from body_tracking.core.measurement import joint_stddev, viewing_angle
+from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import PAIRS
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
-from body_tracking.fusion.placement import Placement
+from body_tracking.fusion.placement import WORLD, PlacedSensors, Placement
 from body_tracking.fusion.rhythm import Rhythm
-from body_tracking.fusion.sides import HOLD, Sides
+from body_tracking.fusion.sides import Sides
 from body_tracking.fusion.weights import thesis_formula, thesis_text
-
-WORLD = "world"
 
 MAX_SPEED = 8.0
 """Fastest motion of a joint along an axis, metres per second."""
@@ -41,12 +39,19 @@ ACCELERATION = 30.0
 _WIDTHS = ((0.15, 0.6), (0.05, 0.4))
 """Plausible (least, greatest) lengths of the left-right axes of shoulders and hips, as a Kinect sees them, metres."""
 
+MAX_OUTPUT_GAP = round(0.065 * NANOSECONDS)
+"""Silence of the reference from which outputs are made at another sensor's frames, nanoseconds."""
+
+EXTRAPOLATE = 0.05
+"""Longest time by which a sensor's older frame is carried forward, seconds."""
+
+GATE = 3.5
+"""Standard deviations from its prediction beyond which a joint is rejected ..."""
+
+REACQUIRE = 0.3
+"""... unless a sensor has reported it there for this long, seconds."""
 
 _DIAGONAL = np.arange(3)
-
-
-class FusionError(BodyTrackingError):
-    """Raised when the reference sensor is not among the sensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,67 +66,12 @@ class FusionParameters:
             "choices": ("covariance", "thesis_text", "thesis_formula"),
         },
     )
-    silence: float = field(
-        default=0.1,
-        metadata={"doc": "drop a sensor whose newest frame is older than this", "unit": "s", "min": 0.02, "max": 5.0},
+    silence: float = number_field(0.1, "drop a sensor whose newest frame is older than this", "s", 0.02, 5.0)
+    max_wait: float = number_field(
+        0.05, "wait at most this long for another sensor's frame that is due; 0 for the least delay", "s", 0.0, 1.0
     )
-    max_wait: float = field(
-        default=0.05,
-        metadata={
-            "doc": "wait at most this long for another sensor's frame that is due; 0 for the least delay",
-            "unit": "s",
-            "min": 0.0,
-            "max": 1.0,
-        },
-    )
-    max_output_gap: float = field(
-        default=0.065,
-        metadata={
-            "doc": "publish at another sensor's frames when the reference is silent for this long",
-            "unit": "s",
-            "min": 0.01,
-            "max": 5.0,
-        },
-    )
-    extrapolate: float = field(
-        default=0.05,
-        metadata={"doc": "carry a sensor's older frame forward by at most this", "unit": "s", "min": 0.0, "max": 0.5},
-    )
-    gate: float = field(
-        default=3.5,
-        metadata={
-            "doc": "reject a joint farther from its prediction than this many standard deviations",
-            "min": 1.0,
-            "max": 100.0,
-        },
-    )
-    reacquire: float = field(
-        default=0.3,
-        metadata={
-            "doc": "accept a rejected joint that a sensor has reported for this long",
-            "unit": "s",
-            "min": 0.0,
-            "max": 10.0,
-        },
-    )
-    fade_in: float = field(
-        default=0.5,
-        metadata={
-            "doc": "let a sensor that appears or returns gain its full weight over this time",
-            "unit": "s",
-            "min": 0.0,
-            "max": 10.0,
-        },
-    )
-    turned_hold: float = field(
-        default=HOLD,
-        metadata={
-            "doc": "hold left and right against a body that all sensors see reversed at once, for as long as it was "
-            "seen before, but at most for this long",
-            "unit": "s",
-            "min": 0.0,
-            "max": 60.0,
-        },
+    fade_in: float = number_field(
+        0.5, "let a sensor that appears or returns gain its full weight over this time", "s", 0.0, 10.0
     )
 
 
@@ -142,18 +92,13 @@ class _Frame:
 class _Sensor(Placement):
     """Recent frames, pose and clock of one sensor."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.clear()
-
     def clear(self) -> None:
+        super().clear()
         self.frames: deque[_Frame] = deque(maxlen=8)
         self.rhythm = Rhythm()
-        self.newest_ns: int | None = None  # in the reference's clock
-        self.ahead = False  # its clock relation is wrong: the reference's frames are from its past
 
 
-class Fusion:
+class Fusion(PlacedSensors[_Sensor]):
     """Fuses the skeletons of any number of calibrated sensors.
 
     Args:
@@ -170,13 +115,9 @@ class Fusion:
         reference: str | None = None,
         world: str = WORLD,
     ) -> None:
+        super().__init__(sensors, reference, _Sensor)
         self.parameters = parameters or FusionParameters()
-        self.reference = reference or (sensors[0] if sensors else "")
-        if self.reference not in sensors:
-            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {', '.join(sensors)}")
         self.world = world
-        self.counters: Counter[str] = Counter()
-        self._sensors = {name: _Sensor() for name in sensors}
         # Frames at whose time an output may be due: capture time, whether not the reference's, and deadline.
         self._pending: list[tuple[int, bool, int]] = []
         self._forget_output()
@@ -190,7 +131,7 @@ class Fusion:
         self._known_ns: FloatArray = np.full(N_JOINTS, -np.inf)
         self._rejected_since: dict[str, FloatArray] = {name: np.full(N_JOINTS, np.nan) for name in self._sensors}
         self._rejecting = False
-        self._sides = Sides(self.parameters.turned_hold)
+        self._sides = Sides()
 
     def reset(self) -> None:
         """Forget all frames; calibrations stay, and those that wait for their time come into force."""
@@ -204,24 +145,6 @@ class Fusion:
         for sensor in self._sensors.values():
             sensor.clear()
         self._forget_output()
-
-    # --- calibration in
-
-    def set_pose(self, pose: SensorPose) -> None:
-        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""
-        sensor = self._sensors.get(pose.sensor)
-        if sensor is None:
-            self.counters["unknown_sensor"] += 1
-        else:
-            sensor.set_pose(pose)
-
-    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
-        """Take a sensor's clock, in force from a reference time; unknown sensors are counted and ignored."""
-        known = self._sensors.get(sensor)
-        if known is None:
-            self.counters["unknown_sensor"] += 1
-        else:
-            known.set_clock(valid_from_ns, clock)
 
     # --- frames in
 
@@ -238,10 +161,8 @@ class Fusion:
         """
         # The result does not depend on whether the caller polled in between.
         fused = self.poll(now_ns)
-        source = self._sensors.get(sensor)
-        if source is None:
-            self.counters["unknown_sensor"] += 1
-        elif self._accepts(sensor, source, skeleton, now_ns):
+        source = self._known(sensor)
+        if source is not None and self._accepts(sensor, source, skeleton, now_ns):
             fused += self.poll(now_ns)
         return fused
 
@@ -257,9 +178,11 @@ class Fusion:
                 source.clear()
                 self.counters["resets"] += 1
         stamp = source.stamp(skeleton.stamp_ns)
-        if stamp is None or not self._in_step(sensor, source, stamp, now_ns):
+        if stamp is None or not self._in_step(sensor, stamp):
             self.counters["other_clock"] += 1
             return False
+        if sensor == self.reference:
+            self._restart_behind(stamp, now_ns)
         # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:
@@ -271,19 +194,11 @@ class Fusion:
             insort(self._pending, (stamp, sensor != self.reference, deadline))
         return True
 
-    def _in_step(self, sensor: str, source: _Sensor, stamp: int, now_ns: int) -> bool:
-        """Whether a frame's stamp is consistent with the reference sensor's newest one.
+    def _restart_behind(self, stamp: int, now_ns: int) -> None:
+        """Start the output again where the reference's frames are older than it for longer than a delay explains.
 
-        The clock relation of another sensor may be wrong, and the output far ahead: where the reference's frames have
-        been older than the output for longer than a delay explains, the output starts again.
+        The clock relation of another sensor may have been wrong, and the output far ahead.
         """
-        source.newest_ns = stamp
-        if sensor != self.reference:
-            reference_ns = self._sensors[self.reference].newest_ns
-            source.ahead &= reference_ns is not None and stamp > reference_ns + JUMP_BACK_NS
-            return not source.ahead and not jumped_back(stamp, reference_ns)
-        for other in self._sensors.values():
-            other.ahead |= other.newest_ns is not None and other.newest_ns > stamp + JUMP_BACK_NS
         if self._last_ns is None or self._last_ns <= stamp + JUMP_BACK_NS:
             self._behind_since_ns = None
         elif self._behind_since_ns is None:
@@ -291,7 +206,6 @@ class Fusion:
         elif now_ns - self._behind_since_ns > JUMP_BACK_NS:
             self._forget_output()
             self.counters["resets"] += 1
-        return True
 
     def _remember(self, source: _Sensor, skeleton: Skeleton, stamp: int) -> None:
         known = skeleton.valid
@@ -327,7 +241,7 @@ class Fusion:
         while self._pending:
             stamp, other, deadline = self._pending[0]
             # Another sensor's frame gives an output only when the reference has been silent for a while.
-            if other and stamp - self._last_output(stamp) <= self.parameters.max_output_gap * NANOSECONDS:
+            if other and stamp - self._last_output(stamp) <= MAX_OUTPUT_GAP:
                 del self._pending[0]
                 continue
             due = self._due(stamp)
@@ -383,12 +297,12 @@ class Fusion:
             if age > self.parameters.silence:
                 self.counters["silent"] += 1
                 continue
-            fade = self.parameters.fade_in
             names.append(name)
             frames.append(frame)
             ages.append(age)
             poses.append(pose)
-            shares.append(1.0 if fade <= 0.0 else min(1.0, max(0.02, (stamp - frame.since_ns) / NANOSECONDS / fade)))
+            fade = max(self.parameters.fade_in, 1e-9)
+            shares.append(min(1.0, max(0.02, (stamp - frame.since_ns) / NANOSECONDS / fade)))
         if not names:
             return None
         self.counters["fused"] += 1
@@ -396,9 +310,7 @@ class Fusion:
         thesis = self.parameters.method != "covariance"
         points = np.stack(
             [
-                pose.apply(
-                    frame.positions + (0.0 if thesis else min(age, self.parameters.extrapolate)) * frame.velocities
-                )
+                pose.apply(frame.positions + (0.0 if thesis else min(age, EXTRAPOLATE)) * frame.velocities)
                 for pose, frame, age in zip(poses, frames, ages, strict=True)
             ]
         )
@@ -428,10 +340,10 @@ class Fusion:
         weights = 1.0 / variance
         elapsed = (stamp - self._known_ns) / NANOSECONDS
         spread = 0.03**2 + (0.5 * ACCELERATION * elapsed**2 + 0.5 * elapsed) ** 2
-        spread[elapsed > self.parameters.reacquire] = np.inf
+        spread[elapsed > REACQUIRE] = np.inf
         away = points - (self._position + np.minimum(elapsed, 1.0)[:, None] * self._velocity)
         squared = np.einsum("kji,kji->kj", away, away) / (variance + spread)
-        far = squared > self.parameters.gate**2  # False for NaN
+        far = squared > GATE**2  # False for NaN
         if far.any() or self._rejecting:
             self._readmit(stamp, names, far)
         # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those that agree
@@ -448,12 +360,12 @@ class Fusion:
         return weights
 
     def _readmit(self, stamp: int, names: list[str], far: BoolArray) -> None:
-        """Accept, in place, joints that a sensor has reported outside the gate for :attr:`reacquire`."""
+        """Accept, in place, joints that a sensor has reported outside the gate for :data:`REACQUIRE`."""
         for index, name in enumerate(names):
             since = self._rejected_since[name]
             since[~far[index]] = np.nan
             since[far[index] & np.isnan(since)] = stamp
-            far[index] &= stamp - since <= self.parameters.reacquire * NANOSECONDS
+            far[index] &= stamp - since <= REACQUIRE * NANOSECONDS
         self._rejecting = any(not np.isnan(since).all() for since in self._rejected_since.values())
 
     def _combined(
@@ -491,7 +403,7 @@ class Fusion:
         elapsed = (stamp - self._known_ns) / NANOSECONDS
         smoothing = (1.0 - np.exp(-elapsed / SMOOTHING))[:, None]
         velocity = self._velocity + smoothing * ((positions - self._position) / elapsed[:, None] - self._velocity)
-        velocity[~(elapsed < self.parameters.reacquire)] = 0.0
+        velocity[~(elapsed < REACQUIRE)] = 0.0
         if known.all():
             self._position, self._velocity, self._known_ns = positions, velocity, np.full(N_JOINTS, float(stamp))
         else:

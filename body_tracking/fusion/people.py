@@ -5,17 +5,17 @@ Brings frames into world for :mod:`body_tracking.fusion.association`, and gives 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.clocks import jumped_back
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import Association
-from body_tracking.fusion.placement import Placement
+from body_tracking.fusion.placement import PlacedSensors, Placement
 from body_tracking.pipeline.people import ALL, FIRST, PeopleParameters, SubjectSelector
 
 _PRESENT = round(0.2 * NANOSECONDS)
@@ -60,21 +60,15 @@ class Slots:
 class _Sensor(Placement):
     """Pose and clock of a sensor, and its frames of a lone person that wait for the association."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.selector = SubjectSelector()
-        self.clear()
-
     def clear(self) -> None:
+        super().clear()
+        self.selector = SubjectSelector()
         self.last_ns: int | None = None  # in its own clock
-        self.newest_ns: int | None = None  # in the reference's
-        self.ahead = False
         self.used: SensorPose | None = None
         self.pending: deque[tuple[int, SensorPose, Skeleton]] = deque(maxlen=_PENDING)
-        self.selector.reset()
 
 
-class People:
+class People(PlacedSensors[_Sensor]):
     """Sorts the bodies of every sensor's frames by person.
 
     With one subject, a sensor that is not calibrated, or whose clock is wrong, selects the person nearest to itself, so
@@ -94,20 +88,18 @@ class People:
         reference: str | None = None,
         gone: Callable[[int], None] = lambda number: None,
     ) -> None:
+        super().__init__(sensors, reference, _Sensor)
         self.parameters = parameters
-        self.reference = reference or sensors[0]
         self.gone = gone
-        self._sensors = {name: _Sensor() for name in sensors}
         self._association = Association(parameters.hold)
         self._slots = Slots(parameters.people)
         self._chosen: int | None = None
-        self._counters: Counter[str] = Counter()
         self._without = 0
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counts(self) -> dict[str, int]:
         """How many people there are now, and what happened since the construction."""
-        counters = {"people": len(self._association.people), **self._association.counters, **self._counters}
+        counters = {"people": len(self._association.people), **self._association.counters, **self.counters}
         if self._without:
             counters["people without a number"] = self._without
         return counters
@@ -123,16 +115,6 @@ class People:
     def nearest(self) -> int | None:
         """With all, the number of the person whom ``nearest`` would choose."""
         return None if self._chosen is None else self._slots.of.get(self._chosen)
-
-    def set_pose(self, pose: SensorPose) -> None:
-        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are ignored."""
-        if pose.sensor in self._sensors:
-            self._sensors[pose.sensor].set_pose(pose)
-
-    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
-        """Take a sensor's clock, in force from a reference time; unknown sensors are ignored."""
-        if sensor in self._sensors:
-            self._sensors[sensor].set_clock(valid_from_ns, clock)
 
     def reset(self) -> None:
         """Forget all people, because time jumped back; poses and clocks stay."""
@@ -200,30 +182,17 @@ class People:
         source.last_ns = sensor_ns
         stamp_ns = source.stamp(sensor_ns)
         if stamp_ns is None:
-            self._counters["other_clock"] += 1
+            self.counters["other_clock"] += 1
             return None
         pose = source.pose(stamp_ns)
         if pose is None:
-            self._counters["uncalibrated"] += 1
+            self.counters["uncalibrated"] += 1
             return None
         source.forget_before(stamp_ns - _KEEP)
-        source.newest_ns = stamp_ns
-        if not self._in_step(sensor, source, stamp_ns):
-            self._counters["other_clock"] += 1
+        if not self._in_step(sensor, stamp_ns):
+            self.counters["other_clock"] += 1
             return None
         return stamp_ns, pose
-
-    def _in_step(self, sensor: str, source: _Sensor, stamp_ns: int) -> bool:
-        """Whether a frame's stamp is consistent with the reference sensor's newest one."""
-        if sensor == self.reference:
-            for other in self._sensors.values():
-                other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + JUMP_BACK_NS
-            return True
-        reference_ns = self._sensors[self.reference].newest_ns
-        if reference_ns is None:
-            return True
-        source.ahead &= stamp_ns > reference_ns + JUMP_BACK_NS
-        return not source.ahead and not jumped_back(stamp_ns, reference_ns)
 
     def _record_pending(self) -> None:
         """Pass the lone person's waiting frames to the association."""

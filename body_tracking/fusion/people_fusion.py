@@ -10,8 +10,9 @@ from itertools import groupby
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
-from body_tracking.fusion.fusion import WORLD, Fusion, FusionParameters
+from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.people import People
+from body_tracking.fusion.placement import WORLD
 from body_tracking.pipeline.people import ALL, PeopleParameters
 
 
@@ -60,7 +61,7 @@ class PeopleFusion:
         total: Counter[str] = Counter()
         for fusion in self._fusions:
             total.update(fusion.counters)
-        return {**total, **{f"association {name}": count for name, count in self.people.counters.items()}}
+        return {**total, **{f"association {name}": count for name, count in self.people.counts.items()}}
 
     def set_pose(self, pose: SensorPose) -> None:
         """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""

@@ -1,16 +1,27 @@
-"""Pose and clock of a sensor over time, as the calibration publishes them."""
+"""Poses and clocks of sensors over time, as the calibration publishes them."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final, Generic, TypeVar
 
-from body_tracking.core.clocks import ClockModel
+from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import MAX_STAMP_NS
 
+WORLD: Final = "world"
+"""The usual frame of the output."""
+
 _MOST = 64
 """Poses, and clocks, of one sensor that may wait to come into force."""
+
+
+class FusionError(BodyTrackingError):
+    """Raised when the reference sensor is not among the sensors."""
 
 
 class Placement:
@@ -19,6 +30,12 @@ class Placement:
     def __init__(self) -> None:
         self._poses: list[SensorPose] = []  # by valid_from_ns
         self._clocks: list[tuple[int, ClockModel]] = []  # likewise
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self.newest_ns: int | None = None  # in the reference's clock
+        self.ahead = False  # the clock relation is wrong: the reference's frames are from this sensor's past
 
     def set_pose(self, pose: SensorPose) -> None:
         """Add a pose, in force from its ``valid_from_ns``; it replaces earlier ones for later times."""
@@ -62,6 +79,67 @@ class Placement:
         del self._poses[:-1], self._clocks[:-1]
         if self._poses:
             self._poses[0] = replace(self._poses[0], valid_from_ns=0)
+
+
+S = TypeVar("S", bound=Placement)
+
+
+class PlacedSensors(Generic[S]):
+    """Several sensors with their poses and clocks; who takes their frames derives from it.
+
+    Attributes:
+        reference: the sensor whose clock is that of the output.
+        counters: event counts since the construction, for diagnostics.
+    """
+
+    def __init__(self, sensors: Sequence[str], reference: str | None, kind: type[S]) -> None:
+        """Without poses and clocks.
+
+        Args:
+            sensors: their names.
+            reference: one of them; the first one when None.
+            kind: class of the state of a sensor.
+
+        Raises:
+            FusionError: the reference is not among the sensors.
+        """
+        self.reference = reference or (sensors[0] if sensors else "")
+        if self.reference not in sensors:
+            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {', '.join(sensors)}")
+        self.counters: Counter[str] = Counter()
+        self._sensors: dict[str, S] = {name: kind() for name in sensors}
+
+    def set_pose(self, pose: SensorPose) -> None:
+        """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""
+        if (sensor := self._known(pose.sensor)) is not None:
+            sensor.set_pose(pose)
+
+    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
+        """Take a sensor's clock, in force from a reference time; unknown sensors are counted and ignored."""
+        if (known := self._known(sensor)) is not None:
+            known.set_clock(valid_from_ns, clock)
+
+    def _known(self, sensor: str) -> S | None:
+        """The sensor of a name; None, and counted, for an unknown one."""
+        found = self._sensors.get(sensor)
+        if found is None:
+            self.counters["unknown_sensor"] += 1
+        return found
+
+    def _in_step(self, sensor: str, stamp_ns: int) -> bool:
+        """Whether a frame's stamp is consistent with the reference sensor's newest one.
+
+        The clock of a restarted sensor may have another offset until the calibration has estimated it again.
+        """
+        source = self._sensors[sensor]
+        source.newest_ns = stamp_ns
+        if sensor == self.reference:
+            for other in self._sensors.values():
+                other.ahead |= other.newest_ns is not None and other.newest_ns > stamp_ns + JUMP_BACK_NS
+            return True
+        reference_ns = self._sensors[self.reference].newest_ns
+        source.ahead &= reference_ns is not None and stamp_ns > reference_ns + JUMP_BACK_NS
+        return not source.ahead and not jumped_back(stamp_ns, reference_ns)
 
 
 def _valid_from(pose: SensorPose) -> int:

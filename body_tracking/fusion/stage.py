@@ -24,8 +24,6 @@ from body_tracking.pipeline.shared import (
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
-_FIXED = {"turned_hold": "a body that is held reversed is held for as long as was said when it was seen"}
-
 
 def calibration_inputs(sensors: int, waiting: int = 0) -> tuple[Port, ...]:
     """The poses and clocks of some sensors, of which the ones in force and the next ones must be kept."""
@@ -45,7 +43,7 @@ class FusionStage(Stage):
         REFERENCE,
         WORLD_FRAME,
         *PEOPLE,
-        *parameters_from(FusionParameters, only=("method", "silence", "max_wait"), live=True, fixed=_FIXED),
+        *parameters_from(FusionParameters, only=("method", "silence", "max_wait"), live=True),
         RELIABLE,
     )
 

@@ -4,7 +4,7 @@
 estimates the rotation between sensor and segment, and ``heading`` tracks it and every sensor's heading over time.
 ``held_pose`` detects a pose for the alignment, ``mounting`` has the intended mountings, ``detection`` finds exchanged
 and slipped sensors. ``clock`` estimates a clock's offset by motion, ``timing`` keeps the offsets of all. ``posture``
-fits the body model to orientations, ``body`` makes a skeleton, ``angles`` makes joint angles. ``tracking`` with its
+fits the body model to orientations, ``body`` makes a skeleton. ``tracking`` with its
 ``parameters`` puts these together for ``stage``. ``simulated`` and its helpers simulate sensors; ``imu_csv`` and
 ``mvnx`` read recordings.
 

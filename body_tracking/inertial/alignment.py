@@ -1,6 +1,6 @@
-"""Alignment of inertial sensors with their segments: by a held pose, and by the axes of the elbow.
+"""Alignment of inertial sensors with their segments by a held pose.
 
-**Pose.** In a known pose, R_pose of eq. 1 is given. Sensors that each have a heading of their own leave four unknowns
+In a known pose, R_pose of eq. 1 is given. Sensors that each have a heading of their own leave four unknowns
 for its three equations; the intended mounting, or headings known from elsewhere, determine the fourth. The most
 probable alignment A = A_0 exp(delta) and heading psi minimise, weighted by their covariances,
 
@@ -9,18 +9,6 @@ probable alignment A = A_0 exp(delta) and heading psi minimise, weighted by thei
 People hold a pose to within 5-10 degrees per axis of a segment; static calibrations of the upper limb compared by
 Bouvier et al., Sensors 15 (2015) 18813. One person repeats a pose to 2 degrees, people differ by far more (Donaldson
 et al., ISBS 39 (2021) 58): longer averaging does not reduce this error. See :func:`pose_covariance`.
-
-**Elbow.** Flexion turns about an axis j1 that is fixed in the upper arm, pronation about j2 fixed in the forearm, so
-that the relative angular rate has no component normal to both (Mueller et al. 2016; with an unknown heading Delta
-between the two sensors, Laidig, Weygers and Seel, Sensors 22 (2022) 9850):
-
-    (R1 w1 - Rz(Delta) R2 w2) . n / |n| = 0,  n = R1 j1 x Rz(Delta) R2 j2                                           (5)
-
-It is robust, and weighted by the standard deviation of an angular rate at that speed (as Olsson et al., Sensors 20
-(2020) 3534, weigh samples by their motion). The weight of a sample allows for the autocorrelation of the residuals, and
-soft tissue and the person's own joint bound the accuracy of an axis.
-
-Over 500 lines: the inertial issue rewrites headings and alignment.
 """
 
 from __future__ import annotations
@@ -30,12 +18,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation, Slerp
 
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.kinematics.upper_body import UpperBody
 
 Pose = Literal["t", "n"]
@@ -60,22 +46,6 @@ _BIN = 0.1
 POSE_CONE: Final = float(np.radians(35.0))
 """Radians within which an arm counts as hanging or horizontal."""
 
-AXIS_FLOOR: Final = float(np.radians(5.0))
-"""Radians per direction: least standard deviation of a fitted axis; the skin follows a forearm's twist only in part."""
-AXIS_OFF: Final = float(np.radians(4.0))
-"""Radians per direction: standard deviation of a person's axes from the model's: carrying angle, varus and valgus."""
-FLESH_TURN: Final = float(np.radians(15.0))
-"""Radians: standard deviation of the heading between an elbow's sensors by its movement, as the skin lags a twist by a
-fifth; simulated."""
-_RATE_NOISE = 0.03
-_RATE_SHARE = 0.1
-"""rad/s and share of the rate: standard deviation of a relative rate, by noise and bias, and by soft tissue."""
-_TWIST_SHARE = 0.2
-_REPETITIONS = 15.0
-"""Share of a segment's twist that the skin does not follow, and greatest number of independent samples: the errors of
-soft tissue repeat with the movement."""
-_LEAST_TURNING = 0.3
-"""rad/s: least motion of an elbow for a fit."""
 _Z: Final = np.array([0.0, 0.0, 1.0])
 _STEPS = 12
 
@@ -117,27 +87,6 @@ class Stream:
         """The samples from begin to end, end excluded."""
         part = slice(*np.searchsorted(self.stamps, [begin, end]))
         return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
-
-    def thinned(self, rate: float) -> Stream:
-        """Every n-th sample, for about ``rate`` samples per second."""
-        if len(self.stamps) < 2:
-            return self
-        every = max(1, round(float(len(self.stamps) - 1) / float(np.ptp(self.stamps)) / rate))
-        part = slice(None, None, every)
-        return Stream(self.segment, self.stamps[part], self.rotations[part], self.rates[part])
-
-    def at(self, times: FloatArray, gap: float = 0.1) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Interpolated rotations and rates, and whether the surrounding samples are no further apart than the gap."""
-        if len(self.stamps) < 2:
-            nowhere = np.zeros(len(times), dtype=np.bool_)
-            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3)), nowhere
-        index = np.clip(np.searchsorted(self.stamps, times), 1, len(self.stamps) - 1)
-        inside = (times >= self.stamps[0]) & (times <= self.stamps[-1])
-        known: BoolArray = inside & (self.stamps[index] - self.stamps[index - 1] <= gap)
-        clipped = np.clip(times, self.stamps[0], self.stamps[-1])
-        rotations = Slerp(self.stamps, Rotation.from_matrix(self.rotations))(clipped).as_matrix()
-        rates = np.stack([np.interp(clipped, self.stamps, column) for column in self.rates.T], axis=-1)
-        return rotations, rates, known
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,152 +374,6 @@ def across(axis: FloatArray) -> FloatArray:
     one = np.cross(axis, least)
     one /= np.linalg.norm(one)
     return np.stack([one, np.cross(axis, one)], axis=-1)
-
-
-def _tilted(axis: FloatArray, by: FloatArray) -> FloatArray:
-    turned = axis + across(axis) @ by
-    result: FloatArray = turned / np.linalg.norm(turned)
-    return result
-
-
-def _common(first: Stream, second: Stream) -> tuple[FloatArray, ...]:
-    """Times of the slower stream where both are known, and rotations and rates of both at these."""
-    ends = [one.stamps[[0, -1]] if len(one.stamps) else np.array([np.inf, -np.inf]) for one in (first, second)]
-    begin, end = max(ends[0][0], ends[1][0]), min(ends[0][1], ends[1][1])
-    slower = min((first, second), key=lambda one: len(one.between(begin, end).stamps))
-    times = slower.stamps[(slower.stamps >= begin) & (slower.stamps <= end)]
-    (r1, w1, known), (r2, w2, known2) = first.at(times), second.at(times)
-    both = known & known2
-    return times[both], r1[both], w1[both], r2[both], w2[both]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ElbowFit:
-    """An alignment by the movement of an elbow.
-
-    Attributes:
-        alignment: corrected.
-        before: (5,) radians, standard deviations before: of two directions of the flexion axis in the upper arm's
-            sensor, two of the pronation axis in the forearm's, and of the heading between both.
-        after: (5,) the standard deviations after the fit.
-        information: of the movement, nats: half the logarithm of the ratio of the covariances' determinants.
-    """
-
-    alignment: Alignment
-    before: FloatArray
-    after: FloatArray
-    information: float
-
-
-def align_by_elbow(alignment: Alignment, side: str, upper: Stream, lower: Stream) -> ElbowFit | None:
-    """Correct two alignments and headings by any movement of the elbow between them (eq. 5).
-
-    The most probable errors of both with the alignment as prior; the person's axes deviate from the model's by unknown
-    constants of :data:`AXIS_OFF`.
-
-    Args:
-        alignment: the prior, such as one by a pose.
-        side: ``left`` or ``right``.
-        upper: of the upper arm's sensor.
-        lower: of the forearm's sensor.
-
-    Returns:
-        None where the two did not move against each other, or have less than a second in common.
-
-    Raises:
-        AlignmentError: no sensor on one of the segments.
-    """
-    numbers = numbers_of(alignment, f"upper_arm_{side}", f"forearm_{side}")
-    axes = elbow_segment_axes(side)
-    times, r1, w1, r2, w2 = _common(upper, lower)
-    rows = (4 * numbers[:, None] + np.arange(4)).reshape(-1)
-    prior = alignment.covariance[np.ix_(rows, rows)]
-    if len(times) < 50 or np.ptp(times) < 1.0:
-        return None
-    rates = [(r @ w[..., None])[..., 0] for r, w in ((r1, w1), (r2, w2))]
-    apart = float(alignment.headings[numbers[1]] - alignment.headings[numbers[0]])
-    relative = np.linalg.norm(rates[0] - rates[1] @ yaw(apart).T, axis=1)
-    if np.sqrt((relative**2).mean()) < _LEAST_TURNING:
-        return None
-    # the skin follows the bone's twist only in part
-    twists = [
-        np.abs(w @ alignment.rotations[number][:, 2]) for w, number in zip((w1, w2), numbers.tolist(), strict=True)
-    ]
-    scale = np.sqrt(
-        _RATE_NOISE**2 + (_RATE_SHARE * relative) ** 2 + _TWIST_SHARE**2 * (twists[0] ** 2 + twists[1] ** 2)
-    )
-
-    def off_plane(y: FloatArray) -> FloatArray:
-        """(n,) eq. 5, y: errors of both sensors (4 each), of the model's axes (2 each), and heading by soft tissue."""
-        worlds, turned = [], []
-        for place, rotations in enumerate((r1, r2)):
-            number, error = int(numbers[place]), y[4 * place : 4 * place + 4]
-            turn = yaw(alignment.headings[number] + error[3] + place * y[12])
-            held = alignment.rotations[number] @ so3.quat_to_matrix(so3.exp(error[:3]))
-            axis = held @ _tilted(axes[place], y[8 + 2 * place : 10 + 2 * place])
-            worlds.append(rotations @ axis @ turn.T)
-            turned.append(rates[place] @ turn.T)
-        normal = np.cross(*worlds)
-        size = np.maximum(np.linalg.norm(normal, axis=1), 0.3)
-        result: FloatArray = ((turned[0] - turned[1]) * normal).sum(axis=1) / size / scale
-        return result
-
-    whole = np.zeros((13, 13))
-    whole[:8, :8] = prior
-    whole[8:12, 8:12] = (AXIS_OFF**2 + AXIS_FLOOR**2) * np.eye(4)
-    whole[12, 12] = FLESH_TURN**2
-    white = np.linalg.inv(np.linalg.cholesky(whole))
-    y, worth = np.zeros(13), np.sqrt(_REPETITIONS / len(times))
-    found = None
-    for _ in range(3):
-        # weights by the size and the autocorrelation of the residuals
-
-        def residuals(y: FloatArray, worth: float = worth) -> FloatArray:
-            return np.concatenate([worth * _huber(off_plane(y)), white @ y])
-
-        starts = [y]
-        if found is None:  # heading and axes are strongly correlated
-            starts = [y + np.eye(13)[7] * turn for turn in (0.0, -0.4, 0.4)]
-        found = min((least_squares(residuals, start) for start in starts), key=lambda each: float(each.cost))
-        y = found.x
-        left = off_plane(y)
-        spread = max(1.4826 * float(np.median(np.abs(left))), 0.3)
-        worth = 1.0 / (spread * np.sqrt(max(_correlated(_huber(left)), len(left) / _REPETITIONS)))
-    assert found is not None
-    posterior = np.linalg.inv(found.jac.T @ found.jac)[:8, :8]
-    gain = alignment.covariance[:, rows] @ np.linalg.inv(prior)
-    covariance = alignment.covariance - gain @ (prior - posterior) @ gain.T
-    corrected = alignment.moved(np.asarray(gain @ y[:8]), np.asarray(covariance))
-    before, after = (_axes_stddev(a, numbers, axes) for a in (alignment, corrected))
-    information = 0.5 * float(np.linalg.slogdet(prior)[1] - np.linalg.slogdet(posterior)[1])
-    return ElbowFit(corrected, before, after, information)
-
-
-def _huber(values: FloatArray, bound: float = 2.0) -> FloatArray:
-    """Signed square roots of twice Huber's loss."""
-    size = np.abs(values)
-    result: FloatArray = np.sign(values) * np.where(
-        size <= bound, size, np.sqrt(np.maximum(2.0 * bound * size - bound**2, 0.0))
-    )
-    return result
-
-
-def _correlated(values: FloatArray) -> float:
-    """Samples per independent sample: the integral of the autocorrelation up to its first zero."""
-    centred = values - values.mean()
-    power = np.correlate(centred, centred, "full")[len(values) - 1 :]
-    power = power / max(float(power[0]), 1e-12)
-    gone = np.flatnonzero(power <= 0.0)
-    return float(1.0 + 2.0 * power[1 : gone[0] if len(gone) else len(power)].sum())
-
-
-def _axes_stddev(alignment: Alignment, numbers: IntArray, axes: tuple[FloatArray, FloatArray]) -> FloatArray:
-    by = np.zeros((5, len(alignment.covariance)))
-    for place, number in enumerate(numbers):
-        by[2 * place : 2 * place + 2, 4 * number : 4 * number + 3] = -across(axes[place]).T @ so3.skew(axes[place])
-        by[4, 4 * number + 3] = 2.0 * place - 1.0
-    result: FloatArray = np.sqrt((by @ alignment.covariance * by).sum(axis=1))
-    return result
 
 
 def elbow_segment_axes(side: str) -> tuple[FloatArray, FloatArray]:

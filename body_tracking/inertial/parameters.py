@@ -45,10 +45,6 @@ class TrackingParameters:
     magnetometer: bool = field(
         default=True, metadata={"doc": "use magnetic fields, where there are any and while they are undisturbed"}
     )
-    swap_exchanged: bool = field(
-        default=True,
-        metadata={"doc": "assign exchanged sensors to the segments on which they were found; false: only report them"},
-    )
     rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
     orientation_rate: float = number_field(30.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
     largest_stddev: float = number_field(
@@ -63,13 +59,6 @@ class TrackingParameters:
         "rad",
         0.001,
         1.0,
-    )
-    movement: bool = field(
-        default=False,
-        metadata={
-            "doc": "half a minute after a pose, align the sensors of each arm once by the elbow's movement; "
-            "it is less accurate than a pose that is held well"
-        },
     )
     silent_after: float = number_field(0.5, "a sensor without a reading for longer is silent", "s", 0.05, 60.0)
     stature: float = number_field(1.75, "of the person; used until a camera has measured the segments", "m", 0.5, 2.5)

@@ -39,7 +39,7 @@ MOUNTINGS = Parameter(
     "SEGMENT:AXES of sensors that are not worn as usual: where their x and z point on the hanging arm or the upright "
     "trunk of a person who faces x with y to the left, as in forearm_left:-z+y",
 )
-_SETTABLE = ("pose", "camera", "clock", "magnetometer", "rate", "pose_stddev", "movement", "stature")
+_SETTABLE = ("pose", "camera", "clock", "magnetometer", "rate", "pose_stddev", "stature")
 IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters, only=_SETTABLE))
 _READINGS = 64
 """Queue of readings per sensor: a sixth of a second of the fastest ones."""

@@ -1,7 +1,7 @@
 """Inertial sensors as a source: readings in, orientations of segments and a skeleton in ``world`` out.
 
 Puts together what the other modules of this package find: each sensor's orientation in an earth of its own (``worn``),
-its alignment and heading by a pose, by elbows and by a camera's bones (``held_pose``, ``alignment``, ``heading``), its
+its alignment and heading by a pose and by a camera's bones (``held_pose``, ``alignment``, ``heading``), its
 clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
 
 Headings: with a camera, ``world`` is the camera's. Without one, x is where the person faced in the pose; the common
@@ -30,7 +30,6 @@ from body_tracking.inertial.alignment import (
     TISSUE_STDDEV,
     Alignment,
     Stream,
-    align_by_elbow,
     align_in_pose,
     yaw,
 )
@@ -64,8 +63,6 @@ _FRESH_NS = NANOSECONDS // 2
 _PENDING_NS = NANOSECONDS // 20
 """Time that a skeleton waits for the readings around it."""
 _ELBOW_S = 0.5
-_MOVED_S, _MOVED_RATE, _LEAST_INFORMATION = 30.0, 10.0, 0.5
-"""Seconds of an elbow's movement in a fit, readings per second of it, and least information of the fit in nats."""
 _DRIFT_S, _LOST = 1.0, 0.05
 """Seconds between updates of the drift, and rad2 at once from which a heading is lost instead of drifting."""
 _CLOCK_EVERY_S, _CHECK_EVERY_S, _LOOK_BACK_S = 3.0, 5.0, 30.0
@@ -166,8 +163,6 @@ class InertialTracker:
         self._by_pose: dict[str, dict[str, float]] = {}
         self._detectors = {name: self._new_detectors(name) for name in self.segments}
         self._turn = 0
-        self._since = 0.0
-        self._elbows: set[str] = set()
 
     def _unaligned(self, segments: Sequence[str]) -> Alignment:
         """Intended mountings with unknown headings."""
@@ -334,7 +329,7 @@ class InertialTracker:
     def _rebase(self) -> None:
         """Start times again after a change of the output clock."""
         self._tracker = self._new_tracker(self.alignment)
-        self._epoch_ns, self._last, self._since = None, 0.0, 0.0
+        self._epoch_ns, self._last = None, 0.0
         self._due.clear()
         self._published_ns.clear()
         self._skeleton_ns = None
@@ -388,8 +383,6 @@ class InertialTracker:
             self._look_for_pose(now, stamp_ns)
         if self._is_due("elbow", now, _ELBOW_S):
             self._constrain(now, stamp_ns)
-        if self.parameters.movement and self._is_due("movement", now, _CHECK_EVERY_S):
-            self._look_at_movement(now, stamp_ns)
         if self._is_due("clock", now, _CLOCK_EVERY_S):
             self._look_at_clock(now, stamp_ns)
         if self._is_due("exchange", now, _CHECK_EVERY_S):
@@ -455,8 +448,6 @@ class InertialTracker:
 
     def _slipped(self, segment: str, now: float, turn: float) -> None:
         self.counters["slips"] += 1
-        self._since = now
-        self._elbows.add(segment.rpartition("_")[2])
         self._slips[segment] = now, f"{segment}: its sensor has slipped by {np.degrees(turn):.0f} deg"
         self._tracker.loosen(segment, max(turn, 0.2))
         self._detectors[segment] = self._new_detectors(segment)
@@ -533,9 +524,6 @@ class InertialTracker:
                 self._exchanged.pop(stated, None)
             else:
                 self._exchanged[stated] = segment
-        if not self.parameters.swap_exchanged:
-            return
-        self._since = self._last
         for sensor, segment in moved:
             sensor.segment = segment
             self._magnetic[self.segments.index(segment)] = sensor.has_field
@@ -587,8 +575,7 @@ class InertialTracker:
             found = assign(segments, table)
             if found.exchanged:
                 self._exchange([sensor for _, sensor in active], found.segments)
-                if self.parameters.swap_exchanged:
-                    return  # the next pose aligns them under their new segments
+                return  # the next pose aligns them under their new segments
         a = self.alignment
         places = [4 * number + 3 for number in numbers]
         own = a.covariance[np.ix_(places, places)]
@@ -615,7 +602,6 @@ class InertialTracker:
         for each in segments:
             self._slips.pop(each, None)
         self.aligned = True
-        self._since, self._elbows = self._last, {"left", "right"}
         self.counters["alignments by a pose"] += 1
 
     # --- joints
@@ -635,28 +621,6 @@ class InertialTracker:
         for parent, child in _joints():
             if parent in rotations and child in rotations:
                 self._tracker.observe_range(now, parent, child, (rotations[parent], rotations[child]))
-
-    def _look_at_movement(self, now: float, stamp_ns: int) -> None:
-        """Align by an elbow's movement, once after a pose or a slip (eq. 5 of ``alignment``).
-
-        Only once: the errors of such a fit, by soft tissue and by the person's own axes, are the same each time.
-        """
-        if now - self._since < _MOVED_S:
-            return
-        worn = {sensor.segment: sensor for _, sensor in self._active(stamp_ns)}
-        for side in sorted(self._elbows):
-            upper, lower = worn.get(f"upper_arm_{side}"), worn.get(f"forearm_{side}")
-            if upper is None or lower is None or max(self._stddev(upper), self._stddev(lower)) > _FAR_HEADING:
-                continue
-            streams = [self._stream(each, self._recent(each, stamp_ns, _MOVED_S)) for each in (upper, lower)]
-            fit = align_by_elbow(self.alignment, side, streams[0], streams[1].thinned(_MOVED_RATE))
-            if fit is None or fit.information < _LEAST_INFORMATION:
-                continue
-            self._tracker.predict(max(now, self._last))
-            self._tracker.alignment = fit.alignment
-            self._elbows.discard(side)
-            self.counters["alignments by an elbow's movement"] += 1
-            return  # a fit takes long: one side per step
 
     # --- output
 

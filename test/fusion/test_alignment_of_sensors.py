@@ -15,7 +15,7 @@ from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import MIRROR, NANOSECONDS, Joint, Skeleton
 from body_tracking.fusion.alignment import SensorAlignment
-from body_tracking.fusion.fusion import FusionError
+from body_tracking.fusion.placement import FusionError
 from walkers import frame
 
 

@@ -18,7 +18,8 @@ from body_tracking.calibration.online import OnlineCalibration
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import left_right_axes
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
-from body_tracking.fusion.fusion import Fusion, FusionError, FusionParameters
+from body_tracking.fusion.fusion import Fusion, FusionParameters
+from body_tracking.fusion.placement import FusionError
 from body_tracking.fusion.sides import HOLD
 from body_tracking.kinect.csv_recording import CsvRecording
 from draws import draws, some

@@ -57,7 +57,7 @@ def test_one_subject_is_the_same_in_all_sensors(subject: str) -> None:
         ((number, one),) = people.sort("kinect1", seen("kinect1", 40.0 + step / 30, {0: (1.5, 0.3), 1: (2.8, -0.3)}))
         ((_, other),) = people.sort("kinect2", seen("kinect2", 40.01 + step / 30, {0: (2.8, -0.3), 3: (1.5, 0.3)}))
         assert (number, one.body, other.body) == (1, 0, 3)
-    assert people.tracked == (1,) and people.counters["people"] == 2
+    assert people.tracked == (1,) and people.counts["people"] == 2
 
 
 def test_the_subject_is_held_while_hidden_and_then_another_is_chosen() -> None:
@@ -93,7 +93,7 @@ def test_all_have_numbers_and_a_new_one_gets_the_number_unused_for_longest() -> 
         assert {body.body: number for number, body in found} == expected
         assert people.tracked == tuple(sorted(expected.values()))
     assert gone == [1]
-    assert people.counters["people without a number"] == 1
+    assert people.counts["people without a number"] == 1
 
 
 def test_slots_are_taken_in_turn() -> None:
@@ -118,7 +118,7 @@ def test_frames_without_pose_or_clock_are_not_associated() -> None:
         people.sort("kinect2", seen("kinect2", 43.0, {0: (1.5, 0.0)}))
         people.sort("kinect1", seen("kinect1", 43.0, {0: (1.5, 0.0)}))
         people.sort("kinect2", seen("kinect2", 43.1, {0: (1.5, 0.0)}))
-        assert people.counters["uncalibrated"] == 3 and people.counters["other_clock"] == 1
+        assert people.counts["uncalibrated"] == 3 and people.counters["other_clock"] == 1
 
 
 def test_a_lone_person_keeps_the_number_when_another_one_comes() -> None:

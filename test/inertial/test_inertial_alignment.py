@@ -14,9 +14,7 @@ from body_tracking.inertial.alignment import (
     Alignment,
     AlignmentError,
     Stream,
-    align_by_elbow,
     align_in_pose,
-    elbow_segment_axes,
     pose_covariance,
     pose_of,
     pose_rotations,
@@ -135,56 +133,6 @@ def test_who_holds_a_pose_may_sway(sway: float, still: bool) -> None:
     assert bool(still_periods([swaying])) is still
 
 
-def elbow(seed: int, seconds: float = 20.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times, and orientations of an upper arm and of its forearm, which bends and turns."""
-    rng = np.random.default_rng(seed)
-    times = np.arange(0.0, seconds, 0.02)
-    waves = np.sin(2.0 * np.pi * times[:, None, None] * rng.uniform(0.1, 0.7, (5, 3)) + rng.uniform(0, 6.3, (5, 3)))
-    sums = waves.mean(axis=-1)
-    upper = so3.quat_to_matrix(so3.exp(sums[:, :3]))
-    flexion, pronation = elbow_segment_axes("right")
-    bend = so3.exp((1.0 + sums[:, 3])[:, None] * flexion)
-    turn = so3.exp(1.2 * sums[:, 4][:, None] * pronation)
-    return times, upper, upper @ so3.quat_to_matrix(so3.quat_multiply(bend, turn))
-
-
-def sensed(segment: str, times: FloatArray, world: FloatArray, true: FloatArray, psi: float) -> Stream:
-    """Of a segment's orientations what a perfect sensor says."""
-    sensor = yaw(-psi) @ world @ true.T
-    rates = np.zeros((len(times), 3))
-    rates[1:-1] = so3.rotation_vectors(sensor[:-2].swapaxes(-1, -2) @ sensor[2:]) / (times[2] - times[0])
-    return Stream(segment, times[1:-1], sensor[1:-1], rates[1:-1])
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_movement_of_an_elbow_finds_its_heading_and_axes(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    times, upper, lower = elbow(seed)
-    segments = ("upper_arm_right", "forearm_right")
-    true, psi = random_rotations(rng, 2), rng.uniform(-2.0, 2.0, 2)
-    streams = [sensed(*each) for each in zip(segments, (times, times), (upper, lower), true, psi, strict=True)]
-    off = np.radians([5.0, 5.0, 5.0, 20.0]) * np.clip(rng.normal(size=(2, 4)), -1.5, 1.5)
-    prior = np.diag(np.tile(np.radians([5.0, 5.0, 5.0, 20.0]) ** 2, 2))
-    start = Alignment(segments, true, psi, prior).moved(off.reshape(-1), prior)
-    fit = align_by_elbow(start, "right", *streams)
-    assert fit is not None
-    assert (fit.after < fit.before).all()
-    assert fit.information > 1.0
-    before, after = (wrapped(np.array(a.headings[1] - a.headings[0] - psi[1] + psi[0])) for a in (start, fit.alignment))
-    assert abs(after) < max(0.4 * abs(before), np.radians(3.0))
-    np.testing.assert_array_less(np.linalg.eigvalsh(fit.alignment.covariance - start.covariance), 1e-9)
-
-
-def test_an_elbow_that_does_not_move_says_nothing() -> None:
-    times, upper, _ = elbow(0)
-    segments = ("upper_arm_right", "forearm_right")
-    streams = [sensed(name, times, upper, np.eye(3), 0.0) for name in segments]
-    start = Alignment(segments, np.broadcast_to(np.eye(3), (2, 3, 3)), np.zeros(2), 0.01 * np.eye(8))
-    assert align_by_elbow(start, "right", *streams) is None
-    with pytest.raises(AlignmentError, match="no sensor on upper_arm_left"):
-        align_by_elbow(start, "left", *streams)
-
-
 def test_what_is_replaced_has_nothing_in_common_with_what_stays() -> None:
     rng = np.random.default_rng(0)
     spread = rng.normal(size=(12, 12))
@@ -198,16 +146,6 @@ def test_what_is_replaced_has_nothing_in_common_with_what_stays() -> None:
     np.testing.assert_array_equal(found.covariance, expected)
     with pytest.raises(AlignmentError, match="no sensor on forearm_left"):
         whole.replaced(Alignment(("forearm_left",), part.rotations[:1], part.headings[:1], np.eye(4)))
-
-
-@given(st.integers(2, 400), st.floats(1.0, 60.0))
-def test_a_thinned_stream_has_about_so_many_samples_a_second(count: int, rate: float) -> None:
-    times = np.linspace(0.0, 4.0, count)
-    thin = stream("pelvis", times, np.zeros(count)).thinned(rate)
-    assert set(thin.stamps) <= set(times)
-    # every second one of twice as many, every third of three times as many
-    assert len(thin.stamps) <= max(1.5 * 4.0 * rate, 4.0 * rate + 2.0) + 1.0
-    assert len(thin.stamps) >= min(count, 4.0 * rate / 1.5 - 1.0)
 
 
 def test_the_mean_of_rotations_about_one_is_that_one() -> None:
@@ -227,8 +165,6 @@ def test_what_is_no_stream_and_no_pose_is_refused() -> None:
         Stream("pelvis", np.zeros(1), np.full((1, 3, 3), np.nan), np.zeros((1, 3)))
     empty = Stream("forearm_right", np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     assert still_periods([empty]) == ()
-    start = Alignment(("upper_arm_right", "forearm_right"), np.zeros((2, 3, 3)), np.zeros(2), np.eye(8))
-    assert align_by_elbow(start, "right", empty, empty) is None
     with pytest.raises(AlignmentError, match="measured"):
         align_in_pose(("pelvis",), np.full((1, 3, 3), np.nan), np.eye(3)[None], np.eye(3))
     with pytest.raises(AlignmentError, match="no segment tail"):
