@@ -63,25 +63,12 @@ class Stream:
         stamps: (n,) seconds, strictly ascending, in a clock common to all streams.
         rotations: (n, 3, 3) sensor to its earth.
         rates: (n, 3) rad/s in the sensor's frame.
-
-    Raises:
-        AlignmentError: inconsistent shapes, stamps that do not ascend, numbers that are not finite.
     """
 
     segment: str
     stamps: FloatArray
     rotations: FloatArray
     rates: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.stamps)
-        if self.stamps.shape != (n,) or self.rotations.shape != (n, 3, 3) or self.rates.shape != (n, 3):
-            shapes = f"{self.stamps.shape}, {self.rotations.shape}, {self.rates.shape}"
-            raise AlignmentError(f"{self.segment}: stamps, rotations and rates of shapes {shapes}")
-        if not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0.0).any():
-            raise AlignmentError(f"{self.segment}: stamps must be finite and ascend")
-        if not (np.isfinite(self.rotations).all() and np.isfinite(self.rates).all()):
-            raise AlignmentError(f"{self.segment}: rotations and rates must be finite")
 
     def between(self, begin: float, end: float) -> Stream:
         """The samples from begin to end, end excluded."""
@@ -302,21 +289,8 @@ def align_in_pose(
 
     Returns:
         The alignment; without mountings and headings its headings have the deviation of unknown ones.
-
-    Raises:
-        AlignmentError: inconsistent shapes, or numbers that are not finite.
     """
     k = len(segments)
-    for name, value, shape in (
-        ("measured", measured, (k, 3, 3)),
-        ("pose", pose, (k, 3, 3)),
-        ("covariance", covariance, (3 * k, 3 * k)),
-        ("mountings", mountings, (k, 3, 3)),
-        ("headings", headings, (k,)),
-        ("heading_covariance", heading_covariance, (k, k)),
-    ):
-        if value is not None and (value.shape != shape or not np.isfinite(value).all()):
-            raise AlignmentError(f"alignment in a pose: {name} of shape {value.shape}, expected {shape} finite numbers")
     posed = yaw(facing) @ pose
     # an unknown heading is uniform over a turn
     known = np.diag(np.full(k, np.pi**2 / 3.0)) if heading_covariance is None else heading_covariance

@@ -82,9 +82,6 @@ class WornBody:
         Returns:
             Points whose position relative to the trunk the sensors determine are TRACKED, the others INFERRED, each
             with its covariance. Points that the model does not have are NOT_TRACKED.
-
-        Raises:
-            AlignmentError: as of :meth:`OrientationKinematics.solve`.
         """
         names = tuple(segments)
         if names not in self._kinematics:

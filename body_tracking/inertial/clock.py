@@ -106,9 +106,7 @@ def turning_of_bone(stamps: FloatArray, vectors: FloatArray) -> Series:
     return turning(stamps, rates)
 
 
-def clock_offset(
-    reference: Series, other: Series, guess: float = 0.0, window: float = WINDOW, *, parts: float = _PART
-) -> ClockModel | None:
+def clock_offset(reference: Series, other: Series, guess: float = 0.0, window: float = WINDOW) -> ClockModel | None:
     """The offset of another clock from the reference clock, where the motion determines it.
 
     Args:
@@ -116,14 +114,13 @@ def clock_offset(
         other: turning of the same limb, or of a neighbouring one, in the other clock.
         guess: other clock minus reference clock, seconds, known to within the window.
         window: half width of the search, seconds.
-        parts: seconds of a window of the fine fit.
 
     Returns:
         None without motion or enough overlap, where the correlation may be chance, and where a periodic motion makes
         another offset nearly as likely.
     """
     lag = _coarse(reference, other, guess, window)
-    return None if lag is None else _fine(reference, other, lag, parts)
+    return None if lag is None else _fine(reference, other, lag)
 
 
 def _autocorrelation(values: FloatArray, known: BoolArray) -> FloatArray:
@@ -187,13 +184,13 @@ def _unexplained(found: Correlation, lag: int) -> tuple[float, float]:
     return float(residuals @ residuals) / float(x @ x), max(correlation_time(residuals, STEP), SAMPLE_TIME)
 
 
-def _fine(reference: Series, other: Series, lag: float, parts: float) -> ClockModel | None:
+def _fine(reference: Series, other: Series, lag: float) -> ClockModel | None:
     begin, end = reference.stamps[[0, -1]]
     base, zero = ClockModel(round(lag * NANOSECONDS)), 0.5 * float(begin + end)
     fit = ClockFit(base, round(zero * NANOSECONDS), caution=_CAUTION, least_stddev=LEAST_RATE)
     near, margin = other.earlier(lag), FINE_RANGE + PEAK_WIDTH
-    for start in np.arange(begin, end, parts):
-        around = near.between(start - margin, start + parts + margin)
-        fit.add(float(start + 0.5 * parts - zero), reference.between(start, start + parts), around)
+    for start in np.arange(begin, end, _PART):
+        around = near.between(start - margin, start + _PART + margin)
+        fit.add(float(start + 0.5 * _PART - zero), reference.between(start, start + _PART), around)
     found = fit.solve()
     return None if found is None or found.stddev > _WORST else found

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -27,11 +26,7 @@ from scipy.optimize import linear_sum_assignment
 from body_tracking.calibration.clock_correlation import STEP, Series
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.inertial.alignment import (
-    MOUNTING_STDDEV,
-    AlignmentError,
-    yaw,
-)
+from body_tracking.inertial.alignment import MOUNTING_STDDEV, yaw
 from body_tracking.inertial.clock import LEAST_OVERLAP, LEAST_RATE, independent_samples
 
 SEGMENT_STDDEV: Final = float(np.radians(8.0))
@@ -47,40 +42,22 @@ SLIP_SURE: Final = 3.0
 LASTING: Final = 1.0
 """Seconds for which the errors of the reference persist."""
 _LEAST_SAMPLES = 20
+_HEADINGS = 72
+"""Number of headings on the grid of a search."""
 
 
-@dataclass(frozen=True, slots=True)
-class Assignment:
-    """An assignment of streams to segments.
-
-    Attributes:
-        segments: for each stream the segment that fits best, of those stated.
-        exchanged: (stated, found) where both differ; empty where the evidence is too weak.
-        advantage: logarithm of the likelihood ratio of the best assignment against the stated one.
-    """
-
-    segments: tuple[str, ...]
-    exchanged: tuple[tuple[str, str], ...]
-    advantage: float
-
-
-def assign(stated: Sequence[str], likelihood: FloatArray) -> Assignment:
+def assign(stated: Sequence[str], likelihood: FloatArray) -> tuple[str, ...]:
     """The best assignment of streams to segments.
 
     Args:
         stated: k segments of the streams.
         likelihood: (k, k) logarithms: of stream i being on segment j; 0 where nothing is known.
 
-    Raises:
-        AlignmentError: a table of another shape, or with NaN.
+    Returns:
+        For each stream the segment on which it most probably is; those stated where the evidence is too weak.
     """
-    k = len(stated)
-    if likelihood.shape != (k, k) or not np.isfinite(likelihood).all():
-        raise AlignmentError(f"assignment of {k} sensors: table of shape {likelihood.shape}, expected finite numbers")
-    _, columns = linear_sum_assignment(likelihood + SURE * np.eye(k), maximize=True)
-    found = tuple(stated[column] for column in columns.tolist())
-    exchanged = tuple((said, is_) for said, is_ in zip(stated, found, strict=True) if said != is_)
-    return Assignment(found, exchanged, float(likelihood[np.arange(k), columns].sum() - likelihood.trace()))
+    _, columns = linear_sum_assignment(likelihood + SURE * np.eye(len(stated)), maximize=True)
+    return tuple(stated[column] for column in columns.tolist())
 
 
 def likelihood_by_motion(sensors: Sequence[Series], bones: Sequence[Series | None]) -> FloatArray:
@@ -116,8 +93,6 @@ def likelihood_by_pose(
     mountings: FloatArray,
     *,
     common_heading: bool,
-    stddev: float = MOUNTING_STDDEV,
-    steps: int = 72,
 ) -> FloatArray:
     """(k, k) log likelihoods of stream i on segment j, by a pose.
 
@@ -128,10 +103,8 @@ def likelihood_by_pose(
         mountings: (k, 3, 3) segment to sensor on each segment, as intended.
         common_heading: all headings are equal (magnetometers), and are searched on a grid. Otherwise each sensor has a
             heading of its own, and only the inclination of its axes counts.
-        stddev: radians per axis, of sensors from their intended mounting.
-        steps: number of headings on the grid.
     """
-    variance = np.full(len(segments), stddev**2 + SEGMENT_STDDEV**2)
+    variance = np.full(len(segments), MOUNTING_STDDEV**2 + SEGMENT_STDDEV**2)
     if not common_heading:
         # the vertical in the sensor's frame, measured and intended: two directions of error
         up, meant = measured[:, 2], (mountings @ pose[:, 2][..., None])[..., 0]
@@ -139,7 +112,7 @@ def likelihood_by_pose(
         steep: FloatArray = -0.5 * off**2 / variance - np.log(variance)
         return steep
     tables = []
-    for psi in np.linspace(-np.pi, np.pi, steps, endpoint=False):
+    for psi in np.linspace(-np.pi, np.pi, _HEADINGS, endpoint=False):
         expected = yaw(psi).T @ pose @ mountings.swapaxes(-1, -2)
         off = so3.rotation_vectors(measured[:, None].swapaxes(-1, -2) @ expected)
         tables.append(-0.5 * (off**2).sum(axis=-1) / variance - 1.5 * np.log(variance))
@@ -147,38 +120,14 @@ def likelihood_by_pose(
     return np.asarray(best)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SlipFound:
-    """A detected slip of a sensor on its segment.
-
-    Attributes:
-        segment: of the sensor.
-        stamp: seconds, time of detection.
-        turn: (3,) radians, rotation vector in the segment's frame from the sensor's orientation to the observed one.
-        stddev: radians, of its magnitude.
-    """
-
-    segment: str
-    stamp: float
-    turn: FloatArray
-    stddev: float
-
-
 class SlipDetector:
-    """Monitors the residual between a segment's observed orientation and its sensor's."""
+    """Monitors the residual between a segment's observed orientation and its sensor's, over a window of seconds."""
 
-    def __init__(self, segment: str, *, least: float = SLIP_TURN, window: float = SLIP_TIME) -> None:
-        """Set up without a residual.
-
-        Args:
-            segment: its name.
-            least: least turn of a slip, radians.
-            window: seconds over which it must last.
-        """
-        self._segment, self._least, self._window = segment, least, window
+    def __init__(self, window: float = SLIP_TIME) -> None:
+        self._window = window
         self._recent: deque[tuple[float, FloatArray, float]] = deque()
 
-    def update(self, stamp: float, turn: FloatArray, stddev: float) -> SlipFound | None:
+    def update(self, stamp: float, turn: FloatArray, stddev: float) -> FloatArray | None:
         """Take one residual.
 
         Args:
@@ -187,7 +136,8 @@ class SlipDetector:
             stddev: radians per direction, of noise, alignment and heading together.
 
         Returns:
-            A slip, once; then the detector restarts.
+            (3,) radians, the rotation vector in the segment's frame from the sensor's orientation to the observed one,
+            once the sensor has slipped; then the detector restarts.
         """
         if self._recent and stamp < self._recent[-1][0]:
             self._recent.clear()
@@ -202,7 +152,7 @@ class SlipDetector:
         independent = max(self._window / (2.0 * LASTING), 1.0)
         off = float(np.median([stddev for *_, stddev in self._recent])) * np.sqrt(0.5 * np.pi / independent)
         size = float(np.linalg.norm(middle))
-        if size < max(self._least, SLIP_SURE * off):
+        if size < max(SLIP_TURN, SLIP_SURE * off):
             return None
         self._recent.clear()
-        return SlipFound(self._segment, stamp, middle, off)
+        return np.asarray(middle)

@@ -123,23 +123,16 @@ class HeadingTracker:
         alignment: the current estimate.
     """
 
-    def __init__(
-        self,
-        alignment: Alignment,
-        *,
-        heading_walk: FloatArray | float = HEADING_WALK,
-        alignment_walk: float = ALIGNMENT_WALK,
-    ) -> None:
+    def __init__(self, alignment: Alignment, *, heading_walk: FloatArray | float = HEADING_WALK) -> None:
         """Start from an alignment.
 
         Args:
             alignment: such as one by a pose.
             heading_walk: (k,) or one for all, radians per root second; less for sensors with magnetometers.
-            alignment_walk: radians per root second.
         """
         self.alignment = alignment
         k = len(alignment.segments)
-        walk = np.full((k, 4), alignment_walk)
+        walk = np.full((k, 4), ALIGNMENT_WALK)
         walk[:, 3] = heading_walk
         self._walk: FloatArray = walk.reshape(-1) ** 2
         self._stamp: float | None = None
@@ -225,9 +218,7 @@ class HeadingTracker:
         back = (-square.T @ so3.skew(axis)).T  # the pseudoinverse: the rows are orthonormal
         return self._update(stamp, ("bone", segment), linear, noise, CAMERA_TIME, number, turned, back)
 
-    def observe_elbow(
-        self, stamp: float, side: str, upper: FloatArray, lower: FloatArray, stddev: float = ELBOW_STDDEV
-    ) -> Innovation:
+    def observe_elbow(self, stamp: float, side: str, upper: FloatArray, lower: FloatArray) -> Innovation:
         """Update by an elbow, whose axes of flexion and pronation are normal to each other (eq. 11).
 
         Args:
@@ -235,7 +226,6 @@ class HeadingTracker:
             side: ``left`` or ``right``.
             upper: (3, 3) the upper arm's sensor to its earth at that time.
             lower: (3, 3) the forearm's sensor, likewise.
-            stddev: radians.
         """
         numbers = self._number(f"upper_arm_{side}"), self._number(f"forearm_{side}")
         axes = elbow_segment_axes(side)
@@ -248,7 +238,7 @@ class HeadingTracker:
                 jacobian[0] += -(other @ world @ so3.skew(axis)) @ self._turning(i, world)
             return np.array([-float(pointing[0] @ pointing[1])]), jacobian
 
-        return self._update(stamp, ("elbow", side), linear, np.array([[stddev**2]]), ELBOW_TIME)
+        return self._update(stamp, ("elbow", side), linear, np.array([[ELBOW_STDDEV**2]]), ELBOW_TIME)
 
     def observe_range(
         self, stamp: float, parent: str, child: str, rotations: tuple[FloatArray, FloatArray]

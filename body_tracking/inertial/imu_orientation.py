@@ -86,7 +86,6 @@ class ImuOrientation:
         covariance: (3, 3) rad2 about the earth's axes.
         angular_velocity: (3,) rad/s in the sensor's frame, bias subtracted.
         bias: (3,) rad/s in the sensor's frame.
-        at_rest: VQF's detection of rest.
     """
 
     stamp_ns: int
@@ -94,7 +93,6 @@ class ImuOrientation:
     covariance: FloatArray
     angular_velocity: FloatArray
     bias: FloatArray
-    at_rest: bool
 
 
 class OrientationEstimator:
@@ -124,8 +122,6 @@ class OrientationEstimator:
         self._magnetometer = magnetometer
         self._errors = InertialErrors() if errors is None else errors
         self.restarts = 0
-        self.resets = 0
-        self.repeated = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -161,10 +157,8 @@ class OrientationEstimator:
         if self._latest is not None:
             interval = (sample.stamp_ns - self._latest.stamp_ns) / NANOSECONDS
             if interval == 0.0:
-                self.repeated += 1
                 return None
             if interval < 0.0:
-                self.resets += 1
                 self._begin()
             elif interval > OUTAGE_S:
                 self._restart(interval)
@@ -276,7 +270,6 @@ class OrientationEstimator:
             self._budget.covariance(),
             rate - bias,
             bias,
-            bool(vqf.getRestDetected()),
         )
 
     def _turn_by(self, angle: FloatArray) -> None:

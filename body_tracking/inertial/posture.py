@@ -18,7 +18,6 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.inertial.alignment import AlignmentError
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
@@ -30,14 +29,7 @@ class OrientationKinematics:
     """Orientations of segments to configurations of ``upper_body``."""
 
     def __init__(self, model: UpperBody, segments: Sequence[str]) -> None:
-        """For the segments that carry sensors.
-
-        Raises:
-            AlignmentError: a segment that the model does not have, or none.
-        """
-        unknown = [name for name in segments if name not in model.segment_names]
-        if unknown or not segments:
-            raise AlignmentError(f"orientation kinematics: segments {', '.join(unknown) or 'none'}")
+        """For the segments that carry sensors, at least one."""
         self._model, self._ranges = model, Ranges(model)
         self._numbers = np.array([model.segment_names.index(name) for name in segments], dtype=np.intp)
         self._lengths = model.default_lengths()
@@ -54,17 +46,7 @@ class OrientationKinematics:
 
         Returns:
             (35,) configuration, (32, 32) covariance of its tangent, infinite for the position of the base.
-
-        Raises:
-            AlignmentError: inconsistent shapes, or numbers that are not finite.
         """
-        k = len(self._numbers)
-        if rotations.shape != (k, 3, 3) or covariances.shape != (k, 3, 3):
-            raise AlignmentError(
-                f"orientation kinematics of {k} segments: shapes {rotations.shape} and {covariances.shape}"
-            )
-        if not (np.isfinite(rotations).all() and np.isfinite(covariances).all()):
-            raise AlignmentError("orientation kinematics: an orientation or its covariance is not finite")
         model, ranges = self._model, self._ranges
         weights = np.linalg.inv(covariances)
         q = self._start(rotations) if start is None else start.copy()

@@ -30,6 +30,7 @@ from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.inertial.mounting import mounting
 from body_tracking.inertial.simulated_driver import Z, fuse, rotate, stated_covariance
 from body_tracking.inertial.simulated_errors import CONSUMER, STANDARD_GRAVITY, ImuErrors, ImuSimulationError
 from body_tracking.inertial.surroundings import Surroundings
@@ -73,37 +74,28 @@ class Mounting:
     flesh: float = 1.0
 
 
-# segment: position as shares of the stature (forward, outward or left, up), directions of the sensor's z and x, flesh
-_PLACES: dict[str, tuple[tuple[float, float, float], str, str, float]] = {
-    "pelvis": ((-0.060, 0.0, 0.020), "-x", "+z", 0.4),
-    "lower_trunk": ((-0.060, 0.0, 0.070), "-x", "+z", 0.5),
-    "upper_trunk": ((0.065, 0.0, 0.090), "+x", "+z", 0.3),
-    "head": ((-0.055, 0.0, 0.080), "-x", "+z", 0.2),
-    "clavicle": ((-0.050, 0.060, -0.010), "-x", "+z", 1.0),
-    "upper_arm": ((0.0, 0.028, -0.100), "+y", "-z", 1.0),
-    "forearm": ((0.0, 0.016, -0.125), "+y", "-z", 0.4),
-    "hand": ((0.0, 0.012, -0.035), "+y", "-z", 0.3),
+# segment: position as shares of the stature (forward, outward or left, up), flesh
+_PLACES: dict[str, tuple[tuple[float, float, float], float]] = {
+    "pelvis": ((-0.060, 0.0, 0.020), 0.4),
+    "lower_trunk": ((-0.060, 0.0, 0.070), 0.5),
+    "upper_trunk": ((0.065, 0.0, 0.090), 0.3),
+    "head": ((-0.055, 0.0, 0.080), 0.2),
+    "clavicle": ((-0.050, 0.060, -0.010), 1.0),
+    "upper_arm": ((0.0, 0.028, -0.100), 1.0),
+    "forearm": ((0.0, 0.016, -0.125), 0.4),
+    "hand": ((0.0, 0.012, -0.035), 0.3),
 }
 
 
 def usual_mounting(segment: str, stature: float = 1.75) -> Mounting:
-    """The usual mounting: sacrum, sternum, back of the head, scapula, outside of the arm, back of the hand.
-
-    The sensor's z points away from the body; its x upwards on the trunk, towards the hand on the arm.
-
-    Args:
-        segment: of ``UpperBody.segment_names``.
-        stature: metres.
+    """The usual mounting (:mod:`~body_tracking.inertial.mounting`) of a person of a stature in metres.
 
     Raises:
-        ImuSimulationError: no such segment.
+        MountingError: no such segment.
     """
-    if segment not in SEGMENTS:
-        raise ImuSimulationError(f"segment {segment!r}: expected one of {', '.join(SEGMENTS)}")
-    place, normal, along, flesh = _PLACES[segment.removesuffix("_left").removesuffix("_right")]
+    rotation = mounting(segment).T
+    place, flesh = _PLACES[segment.removesuffix("_left").removesuffix("_right")]
     mirror = np.array([1.0, -1.0 if segment.endswith("_right") else 1.0, 1.0])
-    z, x = (float(f"{axis[0]}1") * np.eye(3)["xyz".index(axis[1])] * mirror for axis in (normal, along))
-    rotation = np.stack([x, np.cross(z, x), z], axis=-1)
     return Mounting(stature * mirror * place, so3.matrix_to_quat(rotation), flesh)
 
 

@@ -30,13 +30,6 @@ class Iron:
     since: float = -np.inf
     until: float = np.inf
 
-    @classmethod
-    def sphere(
-        cls, position: FloatArray, radius: float, earth: FloatArray, since: float = -np.inf, until: float = np.inf
-    ) -> Iron:
-        """A ball of soft iron in the earth's field (3,), tesla: ``m = 4 pi a^3 B / mu0`` (Jackson, section 5.11)."""
-        return cls(np.asarray(position, float), radius**3 * np.asarray(earth, float) / _DIPOLE, radius, since, until)
-
     def field(self, points: FloatArray, times: FloatArray) -> FloatArray:
         """(n, 3) tesla in world at points (n, 3) and times (n,): Jackson eq. 5.56, without the field inside."""
         away = points - self.position

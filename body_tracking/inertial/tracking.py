@@ -161,7 +161,7 @@ class InertialTracker:
         self._slips: dict[str, tuple[float, str]] = {}
         self._exchanged: dict[str, str] = {}
         self._by_pose: dict[str, dict[str, float]] = {}
-        self._detectors = {name: self._new_detectors(name) for name in self.segments}
+        self._detectors = {name: self._new_detectors() for name in self.segments}
         self._turn = 0
 
     def _unaligned(self, segments: Sequence[str]) -> Alignment:
@@ -171,8 +171,8 @@ class InertialTracker:
         return Alignment(tuple(segments), meant, np.zeros(len(segments)), np.diag(prior))
 
     @staticmethod
-    def _new_detectors(segment: str) -> tuple[SlipDetector, ...]:
-        return tuple(SlipDetector(segment, window=window) for window in _SLIP_WINDOWS)
+    def _new_detectors() -> tuple[SlipDetector, ...]:
+        return tuple(SlipDetector(window) for window in _SLIP_WINDOWS)
 
     def reset(self) -> None:
         """Start again, as after a jump of time; the counters stay."""
@@ -334,7 +334,7 @@ class InertialTracker:
         self._published_ns.clear()
         self._skeleton_ns = None
         self._slips.clear()
-        self._detectors = {name: self._new_detectors(name) for name in self.segments}
+        self._detectors = {name: self._new_detectors() for name in self.segments}
         self._asked_until = None if self._asked_until is None else _ASKED_S
 
     def _new_tracker(self, alignment: Alignment) -> HeadingTracker:
@@ -441,16 +441,16 @@ class InertialTracker:
                 continue
             off = float(np.sqrt(0.5 * innovation.covariance.trace() - (_CAMERA_LASTS - _CAMERA_SLIPS) * stddev**2))
             for detector in self._detectors[segment]:
-                slip = detector.update(now, innovation.turn, off)
-                if slip is not None:
-                    self._slipped(segment, now, float(np.linalg.norm(slip.turn)))
+                turn = detector.update(now, innovation.turn, off)
+                if turn is not None:
+                    self._slipped(segment, now, float(np.linalg.norm(turn)))
                     break
 
     def _slipped(self, segment: str, now: float, turn: float) -> None:
         self.counters["slips"] += 1
         self._slips[segment] = now, f"{segment}: its sensor has slipped by {np.degrees(turn):.0f} deg"
         self._tracker.loosen(segment, max(turn, 0.2))
-        self._detectors[segment] = self._new_detectors(segment)
+        self._detectors[segment] = self._new_detectors()
 
     def _bones(self, segments: Sequence[str]) -> list[Series | None]:
         """Turning rates of bones in the camera's recent skeletons."""
@@ -502,9 +502,7 @@ class InertialTracker:
         for row, number in enumerate(kept):
             by_pose = self._by_pose.get(self._stated(active[number][1]), {})
             table[row] += [by_pose.get(segment, 0.0) for segment in segments]
-        found = assign(segments, table)
-        if found.exchanged:
-            self._exchange([active[number][1] for number in kept], found.segments)
+        self._exchange([active[number][1] for number in kept], assign(segments, table))
 
     def _note_pose(self, sensors: Sequence[WornSensor], table: FloatArray) -> None:
         """Keep the log likelihoods of a pose, to add them to those of motion."""
@@ -512,10 +510,12 @@ class InertialTracker:
             bounded = np.maximum(row - row.max(), -_POSE_LIMIT).tolist()
             self._by_pose[self._stated(sensor)] = dict(zip((each.segment for each in sensors), bounded, strict=True))
 
-    def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> None:
-        """Assign sensors to the segments on which they were found."""
+    def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> bool:
+        """Assign sensors to the segments on which they were found; whether any of these is another one."""
         pairs = zip(sensors, segments, strict=True)
         moved = [(sensor, segment) for sensor, segment in pairs if sensor.segment != segment]
+        if not moved:
+            return False
         for sensor, segment in moved:
             stated = self._stated(sensor)
             self._slips.pop(segment, None)  # the exchange looked like a slip
@@ -527,8 +527,9 @@ class InertialTracker:
         for sensor, segment in moved:
             sensor.segment = segment
             self._magnetic[self.segments.index(segment)] = sensor.has_field
-            self._detectors[segment] = self._new_detectors(segment)
+            self._detectors[segment] = self._new_detectors()
         self._tracker = self._new_tracker(self.alignment.replaced(self._unaligned([each for _, each in moved])))
+        return True
 
     # --- a pose
 
@@ -572,9 +573,7 @@ class InertialTracker:
         if len(segments) > 1 and (held.facing is None or magnetic):
             table = likelihood_by_pose(segments, measured, posed, self._intended[numbers], common_heading=magnetic)
             self._note_pose([sensor for _, sensor in active], table)
-            found = assign(segments, table)
-            if found.exchanged:
-                self._exchange([sensor for _, sensor in active], found.segments)
+            if self._exchange([sensor for _, sensor in active], assign(segments, table)):
                 return  # the next pose aligns them under their new segments
         a = self.alignment
         places = [4 * number + 3 for number in numbers]
@@ -598,7 +597,7 @@ class InertialTracker:
             facing=0.0 if held.facing is None else held.facing,
         )
         self._tracker = self._new_tracker(a.replaced(part))
-        self._detectors = {each: self._new_detectors(each) for each in self.segments}
+        self._detectors = {each: self._new_detectors() for each in self.segments}
         for each in segments:
             self._slips.pop(each, None)
         self.aligned = True

@@ -52,31 +52,12 @@ class Fit:
         covariance: (nv, nv) of the tangent at ``q``, by the noise of the points and the ranges of motion.
         residuals: (m, 3) metres, measured minus fitted; NaN where a point was not measured.
         cost: half the sum of the squared, normalised (and bounded) residuals and priors.
-        iterations: of the least squares.
     """
 
     q: FloatArray
     covariance: FloatArray
     residuals: FloatArray
     cost: float
-    iterations: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Descent:
-    """Where least squares end.
-
-    Attributes:
-        q: (35,) configuration.
-        normal: (32, 32) of the normal equations.
-        cost: there.
-        iterations: it took.
-    """
-
-    q: FloatArray
-    normal: FloatArray
-    cost: float
-    iterations: int
 
 
 class InverseKinematics:
@@ -175,10 +156,10 @@ class InverseKinematics:
         target = np.where(measured[:, None], positions, 0.0)
         found = self._descended(q, target, weights, lengths, max_iterations, tolerance)
         if alternatives:
-            for other in self.turned_about(found.q, positions, stddev, lengths):
+            for other in self.turned_about(found[0], positions, stddev, lengths):
                 another = self._descended(other, target, weights, lengths, max_iterations, tolerance)
-                found = another if another.cost < found.cost else found
-        q, normal = found.q, found.normal
+                found = another if another[2] < found[2] else found
+        q, normal, cost = found
         branch = self.ranges.nearest_branch(q)
         if branch is not None:
             q = branch[0]
@@ -186,7 +167,7 @@ class InverseKinematics:
         fitted = self.model.forward(q, lengths).positions
         residuals = np.where(measured[:, None], positions - fitted, np.nan)
         covariance = np.linalg.inv(normal).astype(np.float64)
-        return Fit(q, covariance, residuals, found.cost, found.iterations)
+        return Fit(q, covariance, residuals, cost)
 
     def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> FloatArray:
         """(...,) what :attr:`Fit.cost` would be at configurations (..., 35); other arguments as of :meth:`solve`."""
@@ -271,12 +252,11 @@ class InverseKinematics:
         lengths: FloatArray,
         max_iterations: int,
         tolerance: float,
-    ) -> _Descent:
-        """The nearest minimum."""
-        damping, iterations = 1e-3, 0
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """(35,) the nearest minimum, (32, 32) the normal equations and the cost there."""
+        damping = 1e-3
         normal, gradient, cost = self._normal_equations(q, target, weights, lengths)
-        while iterations < max_iterations:
-            iterations += 1
+        for _ in range(max_iterations):
             damped = normal + damping * np.diag(normal.diagonal())
             step = np.linalg.solve(damped, gradient).astype(np.float64)
             moved = self.model.integrate(q, step)
@@ -291,7 +271,7 @@ class InverseKinematics:
                 damping *= 10.0
                 if damping > 1e8:
                     break
-        return _Descent(q, normal, cost, iterations)
+        return q, normal, cost
 
     def _costs(self, size: FloatArray, soft: FloatArray, tilt: FloatArray) -> FloatArray:
         """(...,) of normalised residuals (..., 19), the quantities (..., 26) of ranges and the tilt (..., 2)."""

@@ -124,14 +124,12 @@ def test_without_errors_it_follows_and_jitter_and_losses_add_nothing_up(
     assert run.estimator.magnetically_disturbed is None
     if errors is IDEAL:
         assert run.estimator.rate_hz == pytest.approx(rate_hz, rel=0.01)
-        assert run.estimator.resets == run.estimator.repeated == 0
 
 
 def test_at_rest_the_bias_is_found_and_taken_off() -> None:
     samples = measured(replace(CONSUMER, **STILL_RADIO, gyro_bias=0.5), 15.0, 3, motion=still)
     run = Run(samples)
     last, true = run.found[-1], samples.truth.gyro_bias[run.which[-1]]
-    assert last.at_rest
     assert np.degrees(np.abs(last.bias - true)).max() < 0.03
     rates = np.array([orientation.angular_velocity for orientation in run.found[-300:]])
     assert np.degrees(np.abs(rates.mean(axis=0))).max() < 0.03
@@ -251,7 +249,6 @@ def test_time_that_runs_backwards_begins_anew_and_a_stamp_that_repeats_is_left_o
         for k in range(len(samples.stamps_ns)):
             found.append(estimator.update(sample(samples, k)))
             assert estimator.update(sample(samples, k)) is None
-    assert (estimator.resets, estimator.repeated) == (1, 2 * len(samples.stamps_ns))
     for first, second in zip(*rounds, strict=True):
         assert (first is None) == (second is None)
         if first is not None and second is not None:

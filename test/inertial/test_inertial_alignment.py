@@ -156,16 +156,8 @@ def test_the_mean_of_rotations_about_one_is_that_one() -> None:
     np.testing.assert_allclose(so3.mean_rotation(spread), middle, atol=1e-9)
 
 
-def test_what_is_no_stream_and_no_pose_is_refused() -> None:
-    with pytest.raises(AlignmentError, match="shapes"):
-        Stream("pelvis", np.arange(3.0), np.zeros((2, 3, 3)), np.zeros((3, 3)))
-    with pytest.raises(AlignmentError, match="ascend"):
-        Stream("pelvis", np.zeros(2), np.zeros((2, 3, 3)), np.zeros((2, 3)))
-    with pytest.raises(AlignmentError, match="finite"):
-        Stream("pelvis", np.zeros(1), np.full((1, 3, 3), np.nan), np.zeros((1, 3)))
+def test_no_readings_are_no_pose_and_an_unknown_segment_is_refused() -> None:
     empty = Stream("forearm_right", np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     assert still_periods([empty]) == ()
-    with pytest.raises(AlignmentError, match="measured"):
-        align_in_pose(("pelvis",), np.full((1, 3, 3), np.nan), np.eye(3)[None], np.eye(3))
     with pytest.raises(AlignmentError, match="no segment tail"):
         pose_covariance(MODEL, "t", ("tail",))
