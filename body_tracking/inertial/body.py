@@ -24,21 +24,6 @@ _BASE_WALK = 0.3
 _STANDING: Final = np.array([0.0, 0.0, 1.0])
 _EYE3: Final = np.eye(3)
 _SMALL: Final = 1e-4 * _EYE3
-_CARRIERS: Final = {
-    "SPINE_BASE": "pelvis",
-    "HIP": "pelvis",
-    "SPINE_MID": "lower_trunk",
-    "SPINE_SHOULDER": "upper_trunk",
-    "NECK": "upper_trunk",
-    "HEAD": "head",
-    "SHOULDER": "clavicle",
-    "ELBOW": "upper_arm",
-    "WRIST": "forearm",
-    "HAND": "hand",
-    "HAND_TIP": "hand",
-    "THUMB": "hand",
-}
-"""The segment to which each kind of joint belongs."""
 _LITTLE_MOVED: Final = ("lower_trunk", "clavicle_left", "clavicle_right")
 _TRUNK: Final = ("pelvis", "upper_trunk")
 
@@ -125,16 +110,8 @@ def _placed_by(model: UpperBody, sensed: Sequence[str]) -> BoolArray:
     Lower trunk and clavicles, which move little, need no sensor, and one end of the trunk is enough.
     """
     trunk = any(name in sensed for name in _TRUNK)
-    determined: dict[str, bool] = {}
+    determined = np.zeros(len(model.segment_names), dtype=np.bool_)
     for number, name in enumerate(model.segment_names):
-        above = PARENTS[number] < 0 or determined[model.segment_names[PARENTS[number]]]
-        determined[name] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
-    carriers = []
-    for joint in model.joints.tolist():
-        kind, _, side = Joint(joint).name.rpartition("_")
-        if side in ("LEFT", "RIGHT"):
-            carrier = _CARRIERS[kind]
-            carriers.append(carrier if carrier == "pelvis" else f"{carrier}_{side.lower()}")
-        else:
-            carriers.append(_CARRIERS[Joint(joint).name])
-    return np.array([determined[carrier] for carrier in carriers])
+        above = PARENTS[number] < 0 or determined[PARENTS[number]]
+        determined[number] = above and (name in sensed or name in _LITTLE_MOVED or (trunk and name in _TRUNK))
+    return determined[model.point_segments]

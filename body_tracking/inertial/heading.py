@@ -56,7 +56,6 @@ RANGE_TIME: Final = 5.0
 _FREEDOM = 4.0
 _FAR = 0.5
 """Radians of a heading's standard deviation from which the update starts at the observed heading."""
-_DIFFERENCE = 1e-5
 _Z: Final = np.array([0.0, 0.0, 1.0])
 
 
@@ -254,17 +253,15 @@ class HeadingTracker:
         Raises:
             AlignmentError: no joint between both.
         """
-        limits = _limits(parent, child)
+        if (parent, child) not in JOINTS:
+            raise AlignmentError(f"{parent} and {child}: no joint between them has a range")
+        limits = JOINTS[parent, child]
         numbers = self._number(parent), self._number(child)
 
-        def angles(worlds: list[FloatArray]) -> FloatArray:
-            found: FloatArray = Rotation.from_matrix(worlds[0].T @ worlds[1]).as_euler("YXZ")
-            return found
-
-        def excess(a: Alignment) -> tuple[FloatArray, list[FloatArray]]:
+        def excess(a: Alignment) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
             worlds = [a.oriented(i, rotation) for i, rotation in zip(numbers, rotations, strict=True)]
-            found = angles(worlds)
-            return np.maximum(found - limits[:, 1], 0.0) + np.minimum(found - limits[:, 0], 0.0), worlds
+            found: FloatArray = Rotation.from_matrix(worlds[0].T @ worlds[1]).as_euler("YXZ")
+            return np.maximum(found - limits[:, 1], 0.0) + np.minimum(found - limits[:, 0], 0.0), found, worlds
 
         beyond = np.abs(excess(self.alignment)[0]) > 0.0
         if not beyond.any():
@@ -272,21 +269,10 @@ class HeadingTracker:
             return None
 
         def linear(a: Alignment) -> _Linear:
-            over, worlds = excess(a)
-            jacobian = np.zeros((3, len(a.covariance)))
-            for place, number in enumerate(numbers):
-                gradient = np.empty((3, 3))
-                for axis in range(3):
-                    step = so3.quat_to_matrix(so3.exp(_DIFFERENCE * np.eye(3)[axis]))
-                    ends = []
-                    for turn in (step, step.T):
-                        moved = list(worlds)
-                        moved[place] = worlds[place] @ turn
-                        ends.append(angles(moved))
-                    apart = ends[0] - ends[1]
-                    gradient[:, axis] = np.arctan2(np.sin(apart), np.cos(apart)) / (2.0 * _DIFFERENCE)
-                jacobian += gradient @ self._turning(number, worlds[place])
-            return -over[beyond], jacobian[beyond]
+            over, found, (above, below) = excess(a)
+            gradient = _euler_gradient(found)
+            turning = above.T @ below @ self._turning(numbers[1], below) - self._turning(numbers[0], above)
+            return -over[beyond], (gradient @ turning)[beyond]
 
         noise = RANGE_STDDEV**2 * np.eye(int(beyond.sum()))
         return self._update(stamp, ("range", parent, child), linear, noise, RANGE_TIME)
@@ -342,18 +328,12 @@ class HeadingTracker:
         return Innovation(residual, expected, turn, weight)
 
 
-def _limits(parent: str, child: str) -> FloatArray:
-    """(3, 2) radians: least and greatest angle of a child in its parent about y, x and z, in this order."""
-    name, _, side = child.rpartition("_")
-    if side not in ("left", "right"):
-        name, side = child, ""
-    kind = (parent.removesuffix(f"_{side}"), name)
-    if kind not in JOINTS or parent not in (kind[0], f"{kind[0]}_{side}"):
-        raise AlignmentError(f"{parent} and {child}: no joint between them has a range")
-    y, x, z = JOINTS[kind]
-    if side == "right":  # mirrored at the sagittal plane
-        x, z = (-x[1], -x[0]), (-z[1], -z[0])
-    return np.radians([y, x, z])
+def _euler_gradient(angles: FloatArray) -> FloatArray:
+    """(3, 3) derivative of angles about y, x, z, in this order, by the angular velocity in the parent's frame."""
+    x, y, z = np.eye(3)
+    axes = y, Rotation.from_euler("Y", angles[0]).apply(x), Rotation.from_euler("YX", angles[:2]).apply(z)
+    gradient: FloatArray = np.linalg.pinv(np.stack(axes, axis=1))
+    return gradient
 
 
 def _sum(*names: str) -> tuple[float, float]:
@@ -367,28 +347,34 @@ def _against(limits: tuple[float, float]) -> tuple[float, float]:
 _GIRDLE = 45.0
 """Degrees of a clavicle's rotation about its axis, which the model does not have; 15 for elbow and wrist."""
 
-JOINTS: Final[dict[tuple[str, str], tuple[tuple[float, float], tuple[float, float], tuple[float, float]]]] = {
+_Range = tuple[float, float]
+_LEFT: Final[dict[tuple[str, str], tuple[_Range, _Range, _Range]]] = {
     ("pelvis", "upper_trunk"): (
         _sum("lumbar_flexion", "thoracic_flexion"),
         _sum("lumbar_lateral", "thoracic_lateral"),
         _sum("lumbar_axial", "thoracic_axial"),
     ),
     ("upper_trunk", "head"): (RANGES["neck_flexion"], RANGES["neck_lateral"], (-80.0, 80.0)),
-    ("upper_trunk", "clavicle"): (
+    ("upper_trunk", "clavicle_left"): (
         (-_GIRDLE, _GIRDLE),
         RANGES["clavicle_elevation"],
         _against(RANGES["clavicle_protraction"]),
     ),
-    ("upper_arm", "forearm"): (
+    ("upper_arm_left", "forearm_left"): (
         _against(RANGES["elbow_flexion"]),
         (-15.0, 15.0),
         _against(RANGES["forearm_pronation"]),
     ),
-    ("forearm", "hand"): (
+    ("forearm_left", "hand_left"): (
         _against(RANGES["wrist_deviation"]),
         _against(RANGES["wrist_flexion"]),
         (-15.0, 15.0),
     ),
 }
-"""Ranges about y, x and z of the parent, degrees, of joints whose two segments may both carry a sensor; left side.
+JOINTS: Final[dict[tuple[str, str], FloatArray]] = {pair: np.radians(ranges) for pair, ranges in _LEFT.items()} | {
+    (parent.replace("left", "right"), child.replace("left", "right")): np.radians([y, _against(x), _against(z)])
+    for (parent, child), (y, x, z) in _LEFT.items()
+    if child.endswith("left")  # mirrored at the sagittal plane
+}
+"""(3, 2) radians: ranges about y, x and z of the parent, of joints whose two segments may both carry a sensor.
 The shoulder is missing: its range is nearly unlimited."""

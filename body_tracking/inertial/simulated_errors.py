@@ -98,44 +98,6 @@ taken as three standard deviations and less, for a sensor that was calibrated on
 of temperature of 1 to 7 K since the calibration (0.24 deg/s and 1.5 mg per kelvin).
 """
 
-GOOD: Final = ImuErrors(
-    gyro_noise=0.007,
-    gyro_bias=0.05,
-    gyro_instability=10.0 / 3600.0,
-    gyro_scale=0.001,
-    gyro_axes=0.001,
-    acc_noise=120e-6 * STANDARD_GRAVITY,
-    acc_bias=0.02,
-    acc_instability=30e-6 * STANDARD_GRAVITY,
-    acc_scale=0.001,
-    acc_axes=0.0005,
-    mag_noise=0.02,
-    mag_bias=0.3,
-    mag_scale=0.003,
-    mag_range=190.0,
-    tilt_time=6.0,
-    heading_time=20.0,
-    driver_bias=0.003,
-    stated_tilt=0.75,
-    stated_heading=1.5,
-    misalignment=3.0,
-    tissue_sag=0.002,
-    tissue_frequency=10.0,
-    twist_share=0.1,
-    jitter=1e-5,
-    stamp_jitter=1e-5,
-    packet=1,
-    lost=0.0005,
-    outages=0.02,
-    delay=0.03,
-    delay_jitter=0.001,
-)
-"""A motion tracker like those of Xsens, calibrated one by one, with tight straps.
-
-Data sheet of the MTi-1: 0.007 deg/s and 120 ug per root hertz, bias stability 10 deg/h and 0.03 mg. Radio as of the
-wireless MTw.
-"""
-
 IDEAL: Final = replace(
     CONSUMER,
     **{

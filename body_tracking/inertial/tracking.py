@@ -176,8 +176,8 @@ class InertialTracker:
 
     def reset(self) -> None:
         """Start again, as after a jump of time; the counters stay."""
-        for name, sensor in self._sensors.items():
-            sensor.segment = name
+        for sensor in self._sensors.values():
+            sensor.segment = sensor.stated
             sensor.reset()
         self._begin()
 
@@ -250,7 +250,7 @@ class InertialTracker:
         self._clocks.take_reading(sample.stamp_ns, received_ns)
         if reading is None or sensor.problems:
             return _NO_OUTPUT
-        stamp_ns = self._to_reference(sensor, reading.stamp_ns)
+        stamp_ns = reading.stamp_ns + self._offset_ns(sensor)
         if self._waits_for_camera(received_ns):
             return _NO_OUTPUT
         now = self._advance(stamp_ns)
@@ -316,15 +316,9 @@ class InertialTracker:
 
     # --- time
 
-    def _to_reference(self, sensor: WornSensor, stamp_ns: int) -> int:
-        """A stamp of a sensor in the output clock."""
-        return stamp_ns + self._offset_ns(sensor)
-
     def _offset_ns(self, sensor: WornSensor) -> int:
-        return self._clocks.offset_ns(self._stated(sensor), sensor.clock)
-
-    def _stated(self, sensor: WornSensor) -> str:
-        return next(name for name, each in self._sensors.items() if each is sensor)
+        """From a sensor's stamps to the output clock."""
+        return self._clocks.offset_ns(sensor.stated, sensor.clock)
 
     def _rebase(self) -> None:
         """Start times again after a change of the output clock."""
@@ -401,7 +395,7 @@ class InertialTracker:
             latest = sensor.latest
             if latest is None or sensor.problems:
                 continue
-            if abs(self._to_reference(sensor, latest.stamp_ns) - stamp_ns) < self.parameters.silent_after * NANOSECONDS:
+            if abs(latest.stamp_ns + self._offset_ns(sensor) - stamp_ns) < self.parameters.silent_after * NANOSECONDS:
                 found.append((self.segments.index(sensor.segment), sensor))
         return sorted(found, key=lambda each: each[0])
 
@@ -487,7 +481,7 @@ class InertialTracker:
             return
         found = clock_offset(seen, measured, window=_CLOCK_WINDOW)
         if found is not None and sensor.segment not in self._exchanged.values():
-            self._clocks.correct(self._stated(sensor), now, found.offset, found.stddev)
+            self._clocks.correct(sensor.stated, now, found.offset, found.stddev)
             self.counters["clocks by motion"] += 1
 
     def _look_for_exchange(self, now: float, stamp_ns: int) -> None:
@@ -500,7 +494,7 @@ class InertialTracker:
         segments = [active[number][1].segment for number in kept]
         table = likelihood_by_motion([each for each in measured if each is not None], self._bones(segments))
         for row, number in enumerate(kept):
-            by_pose = self._by_pose.get(self._stated(active[number][1]), {})
+            by_pose = self._by_pose.get(active[number][1].stated, {})
             table[row] += [by_pose.get(segment, 0.0) for segment in segments]
         self._exchange([active[number][1] for number in kept], assign(segments, table))
 
@@ -508,7 +502,7 @@ class InertialTracker:
         """Keep the log likelihoods of a pose, to add them to those of motion."""
         for sensor, row in zip(sensors, table, strict=True):
             bounded = np.maximum(row - row.max(), -_POSE_LIMIT).tolist()
-            self._by_pose[self._stated(sensor)] = dict(zip((each.segment for each in sensors), bounded, strict=True))
+            self._by_pose[sensor.stated] = dict(zip((each.segment for each in sensors), bounded, strict=True))
 
     def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> bool:
         """Assign sensors to the segments on which they were found; whether any of these is another one."""
@@ -517,7 +511,7 @@ class InertialTracker:
         if not moved:
             return False
         for sensor, segment in moved:
-            stated = self._stated(sensor)
+            stated = sensor.stated
             self._slips.pop(segment, None)  # the exchange looked like a slip
             self.counters["exchanged sensors"] += 1
             if segment == stated:
@@ -617,7 +611,7 @@ class InertialTracker:
             upper, lower = rotations.get(f"upper_arm_{side}"), rotations.get(f"forearm_{side}")
             if upper is not None and lower is not None:
                 self._tracker.observe_elbow(now, side, upper, lower)
-        for parent, child in _joints():
+        for parent, child in JOINTS:
             if parent in rotations and child in rotations:
                 self._tracker.observe_range(now, parent, child, (rotations[parent], rotations[child]))
 
@@ -691,15 +685,3 @@ def rate_variance(rate: FloatArray) -> float:
 def _orthonormal(rotation: FloatArray) -> FloatArray:
     """A product of many rotations without its accumulated rounding errors."""
     return so3.quat_to_matrix(so3.matrix_to_quat(rotation))
-
-
-def _joints() -> list[tuple[str, str]]:
-    """Pairs of segments whose joint has a range of motion in :data:`JOINTS`."""
-    found = []
-    for parent, child in JOINTS:
-        if child in ("upper_trunk", "head"):
-            found.append((parent, child))
-        else:
-            above = [parent] * 2 if parent == "upper_trunk" else [f"{parent}_left", f"{parent}_right"]
-            found += zip(above, [f"{child}_left", f"{child}_right"], strict=True)
-    return found

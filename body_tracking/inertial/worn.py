@@ -77,6 +77,7 @@ class WornSensor:
         magnetometer: use the magnetic field.
 
     Attributes:
+        stated: stated segment.
         segment: current segment; changes when sensors are found to be exchanged.
         clock: its clock by receipt.
         latest: the last reading; None before the first one.
@@ -87,7 +88,7 @@ class WornSensor:
     """
 
     def __init__(self, segment: str, *, magnetometer: bool = True) -> None:
-        self.segment = segment
+        self.stated = self.segment = segment
         self.clock = ReceiptClock()
         self.counters: Counter[str] = Counter()
         self.received_ns: int | None = None

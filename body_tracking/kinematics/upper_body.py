@@ -150,6 +150,7 @@ class UpperBody:
         parents: index of each segment's parent, -1 for the base.
         segment_coordinates: (12,) for each segment the slice of the tangent that turns it against its parent.
         scalar_q, scalar_v: (20,) where configuration and tangent hold the angles of the joints that turn about axes.
+        point_segments: (19,) index of the segment that carries each point.
         ball_v: (3, 3) where the tangent holds the rotations of the pelvis and of the two upper arms.
     """
 
@@ -232,6 +233,7 @@ class UpperBody:
         ]
         point_of = {joint: number for number, (joint, _, _) in enumerate(_POINTS)}
         segment_of = [SEGMENTS.index(name) for _, name, _ in _POINTS]
+        self.point_segments: IntArray = np.array(segment_of, dtype=np.intp)
         self._origin_point: IntArray = np.array([point_of[joint] for joint in _ORIGINS], dtype=np.intp)
         self._place_directions(scalar_segments, ball_segments)
         self._place_lengths(segment_of)

@@ -18,7 +18,6 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.simulated import ImuSamples, Motion, Mounting, SimulatedImu, Slip, usual_mounting
 from body_tracking.inertial.simulated_errors import (
     CONSUMER,
-    GOOD,
     IDEAL,
     STANDARD_GRAVITY,
     ImuErrors,
@@ -27,7 +26,6 @@ from body_tracking.inertial.simulated_errors import (
 from body_tracking.inertial.surroundings import Iron, Surroundings
 from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
-from draws import some
 
 UP = np.array([0.0, 0.0, 1.0])
 AT_ORIGIN = Mounting(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -538,9 +536,8 @@ def test_iron_turns_the_heading_to_its_field_while_it_is_there() -> None:
     assert heading[-1] == pytest.approx(0.0, abs=degrees(0.1))
 
 
-@pytest.mark.parametrize("errors", some([CONSUMER, GOOD]))
-def test_the_stated_heading_deviation_grows_with_the_drift_and_covers_it(errors: ImuErrors) -> None:
-    errors = replace(errors, stated_heading=0.0, tissue_sag=0.0, lost=0.0, outages=0.0)
+def test_the_stated_heading_deviation_grows_with_the_drift_and_covers_it() -> None:
+    errors = replace(CONSUMER, stated_heading=0.0, tissue_sag=0.0, lost=0.0, outages=0.0)
     normalised, stated = [], []
     for seed in range(60):
         samples = measured(
