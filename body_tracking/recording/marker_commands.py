@@ -77,7 +77,8 @@ def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
         if all(topic in bag.topics for topic in topics):
             return topics
     wanted = " or ".join(topics[0] for topics in sources)
-    raise MarkerCommandError(f"{bag.path}: no topic {wanted}; it has {', '.join(sorted(bag.topics))}")
+    rig = "" if len(sources) > 1 else f". Images need {folder / setup.RIG}, which is not there"
+    raise MarkerCommandError(f"{bag.path}: no topic {wanted}; it has {', '.join(sorted(bag.topics))}{rig}")
 
 
 def track(

@@ -155,3 +155,9 @@ def test_what_does_not_serve_is_refused_in_one_line(
     out = capsys.readouterr()
     assert said in out.err and out.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_images_without_a_rig_are_refused_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = Path(__file__).resolve().parents[2] / "bags" / "markers_arm"
+    assert cli.main(["markers", "angles", str(shipped), "--setup", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert f"Images need {tmp_path / setup.RIG}, which is not there" in capsys.readouterr().err
