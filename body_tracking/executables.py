@@ -33,7 +33,7 @@ def start(name: str) -> None:
                 with contextlib.suppress(ImportError):  # the node says what it lacks
                     importlib.import_module(module)
     else:  # of a system of another package
-        main = importlib.import_module("body_tracking.ros.host").host_of(name)
+        main = importlib.import_module("body_tracking.ros.host").main_of(name)
     imported.set()
     main()
 

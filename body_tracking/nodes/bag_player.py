@@ -1,8 +1,5 @@
 """Plays a bag: the recorded messages on their topics with their QoS, and ``/clock``."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time
@@ -241,10 +238,4 @@ class BagPlayer(GraphNode):
         self.reader.close()
 
 
-def main() -> None:
-    """The executable ``bag_player``."""
-    run(BagPlayer)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, BagPlayer)

@@ -1,8 +1,5 @@
 """Records the serialised messages of topics into a bag."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time
@@ -315,10 +312,4 @@ class BagRecorder(GraphNode):
         return (1 if self.refused else 0), ("stopped" if self.writer is None else "recording"), values
 
 
-def main() -> None:
-    """The executable ``bag_recorder``."""
-    run(BagRecorder)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, BagRecorder)

@@ -1,8 +1,5 @@
 """Skeletons, their uncertainty and the sensors as markers for RViz and Foxglove, and a person's segments as TF."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 from functools import partial
@@ -115,10 +112,4 @@ class BodyMarkers(GraphNode):
         self.send(self.output, markers.message())
 
 
-def main() -> None:
-    """The executable ``body_markers``."""
-    run(BodyMarkers)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, BodyMarkers)

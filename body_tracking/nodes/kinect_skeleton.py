@@ -1,13 +1,11 @@
 """One sensor's skeletons, from a live backend or a recording, to ``/<sensor>/skeleton``."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import threading
 import traceback
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -153,10 +151,4 @@ class KinectSkeleton(GraphNode):
         self.thread.join(timeout=1.0)
 
 
-def main() -> None:
-    """The executable ``kinect_skeleton``."""
-    run(KinectSkeleton)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, KinectSkeleton)

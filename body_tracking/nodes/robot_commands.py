@@ -6,9 +6,6 @@ ends, the commands end, and the robot's controller decides what follows. It publ
 publishes them. No safety-rated function: docs/robots.md.
 """
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import contextlib
@@ -205,10 +202,4 @@ class RobotCommands(GraphNode):
         return _LEVELS[command.state], f"{command.state}: {command.reason}", values
 
 
-def main() -> None:
-    """The executable ``robot_commands``."""
-    run(RobotCommands)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, RobotCommands)

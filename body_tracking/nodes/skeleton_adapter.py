@@ -1,11 +1,9 @@
 """Bodies from the ROS driver of another camera (``visualization_msgs/MarkerArray``) to ``/<sensor>/skeleton``."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -80,10 +78,4 @@ class SkeletonAdapter(GraphNode):
         return (1, f"no message on {self.topic} for {silent:.0f} s", {}) if silent > SILENCE else (0, "streaming", {})
 
 
-def main() -> None:
-    """The executable ``skeleton_adapter``."""
-    run(SkeletonAdapter)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, SkeletonAdapter)

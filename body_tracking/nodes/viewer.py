@@ -1,8 +1,5 @@
 """Shows the graph on a live page in a browser, whose controls call services and set parameters."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import contextlib
@@ -428,10 +425,4 @@ def give_way() -> None:
             Path("/proc/self/autogroup").write_text(str(_NICE), encoding="ascii")
 
 
-def main() -> None:
-    """The executable ``viewer``."""
-    run(ViewerNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, ViewerNode)

@@ -1,8 +1,5 @@
 """Message classes by name, and conversion of QoS profiles between rclpy and :mod:`body_tracking.core.qos`."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import importlib

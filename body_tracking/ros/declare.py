@@ -1,8 +1,5 @@
 """Declaration of the nodes' parameters in ROS."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import sys

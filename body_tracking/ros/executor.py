@@ -5,9 +5,6 @@ coroutine for every message: about 0.2 ms, more than the work of most of our nod
 on PyPI uses a whole processor while idle, and its ``spin`` does not return at shutdown.)
 """
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time

@@ -1,8 +1,5 @@
 """Diagnostics, angles and clock of the graph, as the status line of ``body_tracking up``."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import contextlib

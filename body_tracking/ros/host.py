@@ -1,13 +1,10 @@
 """The node that hosts a stage: its topics, services, alarms and parameters, over ROS."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, ClassVar
 
 from rclpy.publisher import Publisher
@@ -205,11 +202,16 @@ class StageNode(GraphNode):
             self.get_logger().error(str(error))
 
 
-def host_of(executable: str) -> Callable[[], None]:
-    """``main`` of the node that hosts the stage of this executable."""
-    hosted = stage_class(executable)
+@cache
+def node_of(executable: str) -> type[StageNode]:
+    """The class of the node that hosts the stage of this executable."""
 
     class Host(StageNode):
-        STAGE = hosted
+        STAGE = stage_class(executable)
 
-    return partial(run, Host)
+    return Host
+
+
+def main_of(executable: str) -> Callable[[], None]:
+    """``main`` of that node."""
+    return partial(run, node_of(executable))

@@ -1,8 +1,5 @@
 """Counters, rates and delays of a node's messages, for its diagnostics."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time

@@ -3,9 +3,6 @@
 Over 500 lines: the methods that override rclpy.node.Node belong together.
 """
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import contextlib

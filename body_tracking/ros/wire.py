@@ -1,8 +1,5 @@
 """Serialisation of messages by the client library."""
 
-# rclpy is only partly typed, and absent where there is no ROS.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 from typing import Any

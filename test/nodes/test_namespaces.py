@@ -48,14 +48,7 @@ def test_every_name_of_a_node_is_in_its_namespace(executable: str) -> None:
     parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     rclpy.init(args=["--ros-args", "-r", "__ns:=/lab/left", *parameters], domain_id=domain())
     try:
-        module = importlib.import_module(f"body_tracking.nodes.{executable}")
-        (node_class,) = (
-            each
-            for each in vars(module).values()
-            if isinstance(each, type)
-            and getattr(each, "NAME", None) == executable
-            and each.__module__ == module.__name__
-        )
+        (node_class,) = importlib.import_module(f"body_tracking.nodes.{executable}").main.args
         node = node_class()
         used = {each.topic_name for each in (*node.publishers, *node.subscriptions)}
         services = {each.service_name for each in (*node.services, *node.clients)}

@@ -27,19 +27,17 @@ from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.messages.node_status import NodeStatus  # noqa: E402
 from body_tracking.nodes.bag_recorder import BagRecorder  # noqa: E402
 from body_tracking.nodes.body_markers import BodyMarkers  # noqa: E402
-from body_tracking.nodes.calibration import CalibrationNode  # noqa: E402
-from body_tracking.nodes.fusion import FusionNode  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402
-from body_tracking.nodes.skeleton_filter import SkeletonFilterNode  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 from body_tracking.ros.graph_monitor import GraphMonitor  # noqa: E402
+from body_tracking.ros.host import node_of  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
 ROBOT = Path(__file__).resolve().parents[2] / "config" / "robots" / "two_joint_arm.yaml"
 SENSOR = graph.skeleton_topic("kinect1")
 ANGLES = graph.joint_states_topic("body1")
-NODES = (BagRecorder, BodyMarkers, CalibrationNode, FusionNode, RobotCommands, SkeletonFilterNode)
+NODES = (BagRecorder, BodyMarkers, RobotCommands, *map(node_of, ("calibration", "fusion", "skeleton_filter")))
 READERS = {
     "calibration": {SENSOR},
     "fusion": {SENSOR, graph.CALIBRATION},

@@ -1,8 +1,5 @@
 """Checks of the ROS domain: publishers and subscribers of each topic, received messages, and status of the nodes."""
 
-# rclpy is only partly typed.
-# mypy: disable-error-code="no-untyped-call, attr-defined, misc"
-
 from __future__ import annotations
 
 import time
