@@ -9,14 +9,12 @@ from hypothesis import strategies as st
 
 from body_tracking.core import so3
 from body_tracking.core.estimate import ModelEstimate
-from body_tracking.core.joint_angles import JointAngles
-from body_tracking.core.message_types import IMAGE, IMU, SEGMENTS
+from body_tracking.core.message_types import IMAGE, IMU
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import MAX_STAMP_NS, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.base import MessageError
-from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_segments, encode_skeletons
+from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
 from body_tracking.messages.imus import message_to_orientation, orientation_to_message
 from body_tracking.messages.model import (
     covariance_to_image,
@@ -24,7 +22,6 @@ from body_tracking.messages.model import (
     estimate_to_stddevs,
     image_to_covariance,
     joint_state_to_model,
-    segments_to_joint_state,
 )
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
@@ -120,23 +117,6 @@ def test_padding_bytes_are_ignored() -> None:
             assert_same(body, decoded[0])
 
 
-@given(st.integers(0, 2**32), STAMPS, FRAMES, st.integers(0, 20))
-def test_angles_read_as_they_were_written(seed: int, stamp_ns: int, frame_id: str, count: int) -> None:
-    random = np.random.default_rng(seed)
-    names = tuple(f"angle_{'x' * index}" for index in range(count))
-    values = random.normal(size=(4, count))
-    values[random.random((4, count)) < 0.2] = np.inf
-    angles = JointAngles(stamp_ns, names, *values)
-    ours = encode_angles(angles, "body1", frame_id)
-    for cdr, message in zip(ours, angles_to_joint_states(angles, "body1", frame_id, BAG_MESSAGES), strict=True):
-        read = deserialize(STATES, cdr)
-        assert read.header == message.header
-        assert read.name == message.name
-        np.testing.assert_array_equal(read.position, message.position)
-        np.testing.assert_array_equal(read.velocity, message.velocity)
-        assert len(read.effort) == 0
-
-
 # --- the state of a body model
 
 
@@ -167,17 +147,6 @@ def test_a_model_state_and_its_uncertainty_survive_serialisation(seed: int, stam
     stamp, covariance = image_to_covariance(deserialize(IMAGE, cdr), MODEL)
     assert stamp == stamp_ns
     np.testing.assert_array_equal(covariance, given_estimate.covariance)
-
-
-@given(st.integers(0, 2**32), STAMPS, FRAMES)
-def test_segments_are_written_as_by_the_serialiser(seed: int, stamp_ns: int, frame_id: str) -> None:
-    given_estimate = estimate(seed, stamp_ns, frame_id)
-    posture = MODEL.forward(given_estimate.q, given_estimate.lengths)
-    placed = MODEL.segment_names, posture.origins, so3.matrix_to_quat(posture.rotations)
-    cdr = encode_segments(given_estimate, *placed)
-    assert cdr == serialize(segments_to_joint_state(given_estimate, *placed, BAG_MESSAGES))
-    read = deserialize(SEGMENTS, cdr)
-    assert len(read.transforms) == len(read.joint_names) == len(MODEL.segment_names)
 
 
 @given(st.integers(0, 2**32), STAMPS, FRAMES.filter(bool), st.booleans())

@@ -6,8 +6,8 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.message_types import SEGMENTS
 from body_tracking.kinematics.tracking import segment_poses
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.cdr import encode_segments
 from body_tracking.messages.codecs import Codec, Wire
+from body_tracking.messages.model import segments_to_joint_state
 
 
 class Segments(Codec):
@@ -19,4 +19,5 @@ class Segments(Codec):
         self.model = model
 
     def encode(self, payload: ModelEstimate, wire: Wire) -> bytes:
-        return encode_segments(payload, self.model.segment_names, *segment_poses(payload, self.model))
+        names, poses = self.model.segment_names, segment_poses(payload, self.model)
+        return wire.serialize(SEGMENTS, segments_to_joint_state(payload, names, *poses, wire.types))

@@ -12,32 +12,32 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds
 
 
-def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:
-    """Values and standard deviations as two ``sensor_msgs/JointState``.
+def angles_to_joint_state(
+    angles: JointAngles, body: str, frame_id: str, types: MessageTypes, *, stddev: bool = False
+) -> Any:
+    """Values, or standard deviations, as ``sensor_msgs/JointState``.
 
     Args:
         angles: radians and radians per second.
         body: the REP-155 body id; every name ends in ``_<body>``.
-        frame_id: of both headers; ``joint_angles`` puts the convention here, because conventions share names of angles.
+        frame_id: of the header; ``joint_angles`` puts the convention here, because conventions share names of angles.
         types: the family of message classes to build.
+        stddev: the standard deviations.
     """
-    header = to_header(angles.stamp_ns, frame_id, types)
-    names = [f"{name}_{body}" for name in angles.names]
-
-    def joint_state(position: FloatArray, velocity: FloatArray) -> Any:
-        return types.make(
-            JOINT_STATE,
-            header=header,
-            name=names,
-            position=types.floats(position),
-            velocity=types.floats(velocity),
-            effort=types.floats(np.empty(0)),
-        )
-
-    return (
-        joint_state(angles.position, angles.velocity),
-        joint_state(angles.position_stddev, angles.velocity_stddev),
+    return types.make(
+        JOINT_STATE,
+        header=to_header(angles.stamp_ns, frame_id, types),
+        name=[f"{name}_{body}" for name in angles.names],
+        position=types.floats(angles.position_stddev if stddev else angles.position),
+        velocity=types.floats(angles.velocity_stddev if stddev else angles.velocity),
+        effort=types.floats(np.empty(0)),
     )
+
+
+def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types: MessageTypes) -> tuple[Any, Any]:
+    """Values and standard deviations by :func:`angles_to_joint_state`."""
+    values, stddevs = (angles_to_joint_state(angles, body, frame_id, types, stddev=which) for which in (False, True))
+    return values, stddevs
 
 
 def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngles:

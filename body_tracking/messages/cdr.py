@@ -1,4 +1,4 @@
-"""The most frequent messages of the graph, written and read as CDR bytes without message objects.
+"""Skeletons, of which the graph passes on most, written and read as CDR bytes without message objects.
 
 CPU microseconds per message, including the conversion to and from our own types (rosbags 0.11.9, rclpy 7.1.6):
 
@@ -9,8 +9,6 @@ skeleton of a sensor, written             8.6   22.1 (2.6 x)     34.3 (4.0 x)
 skeleton of a sensor, read               14.1   43.7 (3.1 x)     66.0 (4.7 x)
 with covariance and velocity, written    12.4   43.0 (3.5 x)    62.1 (5.0 x)
 with covariance and velocity, read       17.3   84.1 (4.9 x)    121.4 (7.0 x)
-26 joint angles, written                  5.0   37.2 (7.5 x)     28.8 (5.8 x)
-segments of a body, written               3.4   37.2 (10.8 x)    97.7 (28 x)
 ======================================  =====  ===============  ==============
 
 The bytes are those of the other modules of this package and a ROS serialiser, except for padding, which Fast CDR does
@@ -29,9 +27,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.core.estimate import ModelEstimate
-from body_tracking.core.joint_angles import JointAngles
-from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton, TrackingState
 from body_tracking.messages.base import BagMessages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 
@@ -51,9 +47,6 @@ def _string(text: str) -> bytes:
     """A CDR string: length with the terminating zero, then the text; without trailing padding."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
-
-
-# --- skeletons
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,49 +167,6 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
 _KINDS = ((True, False), (True, True), (False, False))
 _KNOWN = tuple(_layout(count, *kind) for count in range(1, 7) for kind in _KINDS)
 """The layouts that are read here: of 1 to 6 bodies."""
-
-
-# --- joint angles
-
-
-@cache
-def _names(names: tuple[str, ...], suffix: str = "") -> bytes:
-    """The field ``name``, padded to 4; the suffix is appended to each name."""
-    table = struct.pack("<I", len(names))
-    for name in names:
-        table = _padded(table + _string(name + suffix))
-    return table
-
-
-def encode_angles(angles: JointAngles, body: str, frame_id: str) -> tuple[bytes, bytes]:
-    """``angles_to_joint_states``, serialised: values, and standard deviations."""
-    start = _header(angles.stamp_ns, frame_id) + _names(angles.names, f"_{body}")
-    return (
-        start + _doubles(len(start), angles.position, angles.velocity),
-        start + _doubles(len(start), angles.position_stddev, angles.velocity_stddev),
-    )
-
-
-def _doubles(position: int, *values: FloatArray) -> bytes:
-    """Sequences of ``float64``, aligned to 8 from the end of the encapsulation header, and an empty ``effort``."""
-    data = b""
-    for value in values:
-        data += struct.pack("<I", len(value))
-        data += bytes(-(position + len(data) - 4) % 8) if len(value) else b""
-        data += value.astype("<f8").tobytes()
-    return data + struct.pack("<I", 0)
-
-
-# --- segments
-
-
-def encode_segments(
-    estimate: ModelEstimate, names: tuple[str, ...], origins: FloatArray, quats_xyzw: FloatArray
-) -> bytes:
-    """``segments_to_joint_state``, serialised."""
-    start = _header(estimate.stamp_ns, estimate.frame_id) + _names(names) + struct.pack("<I", len(names))
-    data = np.concatenate([origins, quats_xyzw], axis=1).astype("<f8").tobytes()
-    return start + bytes(-(len(start) - 4) % 8) + data + struct.pack("<II", 0, 0)
 
 
 def _read_header(cdr: bytes) -> tuple[int, str, int] | None:

@@ -27,6 +27,7 @@ from body_tracking.core.message_types import (
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.base import MessageTypes, to_header
 from body_tracking.messages.calibration import (
     clock_to_time_reference,
@@ -34,7 +35,7 @@ from body_tracking.messages.calibration import (
     time_reference_to_clock,
     transform_to_pose,
 )
-from body_tracking.messages.cdr import decode_skeletons, encode_angles, encode_skeletons
+from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
 from body_tracking.messages.imus import (
     message_to_magnetic_field,
     message_to_orientation,
@@ -247,7 +248,9 @@ class Angles(Codec):
         self.body, self.part, self.convention = body, part, convention
 
     def encode(self, payload: JointAngles, wire: Wire) -> bytes:
-        return encode_angles(payload, self.body, self.convention())[self.part]
+        stddev = self.part == 1
+        message = angles_to_joint_state(payload, self.body, self.convention(), wire.types, stddev=stddev)
+        return wire.serialize(JOINT_STATE, message)
 
 
 class Ids(Codec):

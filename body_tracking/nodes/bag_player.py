@@ -19,7 +19,9 @@ from body_tracking.recording.player import Playback
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError
 from body_tracking.ros.bag_topics import UnknownTypeError, message_class, to_profile
-from body_tracking.ros.node import ROS, STEADY, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
+from body_tracking.ros.wire import ROS
 
 PARAMETERS = (
     Parameter("bag", "", "the bag: a folder, or a single mcap file"),

@@ -20,7 +20,8 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.graph import is_model_covariance
 from body_tracking.recording.rosbag2 import BagError, BagWriter
 from body_tracking.ros.bag_topics import from_profile, message_class, to_profile
-from body_tracking.ros.node import STEADY, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
 
 PARAMETERS = (
     Parameter(

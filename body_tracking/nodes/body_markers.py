@@ -18,8 +18,11 @@ from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import BODY, SENSORS, WORLD_FRAME
 from body_tracking.ros.bag_topics import to_profile
-from body_tracking.ros.node import BODY, ROS, SENSORS, STEADY, WORLD_FRAME, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
+from body_tracking.ros.wire import ROS
 from body_tracking.viewing.colours import FILTERED, FUSED, UNCERTAINTY, sensor_colours
 from body_tracking.viewing.markers import Markers, segments_to_transforms
 from body_tracking.viewing.shapes import ellipsoids, figure, frustum, in_world

@@ -17,7 +17,9 @@ from body_tracking.kinect.live import SourceSettings, backends, described, open_
 from body_tracking.kinect.ros_time import RosTime
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.pipeline import graph
-from body_tracking.ros.node import RELIABLE, GraphNode, run
+from body_tracking.pipeline.shared import RELIABLE, skeleton_qos
+from body_tracking.ros.main import run
+from body_tracking.ros.node import GraphNode
 
 _DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0
@@ -86,7 +88,9 @@ class KinectSkeleton(GraphNode):
         )
         self.ros_time = RosTime()
         self.source = open_source(given["backend"], settings)
-        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.output = self.make_publisher(
+            PointCloud2, graph.skeleton_topic(sensor), to_profile(skeleton_qos(self.values))
+        )
         self.thread = threading.Thread(target=self.publish_frames, daemon=True)
         self.thread.start()
 

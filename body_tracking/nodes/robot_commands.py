@@ -36,11 +36,14 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import BODY, RELIABLE, SENSORS, result_qos
 from body_tracking.robot.calibration import CalibrationQuality
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
 from body_tracking.robot.mapping import TRAJECTORY, MappingError, load
 from body_tracking.ros.bag_topics import to_profile
-from body_tracking.ros.node import BODY, RELIABLE, ROS, SENSORS, STEADY, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
+from body_tracking.ros.wire import ROS
 
 PARAMETERS = (
     Parameter("mapping", "", "the robot's mapping file; see docs/robots.md"),
@@ -83,7 +86,9 @@ class RobotCommands(GraphNode):
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
         angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
         for topic in angles:
-            self.subscribe(topic, JointState, self.result_qos(), partial(self.on_angles, self.full_name(topic)))
+            self.subscribe(
+                topic, JointState, to_profile(result_qos(self.values)), partial(self.on_angles, self.full_name(topic))
+            )
         for sensor in self.sensors:
             self.subscribe_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
         self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)

@@ -18,8 +18,10 @@ from body_tracking.kinect.ros_time import RosTime
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.skeletons import markers_to_points
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import RELIABLE, skeleton_qos
 from body_tracking.ros.bag_topics import to_profile
-from body_tracking.ros.node import RELIABLE, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import GraphNode
 
 PARAMETERS = (
     Parameter("sensor", "azure1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
@@ -55,7 +57,9 @@ class SkeletonAdapter(GraphNode):
         self.topic: str = self.resolve_topic_name(given["topic"])
         self.last_received: float | None = None
         self.ros_time = RosTime()
-        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), self.skeleton_qos())
+        self.output = self.make_publisher(
+            PointCloud2, graph.skeleton_topic(sensor), to_profile(skeleton_qos(self.values))
+        )
         self.subscribe(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:

@@ -35,18 +35,18 @@ from body_tracking.kinematics.tracking import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.calibration import transform_to_pose
-from body_tracking.messages.cdr import decode_skeletons
-from body_tracking.messages.codecs import Codec
+from body_tracking.messages.codecs import Codec, Skeletons
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.model import joint_state_to_segments
 from body_tracking.messages.node_status import NodeStatus, update_statuses
-from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES
+from body_tracking.pipeline.shared import BODY, SENSORS
 from body_tracking.pipeline.system import load
 from body_tracking.ros.bag_topics import message_class, to_profile
-from body_tracking.ros.node import BODY, SENSORS, STEADY, GraphNode, deserialized, run
-from body_tracking.ros.wire import WIRE
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
+from body_tracking.ros.wire import WIRE, deserialized
 from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.snapshot import PageError, Seen, Snapshot, SystemView
 
@@ -268,7 +268,7 @@ class ViewerNode(GraphNode):
         if cdr and cdr is not self.read.get(topic):
             self.read[topic] = cdr
             try:
-                skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
+                skeletons = Skeletons().decode(cdr, WIRE)
             except BodyTrackingError as error:
                 self.malformed(topic, str(error))
             else:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -25,31 +25,22 @@ _LOOK_PERIOD_NS = 100_000_000
 _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
-@runtime_checkable
-class HandlesBatches(Protocol):
-    """A node that processes its messages in batches."""
-
-    def batch_done(self) -> None:
-        """Called after the callbacks of all waiting messages."""
-
-
-@runtime_checkable
-class DropsMessages(Protocol):
-    """A node that drops late messages."""
-
-    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-        """The messages to be handled, each with its subscription, in the same order."""
-
-    def work_done(self) -> None:
-        """Called after they have been handled."""
-
-
-@runtime_checkable
-class GuardsCallbacks(Protocol):
-    """A node that handles the errors of its callbacks."""
+class BatchNode(Node):
+    """A node whose messages come in batches: all that wait when the executor looks."""
 
     def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """A callback that returns None instead of raising."""
+        """A callback that returns None instead of raising; ``where`` names it in the log."""
+        return callback
+
+    def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        """The messages of a batch to be handled, each with its subscription, in the same order."""
+        return messages
+
+    def batch_done(self) -> None:
+        """Called after the callbacks of a batch."""
+
+    def work_done(self) -> None:
+        """Called after :meth:`batch_done`."""
 
 
 class LeanExecutor(SingleThreadedExecutor):
@@ -60,11 +51,9 @@ class LeanExecutor(SingleThreadedExecutor):
     messages: the timeout of a message must not fire while that message waits in a queue.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: BatchNode) -> None:
         super().__init__()
-        self._guarded = node.guarded if isinstance(node, GuardsCallbacks) else lambda where, callback: callback
-        self._taken = self._guarded("messages", node.batch_done) if isinstance(node, HandlesBatches) else None
-        self._leaving_out = node if isinstance(node, DropsMessages) else None
+        self._batch_done = node.guarded("messages", node.batch_done)
         self._changed = True
         self._stopped = False
         self._until_ns: int | None = None
@@ -131,7 +120,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 context,
             )
             # a message that the middleware cannot deserialise is left out
-            takes = [self._guarded(f"taking {each.topic_name}", each.handle.take_message) for each in subscriptions]
+            takes = [node.guarded(f"taking {each.topic_name}", each.handle.take_message) for each in subscriptions]
             looked_ns = 0
             ready_since_ns: int | None = None
             while not self._changed:
@@ -163,17 +152,16 @@ class LeanExecutor(SingleThreadedExecutor):
                     if not messages:
                         self._stopped = True
                         return
-                if messages and self._leaving_out is not None:
-                    messages = self._leaving_out.drop_late(messages)
+                if messages:
+                    messages = node.drop_late(messages)
                 for subscription, taken in messages:
                     if self._stopped:
                         return
                     only_message = subscription._callback_type is _MESSAGE_ONLY
                     subscription.callback(*(taken[:1] if only_message else taken))
-                if messages and self._taken is not None:
-                    self._taken()
-                if messages and self._leaving_out is not None:
-                    self._leaving_out.work_done()
+                if messages:
+                    self._batch_done()
+                    node.work_done()
                 executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None

@@ -16,7 +16,8 @@ from body_tracking.core.parameters import Value
 from body_tracking.core.qos import Qos, request_for
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 from body_tracking.ros.bag_topics import UnknownTypeError, from_profile, message_class, to_profile
-from body_tracking.ros.node import STEADY, GraphNode, run
+from body_tracking.ros.main import run
+from body_tracking.ros.node import STEADY, GraphNode
 from body_tracking.ros.wire import WIRE
 from body_tracking.systems import stage_class
 
@@ -104,14 +105,9 @@ class StageNode(GraphNode):
                 self.inputs[topic] = port, self._subscription(port)
 
     def _subscription(self, port: Port) -> Subscription:
-        self._requested[port.topic] = self._request(port)
-        qos = to_profile(self._requested[port.topic])
+        requested = self._requested[port.topic] = self._request(port)
         kind = message_class(port.codec.type_name)
-        handle = partial(self.on_message, port.topic)
-        subscription = self.subscribe(port.topic, kind, qos, handle, raw=True, absolute=port.absolute)
-        if port.droppable:
-            self._droppable[subscription] = self.full_name(port.topic)
-        return subscription
+        return self.subscribe_port(port, requested, kind, partial(self.on_message, port.topic))
 
     def wanted(self, topic: str) -> bool:
         """Whether a topic has subscribers."""

@@ -10,6 +10,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property, wraps
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -22,11 +23,9 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
-from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -39,24 +38,19 @@ from body_tracking.core.parameters import Parameter, ParameterError, Value, to_r
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.core.qos import SENSOR_DATA, Qos
 from body_tracking.core.skeleton import Skeleton
-from body_tracking.messages.base import MessageError, RosMessages, to_nanoseconds
-from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import diagnostics
-from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.shared import BODY, FRAMES_KEPT, REFERENCE, RELIABLE, SENSORS, WORLD_FRAME
-from body_tracking.pipeline.shared import result_qos as shared_result_qos
-from body_tracking.pipeline.shared import skeleton_qos as shared_skeleton_qos
+from body_tracking.pipeline.shared import skeleton_input
+from body_tracking.pipeline.stage import Port
 from body_tracking.ros.backlog import Backlog, Sequences, Standstill
 from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.declare import declare
-from body_tracking.ros.main import run as run
+from body_tracking.ros.executor import BatchNode
 from body_tracking.ros.monitor import Monitor
-
-__all__ = ["BODY", "REFERENCE", "RELIABLE", "SENSORS", "WORLD_FRAME"]
+from body_tracking.ros.wire import ROS, WIRE
 
 RCLError: type[Exception] = _rclpy.RCLError
-ROS = RosMessages()
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _TICKS = 1000
 """Queue of simulated time, ticks: a busy node must still handle each message at the time at which it was sent."""
@@ -127,7 +121,7 @@ class Alarm:
         self.look()
 
 
-class GraphNode(Node):
+class GraphNode(BatchNode):
     """Base of the nodes.
 
     A node has a name and parameters, and overrides ``configure`` and ``start``. It subscribes by :meth:`subscribe`, so
@@ -350,14 +344,6 @@ class GraphNode(Node):
 
     # --- messages
 
-    def skeleton_qos(self) -> QoSProfile:
-        """The profile of skeleton topics, by the parameter ``reliable``."""
-        return to_profile(shared_skeleton_qos(self.values))
-
-    def result_qos(self) -> QoSProfile:
-        """The profile of results, by the parameter ``reliable``."""
-        return to_profile(shared_result_qos(self.values))
-
     def full_name(self, topic: str) -> str:
         """The full name of a topic of the graph, with this node's namespace and remappings."""
         return str(self.resolve_topic_name(names.relative(topic)))
@@ -399,22 +385,25 @@ class GraphNode(Node):
 
     def subscribe_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
         """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
-        name = self.full_name(topic)
+        name, port = self.full_name(topic), skeleton_input(topic, self.values)
 
         def convert(cdr: bytes, sent_ns: int) -> None:
             if self.is_stale(name, sent_ns):
                 return
-            skeletons = decode_skeletons(cdr) or cloud_to_skeletons(deserialized(cdr, PointCloud2))
+            skeletons: tuple[Skeleton, ...] = port.codec.decode(cdr, WIRE)
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
                 self.log_throttled("jump", f"{name}: time jumped back, resetting", period_s=1.0)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
-        qos = self.skeleton_qos()
-        qos.depth = max(qos.depth, FRAMES_KEPT)
-        subscription = self.subscribe(topic, PointCloud2, qos, convert, raw=True)
-        if not self.values["reliable"]:
-            self._droppable[subscription] = name
+        qos = replace(port.qos, depth=max(port.qos.depth, port.waiting))
+        return self.subscribe_port(port, qos, PointCloud2, convert)
+
+    def subscribe_port(self, port: Port, qos: Qos, kind: type[Any], handle: Callable[[Any, int], None]) -> Subscription:
+        """Subscribe to the CDR bytes of a port's topic; arguments as of :meth:`subscribe`."""
+        subscription = self.subscribe(port.topic, kind, to_profile(qos), handle, raw=True, absolute=port.absolute)
+        if port.droppable:
+            self._droppable[subscription] = self.full_name(port.topic)
         return subscription
 
     def is_stale(self, topic: str, sent_ns: int) -> bool:
@@ -555,11 +544,3 @@ class GraphNode(Node):
             for each in self.publishers
             if each.topic_name not in _EVERYWHERE
         }
-
-
-def deserialized(cdr: bytes, kind: type[Any]) -> Any:
-    """A message from CDR bytes; MessageError where they are not of this type."""
-    try:
-        return deserialize_message(cdr, kind)
-    except Exception as error:  # each RMW raises errors of its own
-        raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error

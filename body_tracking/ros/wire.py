@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
+from body_tracking.messages.base import MessageError, RosMessages
 from body_tracking.ros.bag_topics import message_class
-from body_tracking.ros.node import ROS, deserialized
+
+ROS = RosMessages()
+
+
+def deserialized(cdr: bytes, kind: type[Any]) -> Any:
+    """A message from CDR bytes; MessageError where they are not of this type."""
+    try:
+        return deserialize_message(cdr, kind)
+    except Exception as error:  # each RMW raises errors of its own
+        raise MessageError(f"{len(cdr)} bytes are no {kind.__name__}") from error
 
 
 class RosWire:

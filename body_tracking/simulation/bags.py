@@ -23,8 +23,9 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.kinect.simulated import KinectErrors, read_errors
 from body_tracking.kinematics.positional import positional_angles
+from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
-from body_tracking.messages.cdr import encode_angles, encode_skeletons
+from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
 from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
@@ -154,7 +155,8 @@ def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
         yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
         state = estimate_to_joint_state(first.estimate(k), MODEL, BAG_MESSAGES)
         yield log_ns, graph.TRUE_MODEL_STATE, serialize(state)
-        yield log_ns, graph.TRUE_ANGLES, encode_angles(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD)[0]
+        angles = angles_to_joint_state(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
+        yield log_ns, graph.TRUE_ANGLES, serialize(angles)
         if stamp_ns >= due_ns:
             due_ns += NANOSECONDS
             for sensor in recording.sensors[1:]:

@@ -22,9 +22,10 @@ from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
+from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
-from body_tracking.messages.cdr import encode_angles, encode_skeletons
+from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import Progress
@@ -105,8 +106,8 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
             tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
             truth = Skeleton(stamp_ns, WORLD, joints[-1], tracked)
             messages.append((log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])))
-            angles = encode_angles(positional_angles(truth), graph.DEFAULT_BODY, WORLD)[0]
-            messages.append((log_ns, graph.TRUE_ANGLES, angles))
+            angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
+            messages.append((log_ns, graph.TRUE_ANGLES, serialize(angles)))
             progress.at(index)
         messages += _skeletons(scene, np.array(joints))
         for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):

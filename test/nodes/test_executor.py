@@ -16,7 +16,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  #
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.executor import BatchNode, LeanExecutor  # noqa: E402
 from body_tracking.ros.node import STEADY  # noqa: E402
 from domains import domain  # noqa: E402
 
@@ -25,7 +25,7 @@ from domains import domain  # noqa: E402
 def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init(domain_id=domain())
-    yield rclpy.create_node("lean")
+    yield BatchNode("lean")
     rclpy.try_shutdown()
 
 

@@ -16,8 +16,10 @@ from sensor_msgs.msg import PointCloud2  # noqa: E402
 
 from body_tracking.core.skeleton import Skeleton  # noqa: E402
 from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
+from body_tracking.pipeline.shared import RELIABLE, skeleton_qos  # noqa: E402
+from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 from body_tracking.ros.executor import LeanExecutor  # noqa: E402
-from body_tracking.ros.node import RELIABLE, GraphNode  # noqa: E402
+from body_tracking.ros.node import GraphNode  # noqa: E402
 from domains import domain  # noqa: E402
 
 TOPICS = ("/kinect1/skeleton", "/kinect2/skeleton")
@@ -54,7 +56,9 @@ def test_slow_node_drops_old_frames_and_reports_them(slow: Slow) -> None:
     reports: list[Any] = []
     slow._diagnostics.publish = reports.append
     source = rclpy.create_node("source")
-    publishers = [source.create_publisher(PointCloud2, topic, slow.skeleton_qos()) for topic in TOPICS]
+    publishers = [
+        source.create_publisher(PointCloud2, topic, to_profile(skeleton_qos(slow.values))) for topic in TOPICS
+    ]
     executor = LeanExecutor(slow)
     thread = threading.Thread(target=executor.spin, daemon=True)
     thread.start()

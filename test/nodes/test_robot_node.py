@@ -30,14 +30,14 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray  # noqa: E402
 from body_tracking.kinematics.conventions import angles_of  # noqa: E402
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
+from body_tracking.messages.angles import angles_to_joint_states  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds, to_time  # noqa: E402
-from body_tracking.messages.cdr import encode_angles  # noqa: E402
 from body_tracking.messages.model import joint_state_to_model  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
-from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize  # noqa: E402
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.robot.follower import State  # noqa: E402
 from body_tracking.robot.mapping import RobotMapping, load  # noqa: E402
-from body_tracking.ros.node import ROS  # noqa: E402
+from body_tracking.ros.wire import ROS  # noqa: E402
 
 SENSOR = graph.skeleton_topic("kinect1")
 LATENCY_NS = 20_000_000
@@ -76,8 +76,9 @@ def write_angles(path: Path, seconds: float = np.inf) -> None:
             angles = angles_of(state_estimate(model, *state, covariance), model, "isb")
             for body in BODIES.values():
                 topics = (graph.joint_states_topic(body), graph.joint_states_stddev_topic(body))
-                for topic, cdr in zip(topics, encode_angles(angles, body, "isb"), strict=True):
-                    writer.write(topic, cdr, raw.log_time_ns + LATENCY_NS)
+                messages = angles_to_joint_states(angles, body, "isb", BAG_MESSAGES)
+                for topic, message in zip(topics, messages, strict=True):
+                    writer.write_message(topic, message, raw.log_time_ns + LATENCY_NS)
 
 
 @dataclass

@@ -28,7 +28,7 @@ from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.ros.executor import LeanExecutor  # noqa: E402
-from body_tracking.ros.node import ROS  # noqa: E402
+from body_tracking.ros.wire import ROS  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
