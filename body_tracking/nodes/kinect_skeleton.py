@@ -11,13 +11,14 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import Parameter
+from body_tracking.core.parameters import Parameter, fields_of
 from body_tracking.core.sources import RecordedFrame, check_sensor_name
 from body_tracking.kinect.live import SourceSettings, backends, described, open_source
 from body_tracking.kinect.ros_time import RosTime
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE, skeleton_qos
+from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.main import run
 from body_tracking.ros.node import GraphNode
 
@@ -73,24 +74,11 @@ class KinectSkeleton(GraphNode):
         self.failure = ""
         self.source_errors: dict[str, str] = {}
         sensor = check_sensor_name(given["sensor"])
-        settings = SourceSettings(
-            sensor,
-            given["device"],
-            given["file"],
-            given["recorded_sensor"],
-            given["rate"],
-            given["loop"],
-            given["start_time"],
-            given["address"],
-            given["port"],
-            given["key_file"],
-            given["least_delay"],
-        )
+        settings = SourceSettings(**fields_of(SourceSettings, given))
         self.ros_time = RosTime()
         self.source = open_source(given["backend"], settings)
-        self.output = self.make_publisher(
-            PointCloud2, graph.skeleton_topic(sensor), to_profile(skeleton_qos(self.values))
-        )
+        qos = to_profile(skeleton_qos(self.values))
+        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), qos)
         self.thread = threading.Thread(target=self.publish_frames, daemon=True)
         self.thread.start()
 

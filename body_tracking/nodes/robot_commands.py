@@ -84,11 +84,10 @@ class RobotCommands(GraphNode):
         output = self.mapping.output
         kind = JointTrajectory if output.kind == TRAJECTORY else Float64MultiArray
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
+        qos = to_profile(result_qos(self.values))
         angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
         for topic in angles:
-            self.subscribe(
-                topic, JointState, to_profile(result_qos(self.values)), partial(self.on_angles, self.full_name(topic))
-            )
+            self.subscribe(topic, JointState, qos, partial(self.on_angles, self.full_name(topic)))
         for sensor in self.sensors:
             self.subscribe_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
         self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)

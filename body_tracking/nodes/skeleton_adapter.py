@@ -57,9 +57,8 @@ class SkeletonAdapter(GraphNode):
         self.topic: str = self.resolve_topic_name(given["topic"])
         self.last_received: float | None = None
         self.ros_time = RosTime()
-        self.output = self.make_publisher(
-            PointCloud2, graph.skeleton_topic(sensor), to_profile(skeleton_qos(self.values))
-        )
+        qos = to_profile(skeleton_qos(self.values))
+        self.output = self.make_publisher(PointCloud2, graph.skeleton_topic(sensor), qos)
         self.subscribe(self.topic, MarkerArray, to_profile(SENSOR_DATA), self.on_markers, absolute=True)
 
     def on_markers(self, message: Any, sent_ns: int) -> None:
