@@ -146,7 +146,8 @@ def of_posture(run: Run, name: str) -> dict[str, float]:
     without, parameters = POSTURE[name]
     with tempfile.TemporaryDirectory() as folder, without():
         write_bag(run.recording(), Path(folder) / "in")
-        settings = ReplaySettings((), filter_name="ekf", filter_parameters=parameters)
+        values = {f"ekf.{name}": value for name, value in parameters.items()}
+        settings = ReplaySettings((), filter_name="ekf", parameters={"skeleton_filter": values})
         replay(Path(folder) / "in", Path(folder) / "out", settings)
         tracked = read(Path(folder) / "out")
     figures: dict[str, float] = {}

@@ -39,7 +39,7 @@ from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
 from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.node_parameters import parameters_for  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
-from body_tracking.pipeline.people import ALL, PeopleParameters  # noqa: E402
+from body_tracking.pipeline.people import ALL  # noqa: E402
 from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
@@ -275,7 +275,7 @@ def two_people(folder: Path) -> tuple[Path, Path]:
 
 def test_two_people_have_angles_of_their_own_the_same_live_and_offline(up: Callable[..., Up], tmp_path: Path) -> None:
     bag, calibration = two_people(tmp_path)
-    replay(bag, tmp_path / "offline", patient(calibration_file=calibration, people=PeopleParameters(ALL, 3)))
+    replay(bag, tmp_path / "offline", patient(calibration_file=calibration, more={"subject": ALL, "people": 3}))
     arguments = ("--bag", bag, "--subject", "all", "--people", "3")
     topics = [graph.joint_states_topic(body) for body in ("body1", "body2")]
     live = live_as_offline(up, tmp_path, arguments, tmp_path / "offline", topics, calibration)

@@ -18,7 +18,7 @@ from body_tracking.evaluation.pictures import LEGEND, angle_picture, pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.evaluation.report import as_json, facts, page, text, write
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 
 

@@ -98,7 +98,9 @@ class NtuRecording:
             raise NtuError(f"{self.path}, line 1: no number of frames") from None
         for index in range(n_frames):
             try:
-                skeletons = self._frame(index, numbers, counts)
+                stamp_ns = round(index * NANOSECONDS / FRAME_RATE)
+                n_bodies = self._count("number of bodies")
+                skeletons = tuple(self._body(stamp_ns, numbers, counts) for _ in range(n_bodies))
             except _CutOff:
                 text = f"{self.path}: cut off after {index} of {n_frames} frames"
                 if not self._partial:
@@ -137,11 +139,6 @@ class NtuRecording:
             raise self._error(f"{what}: {text.strip()!r}, expected a whole number")
         return number
 
-    def _frame(self, index: int, numbers: dict[str, int], counts: Counter[str]) -> tuple[Skeleton, ...]:
-        n_bodies = self._count("number of bodies")
-        stamp_ns = round(index * NANOSECONDS / FRAME_RATE)
-        return tuple(self._body(stamp_ns, numbers, counts) for _ in range(n_bodies))
-
     def _body(self, stamp_ns: int, numbers: dict[str, int], counts: Counter[str]) -> Skeleton:
         values = self._take().split()
         if len(values) != _BODY_VALUES:
@@ -151,33 +148,21 @@ class NtuRecording:
         n_joints = self._count("number of joints")
         if n_joints != N_JOINTS:
             raise self._error(f"{n_joints} joints, expected {N_JOINTS}")
-        rows = []
-        for _ in range(N_JOINTS):
-            row = self._take().split()
-            if len(row) != _JOINT_VALUES:
-                raise self._error(f"{len(row)} values of a joint, expected {_JOINT_VALUES}")
-            rows.append(row)
-        try:
-            joints: FloatArray = np.array(rows, dtype=np.float64)
-        except ValueError:
-            self._next -= N_JOINTS
-            for row in rows:
-                self._next += 1
-                for cell in row:
-                    try:
-                        float(cell)
-                    except ValueError:
-                        raise self._error(f"{cell!r} is not a number") from None
-            raise
-        states = joints[:, _STATE]
-        wrong = np.flatnonzero(np.isin(states, [state.value for state in TrackingState], invert=True))
-        if wrong.size:
-            joint = int(wrong[0])
-            self._next -= N_JOINTS - 1 - joint
-            raise self._error(f"tracking state {rows[joint][_STATE]}, expected 0, 1 or 2")
-        positions = joints[:, :3]
-        lost: BoolArray = np.asarray(~np.isfinite(positions).all(axis=1))
+        joints: FloatArray = np.array([self._joint() for _ in range(N_JOINTS)])
+        lost: BoolArray = np.asarray(~np.isfinite(joints[:, :3]).all(axis=1))
         counts[NOT_FINITE] += int(lost.sum())
-        positions = camera_space_to_optical(np.where(lost[:, None], np.nan, positions))
-        kept = np.where(lost, TrackingState.NOT_TRACKED, states).astype(np.uint8)
-        return Skeleton(stamp_ns, optical_frame(self.sensor), positions, kept, number)
+        positions = camera_space_to_optical(np.where(lost[:, None], np.nan, joints[:, :3]))
+        states = np.where(lost, TrackingState.NOT_TRACKED, joints[:, _STATE]).astype(np.uint8)
+        return Skeleton(stamp_ns, optical_frame(self.sensor), positions, states, number)
+
+    def _joint(self) -> list[float]:
+        row = self._take().split()
+        if len(row) != _JOINT_VALUES:
+            raise self._error(f"{len(row)} values of a joint, expected {_JOINT_VALUES}")
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError as error:
+            raise self._error(f"not a number ({error})") from None
+        if values[_STATE] not in tuple(TrackingState):
+            raise self._error(f"tracking state {row[_STATE]}, expected 0, 1 or 2")
+        return values

@@ -14,10 +14,13 @@ import numpy as np
 from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import save, to_dict
-from body_tracking.core.parameters import Value
+from body_tracking.core.parameters import fields_of
 from body_tracking.core.sensor_poses import CalibrationResult
-from body_tracking.recording.replay import Progress, parameters_for, sensor_topics, skeletons_of
+from body_tracking.node_parameters import parameters_for
+from body_tracking.recording.progress import Progress
+from body_tracking.recording.replay import sensor_topics, skeletons_of
 from body_tracking.recording.rig import RigReader
+from body_tracking.systems import all_nodes_for, nodes_for, options_of
 
 HISTORY_S = 600.0
 """Raw frames kept, seconds: a recording up to this long is interpolated again with the final clock."""
@@ -107,15 +110,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    own: dict[str, Value] = {
-        "use_sim_time": False,
-        "reliable": False,
-        "world_frame": "",
-        "sensors": (),
-        "reference": "",
-        "calibration_file": "",
-    }
-    parameters, _ = parameters_for("calibration", CalibrationParameters, args.params_file, own)
+    options = options_of()
+    spec = next(spec for spec in nodes_for(options) if spec.name == "calibration")
+    values = parameters_for([spec], args.params_file, absent=all_nodes_for(options))["calibration"]
+    parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
     if args.method:
         parameters = replace(parameters, method=args.method)
     sensors = tuple(args.sensors.split(",")) if args.sensors else ()

@@ -12,9 +12,8 @@ import argparse
 import heapq
 import json
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,6 +43,7 @@ from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 
 CSV_SUFFIXES = (".csv", ".csv.gz")
@@ -60,21 +60,26 @@ class ImportFileError(BodyTrackingError):
     """Raised when files cannot be imported, or not together."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ImportedSensor:
     """The imported messages of one sensor, or of ``markers`` for points.
 
     Attributes:
         frames: number of messages.
         bodies: the most bodies in one frame; 0 for an inertial sensor and for points.
-        seconds: from the first to the last receipt.
-        topics: of the messages.
+        start_ns, end_ns: first and last receipt.
+        topics: of the messages, in the order of their first ones.
     """
 
-    frames: int
-    bodies: int
-    seconds: float
-    topics: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    frames: int = 0
+    bodies: int = 0
+    topics: dict[str, None] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        return (self.end_ns - self.start_ns) / NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,44 +107,12 @@ class ImportReport:
 
     def as_json(self) -> str:
         """One JSON object."""
-        return json.dumps(
-            {
-                "bag": str(self.bag),
-                "frames": self.frames,
-                "recording_s": self.seconds,
-                "sensors": {
-                    name: {
-                        "frames": sensor.frames,
-                        "bodies": sensor.bodies,
-                        "seconds": sensor.seconds,
-                        "topics": list(sensor.topics),
-                    }
-                    for name, sensor in self.sensors.items()
-                },
-                "problems": self.problems,
-                "warnings": self.warnings,
-            },
-            indent=2,
-        )
-
-
-@dataclass(slots=True)
-class _Tally:
-    frames: int = 0
-    bodies: int = 0
-    times_ns: list[int] = field(default_factory=list)
-    topics: dict[str, None] = field(default_factory=dict)
-
-    def add(self, item: RecordedFrame | RecordedImu | RecordedPoints, topics: Iterable[str]) -> None:
-        self.frames += 1
-        self.bodies = max(self.bodies, len(item.skeletons) if isinstance(item, RecordedFrame) else 0)
-        self.topics |= dict.fromkeys(topics)
-        times = (*self.times_ns, item.received_ns)
-        self.times_ns = [min(times), max(times)]
-
-    @property
-    def seconds(self) -> float:
-        return (self.times_ns[1] - self.times_ns[0]) / NANOSECONDS if self.times_ns else 0.0
+        sensors = {
+            name: {"frames": each.frames, "bodies": each.bodies, "seconds": each.seconds, "topics": list(each.topics)}
+            for name, each in self.sensors.items()
+        }
+        report = {"bag": str(self.bag), "frames": self.frames, "recording_s": self.seconds, "sensors": sensors}
+        return json.dumps({**report, "problems": self.problems, "warnings": self.warnings}, indent=2)
 
 
 def open_recording(path: Path, sensor: str | None = None, partial: bool = False) -> Recording:
@@ -191,7 +164,6 @@ def import_files(
     noise: float = DEFAULT_NOISE,
     overwrite: bool = False,
     partial: bool = False,
-    progress: bool = False,
 ) -> ImportReport:
     """Import recordings into one bag, merged in time order.
 
@@ -204,7 +176,6 @@ def import_files(
         noise: standard deviation of each coordinate of these points, metres.
         overwrite: replace an existing bag.
         partial: import truncated files up to their last whole frame.
-        progress: show progress on stderr.
 
     Raises:
         BodyTrackingError: an invalid file, two files with the same sensor, or the bag cannot be written. The incomplete
@@ -221,7 +192,7 @@ def import_files(
         _open_any(path, name, partial, labels, noise)
         for path, name in zip(files, _names(files, sensors or {}), strict=True)
     ]
-    tallies: dict[str, _Tally] = {}
+    found: dict[str, ImportedSensor] = {}
     owners: dict[str, Path] = {}
     # Read all files before an existing bag is replaced: an invalid file must not destroy it.
     if overwrite and bag.exists():
@@ -230,7 +201,7 @@ def import_files(
                 pass
     writer = BagWriter(bag, overwrite=overwrite, flush_interval_s=float("inf"))
     try:
-        shown = _Progress(recordings) if progress else None
+        progress = Progress(0.0, len(recordings))
         streams = [_ordered(recording, number) for number, recording in enumerate(recordings)]
         topics: set[str] = set()
         for _, number, item in heapq.merge(*streams, key=lambda item: item[:2]):
@@ -245,12 +216,15 @@ def import_files(
                     topics.add(topic)
                 writer.write_message(topic, message, item.received_ns)
             if not isinstance(item, RecordedAngles):
-                tallies.setdefault(item.sensor, _Tally()).add(item, [topic for topic, *_ in messages])
-            if shown is not None:
-                shown.update()
-        if shown is not None:
-            shown.end()
-        if not tallies:
+                at_ns = item.received_ns
+                sensor = found.setdefault(item.sensor, ImportedSensor(at_ns, at_ns))
+                sensor.start_ns, sensor.end_ns = min(sensor.start_ns, at_ns), max(sensor.end_ns, at_ns)
+                sensor.frames += 1
+                sensor.bodies = max(sensor.bodies, len(item.skeletons) if isinstance(item, RecordedFrame) else 0)
+                sensor.topics |= dict.fromkeys(topic for topic, *_ in messages)
+            progress.at(sum(recording.progress for recording in recordings))
+        progress.end()
+        if not found:
             raise ImportFileError(
                 f"{', '.join(map(str, files))}: no body in any frame, no inertial reading and no point"
             )
@@ -258,19 +232,13 @@ def import_files(
     except BaseException:
         writer.discard()
         raise
-    problems: Counter[str] = Counter()
-    for recording in recordings:
-        problems.update(recording.problems)
-    times = [value for tally in tallies.values() for value in tally.times_ns]
+    start_ns, end_ns = min(each.start_ns for each in found.values()), max(each.end_ns for each in found.values())
     return ImportReport(
-        bag=bag,
-        sensors={
-            name: ImportedSensor(tally.frames, tally.bodies, tally.seconds, tuple(tally.topics))
-            for name, tally in sorted(tallies.items())
-        },
-        seconds=(max(times) - min(times)) / NANOSECONDS,
-        problems=dict(problems),
-        warnings=[warning for recording in recordings for warning in recording.warnings],
+        bag,
+        dict(sorted(found.items())),
+        (end_ns - start_ns) / NANOSECONDS,
+        dict(sum((Counter(recording.problems) for recording in recordings), Counter())),
+        [warning for recording in recordings for warning in recording.warnings],
     )
 
 
@@ -319,27 +287,6 @@ def _ordered(recording: _Recording, number: int) -> Iterator[tuple[int, int, _It
     for item in recording:
         latest = max(latest, item.received_ns)
         yield latest, number, item
-
-
-class _Progress:
-    """A percentage on stderr, if that is a terminal and the import takes more than a second."""
-
-    def __init__(self, recordings: Sequence[_Recording]) -> None:
-        self._recordings = recordings
-        self._due_s = time.monotonic() + 1.0
-        self._shown = False
-
-    def update(self) -> None:
-        if time.monotonic() < self._due_s or not sys.stderr.isatty():
-            return
-        self._due_s = time.monotonic() + 0.2
-        self._shown = True
-        done = sum(recording.progress for recording in self._recordings) / len(self._recordings)
-        print(f"\rimporting {done:5.1%}", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        if self._shown:
-            print("\r                 \r", end="", file=sys.stderr, flush=True)
 
 
 # --- command line
@@ -396,7 +343,6 @@ def run(args: argparse.Namespace) -> int:
         noise=args.noise,
         overwrite=args.overwrite,
         partial=args.partial,
-        progress=True,
     )
     if args.json:
         print(report.as_json())

@@ -42,7 +42,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import load
 from body_tracking.recording import marker_wand
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
 

@@ -30,7 +30,7 @@ from body_tracking.markers.rig_storage import load_rig, save_rig
 from body_tracking.markers.stages import DetectorStage
 from body_tracking.markers.wand import Wand, WandCalibration, calibrate_wand, centred
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE
 

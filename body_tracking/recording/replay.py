@@ -13,26 +13,24 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final
 
-from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.calibration.storage import load
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import POINT_CLOUD
-from body_tracking.core.parameters import Parameter, Value, check_all, fields_of, matches, parameters_from, read_file
+from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
-from body_tracking.filters import DEFAULT_FILTER, parameter_prefix
-from body_tracking.fusion.fusion import FusionParameters
-from body_tracking.inertial.parameters import TrackingParameters
+from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.messages.skeletons import cloud_to_skeletons
-from body_tracking.node_parameters import parameters_for as parameters_of_nodes
+from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.pipeline.people import PeopleParameters, SubjectSelector
+from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage, deserialize
 from body_tracking.systems import (
@@ -47,11 +45,13 @@ from body_tracking.systems import (
     with_file,
 )
 
-_P = TypeVar("_P")
-
 
 class ReplayError(BodyTrackingError):
     """Raised when the bag lacks the input of the graph."""
+
+
+OFFLINE: Final[Mapping[str, Value]] = {"deadline": 1.0}
+"""Limits of the time that a live graph has, seconds: offline they would make the results depend on the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +64,9 @@ class ReplaySettings:
         reference: or empty.
         filter_name: one of the filters.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
-        filter_input, angles_input: as the parameters ``input`` of ``skeleton_filter`` and ``joint_angles``.
         calibration_file: start from this calibration; None for none.
         imus: segments with inertial sensors, as the parameter ``segments`` of ``imu_skeleton`` lists them.
-        marker_setup, marker_points: the options of these names: folder of infrared markers, topic of their points.
-        depth, person: the options of these names: depth cameras, file of the person's body.
-        played: topics of the bag that take the place of sensors.
-        people: whom to track.
-        calibration, fusion, tracking: parameters of the calibration, the fusion and the inertial sensors.
-        filter_parameters: parameters of the filter, without its prefix.
+        more: further options of the graph, by name.
         parameters: further parameters by node; they override all of the above.
         model_covariance: also write the covariance of the filter's model.
     """
@@ -81,40 +75,23 @@ class ReplaySettings:
     reference: str = ""
     filter_name: str = DEFAULT_FILTER
     convention: str = graph.AUTO
-    filter_input: str = graph.AUTO
-    angles_input: str = graph.AUTO
     calibration_file: Path | None = None
     imus: tuple[str, ...] = ()
-    marker_setup: str = ""
-    marker_points: str = ""
-    depth: tuple[str, ...] = ()
-    person: str = ""
-    played: tuple[str, ...] = ()
-    people: PeopleParameters = field(default_factory=PeopleParameters)
-    calibration: CalibrationParameters = field(default_factory=CalibrationParameters)
-    fusion: FusionParameters = field(default_factory=FusionParameters)
-    tracking: TrackingParameters = field(default_factory=TrackingParameters)
-    filter_parameters: Mapping[str, Any] = field(default_factory=dict)
+    more: Mapping[str, Value] = field(default_factory=dict)
     parameters: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     model_covariance: bool = False
 
     def options(self) -> Options:
         """Options of the graph."""
-        return options_of(
-            sensors=self.sensors or (() if self.marker_setup or self.depth else graph.DEFAULT_SENSORS),
-            filter=self.filter_name,
-            filter_input=self.filter_input,
-            convention=self.convention,
-            angles_input=self.angles_input,
-            imus=self.imus,
-            marker_setup=self.marker_setup,
-            marker_points=self.marker_points,
-            depth=self.depth,
-            person=self.person,
-            played=self.played,
-            calibration="" if self.calibration_file is None else str(self.calibration_file),
-            external=True,
-        )
+        given: dict[str, Value] = {
+            "sensors": self.sensors or (() if self.more.get("marker_setup") or self.more.get("depth") else graph.DEFAULT_SENSORS),
+            "filter": self.filter_name,
+            "convention": self.convention,
+            "imus": self.imus,
+            "calibration": "" if self.calibration_file is None else str(self.calibration_file),
+            "external": True,
+        }
+        return options_of(**given, **self.more)
 
     def values(self) -> dict[str, dict[str, Value]]:
         """All parameters of each stage, by its name.
@@ -122,29 +99,14 @@ class ReplaySettings:
         Raises:
             BodyTrackingError: inconsistent settings.
         """
-        specs = sorted(
-            (spec for spec in nodes_for(self.options()) if spec.name in STAGES),
-            key=lambda spec: STAGES.index(spec.name),
-        )
-        prefix = parameter_prefix(self.filter_name)
-        people = asdict(self.people)
-        own: dict[str, dict[str, Any]] = {
-            "calibration": asdict(self.calibration),
-            "fusion": {**asdict(self.fusion), **people},
-            "imu_skeleton": {**asdict(self.tracking), "subject": self.people.subject},
-            "skeleton_filter": {f"{prefix}{name}": each for name, each in self.filter_parameters.items()} | people,
-            # of the time that a live graph has: here it would make the results depend on the machine
-            "rigid_body_tracker": {"deadline": 1.0},
-            "joint_angles": {"subject": self.people.subject, "people": self.people.people},
-        }
-        found = {}
-        for spec in specs:
-            given = {**spec.defaults, **own.get(spec.name, {}), **spec.parameters, "reference": self.reference}
-            given |= self.parameters.get(spec.name, {})
-            table = stage_class(spec.name).PARAMETERS
+        specs = {spec.name: spec for spec in nodes_for(self.options())}
+        found: dict[str, dict[str, Value]] = {}
+        for name in (stage for stage in STAGES if stage in specs):
+            own, table = self.parameters.get(name, {}), stage_class(name).PARAMETERS
+            given = {**specs[name].defaults, **OFFLINE, **specs[name].parameters, "reference": self.reference, **own}
             known = {item.name for item in table}
-            checked = check_all(table, {name: each for name, each in given.items() if name in known})
-            found[spec.name] = {**own.get(spec.name, {}), **checked}
+            checked = check_all(table, {key: value for key, value in given.items() if key in known})
+            found[name] = {**own, **checked}
         return found
 
 
@@ -245,27 +207,6 @@ def skeletons_of(
         yield sensor, subject, raw.log_time_ns, raw.cdr
 
 
-class Progress:
-    """A percentage on stderr, where that is a terminal."""
-
-    def __init__(self, start_ns: int, end_ns: int) -> None:
-        self._start, self._length = start_ns, max(1, end_ns - start_ns)
-        self._shown = -1
-        self._on = sys.stderr.isatty()
-
-    def at(self, log_time_ns: int) -> None:
-        """Update the percentage."""
-        percent = min(100, 100 * (log_time_ns - self._start) // self._length)
-        if self._on and percent != self._shown:
-            self._shown = percent
-            print(f"\r{percent:3d} %", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Clear the line."""
-        if self._on:
-            print("\r     \r", end="", file=sys.stderr, flush=True)
-
-
 def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bool = False) -> ReplayReport:
     """Run the graph over a bag and write its output, with the sensors' messages and the ground truth.
 
@@ -287,10 +228,10 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
         try:
-            settings = replace(settings, played=played(settings.options(), bag.topics))
+            sources = played(settings.options(), bag.topics)
         except graph.GraphError as error:
             raise ReplayError(f"{bag_path}: {error}") from error
-        kept = tuple(dict.fromkeys((*topics, *truth, *settings.played)))
+        kept = tuple(dict.fromkeys((*topics, *truth, *sources)))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         if settings.calibration_file is not None:
             load(settings.calibration_file)  # raises if it is missing or invalid
@@ -309,7 +250,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             for raw in bag.messages(kept):
                 if raw.topic in topics and frames.skeletons(raw) is None:
                     continue
-                if not started and raw.topic in (topics or settings.played):
+                if not started and raw.topic in (topics or sources):
                     started = True
                     runner.start(raw.log_time_ns)
                 downstream.take(raw.topic, raw.cdr, raw.log_time_ns)
@@ -323,8 +264,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         progress.end()
         counters.update(runner.counters)
         if not written.frames:
-            sources = ", ".join(settings.sensors or settings.played)
-            raise ReplayError(f"{bag_path}: no frame of {sources} came through ({_listed(counters)})")
+            given = ", ".join(settings.sensors or sources)
+            raise ReplayError(f"{bag_path}: no frame of {given} came through ({_listed(counters)})")
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters.update(written.counters)
@@ -344,10 +285,11 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
         ReplayError: none are wanted, and nothing else is.
     """
     if settings.sensors == (graph.NO_SENSORS,):
-        if not (settings.marker_setup or settings.depth):
+        if not (settings.more.get("marker_setup") or settings.more.get("depth")):
             raise ReplayError(f"{bag.path}: sensors none, and neither a marker setup nor a depth camera")
         return True
-    other = settings.depth or (settings.marker_setup and not graph.sensors_among(bag.topics))
+    more = settings.more
+    other = more.get("depth") or (more.get("marker_setup") and not graph.sensors_among(bag.topics))
     return bool(other) and not settings.sensors
 
 
@@ -358,76 +300,34 @@ def _listed(counters: Mapping[str, int]) -> str:
 # --- the command
 
 
-def parameters_for(
-    node: str, parameter_class: type[_P], file: Path | None, own: Mapping[str, Value]
-) -> tuple[_P, dict[str, object]]:
-    """A node's parameters from a parameters file.
-
-    Args:
-        node: its name, such as ``fusion``.
-        parameter_class: the dataclass of its parameters.
-        file: a ROS parameters file, or None.
-        own: names and defaults of the node's parameters that are not in the class.
-
-    Returns:
-        The parameters, and the values of ``own`` in the file.
-
-    Raises:
-        ParameterError: an invalid file, a value of the wrong type or out of range, an unknown name.
-    """
-    checked, others = values_for(node, parameters_from(parameter_class), file, own)
-    return parameter_class(**fields_of(parameter_class, checked)), others
-
-
-def values_for(
-    node: str, table: Sequence[Parameter], file: Path | None, own: Mapping[str, Value]
-) -> tuple[dict[str, Value], dict[str, object]]:
-    """As :func:`parameters_for`, for a table of parameters."""
-    given: dict[str, object] = {}
-    for pattern, values in read_file(file).items() if file is not None else ():
-        if matches(pattern, f"/{node}"):
-            given |= values
-    others = {name: value for name, value in given.items() if name in own}
-    return check_all(table, {name: value for name, value in given.items() if name not in own}), others
-
-
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings of a command line."""
-    chosen = with_file(options_of(**{**options_from(args), "external": True}), args.params_file)
-    specs = [spec for spec in nodes_for(chosen) if spec.name in STAGES]
-    given = parameters_of_nodes(specs, args.params_file, absent=all_nodes_for(chosen))
-    left = ("use_sim_time", "sensors", "calibration_file", "deadline")
+    options: dict[str, Any] = {**with_file(options_of(**{**options_from(args), "external": True}), args.params_file)}
+    specs = [spec for spec in nodes_for(options) if spec.name in STAGES]
+    left = ("use_sim_time", "sensors", "calibration_file", *OFFLINE)
     parameters = {
-        node: {name: value for name, value in values.items() if name not in left} for node, values in given.items()
+        node: {name: value for name, value in values.items() if name not in left}
+        for node, values in parameters_for(specs, args.params_file, absent=all_nodes_for(options)).items()
     }
-    whom = given.get("skeleton_filter", {})
-    people = {name: whom[name] for name in ("subject", "people") if name in whom}
     for node in parameters.keys() & {"skeleton_filter", "joint_angles"}:
         parameters[node]["body"] = args.body
     if args.reference:
         for values in parameters.values():
             values["reference"] = args.reference
-    options: dict[str, Any] = dict(chosen)
     sensors: tuple[str, ...] = ()
     if args.sensors:
         sensors = tuple(each for each in options["sensors"] if each not in options["computed"]) or (graph.NO_SENSORS,)
+    more = ("filter_input", "angles_input", "marker_setup", "marker_points", "depth", "person", "subject", "people")
     return ReplaySettings(
         sensors,
         args.reference or "",
         options["filter"] or DEFAULT_FILTER,
         options["convention"] or graph.AUTO,
-        options["filter_input"] or graph.AUTO,
-        options["angles_input"] or graph.AUTO,
         args.calibration,
         options["imus"],
-        options["marker_setup"],
-        options["marker_points"],
-        options["depth"],
-        options["person"],
-        (),
-        PeopleParameters(**people),  # type: ignore[arg-type]
-        parameters=parameters,
-        model_covariance=args.model_covariance,
+        {name: options[name] for name in more},
+        parameters,
+        args.model_covariance,
     )
 
 
@@ -469,20 +369,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     report = replay(args.bag, args.output, settings_from(args), overwrite=args.overwrite)
     if args.json:
-        print(
-            json.dumps(
-                {
-                    "bag": str(args.bag),
-                    "output": str(args.output),
-                    "frames": report.frames,
-                    "recording_s": report.recording_s,
-                    "elapsed_s": report.elapsed_s,
-                    "counters": dict(report.counters),
-                    "warnings": list(report.warnings),
-                },
-                indent=2,
-            )
-        )
+        print(json.dumps({"bag": str(args.bag), "output": str(args.output), **asdict(report)}, indent=2))
         return 0
     for warning in report.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -29,7 +29,7 @@ from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
 from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
 from body_tracking.simulation import depth_bags, marker_bags
 from body_tracking.simulation.layouts import Layout, around, layout

