@@ -191,12 +191,11 @@ def test_invalid_model_state_is_refused(field: str, value: object, said: str) ->
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
-        ("height", 32, "covariance of 32 x 32"),
-        ("width", 31, "expected 64 x 32 float32"),
-        ("step", 64, "with 64 bytes a row"),
+        ("height", 32, "32 x 32 pixels of 32FC1"),
+        ("width", 31, "covariance of 64 x 31, expected 64 x 32"),
+        ("step", 64, "64 bytes a row"),
         ("data", np.zeros(100, np.uint8), "100 in all"),
-        ("encoding", "64FC1", "encoding '64FC1', expected 32FC1"),
-        ("is_bigendian", 1, "big-endian"),
+        ("encoding", "64FC1", "encoding '64FC1', expected one of 32FC1"),
         ("data", np.full(64 * 32, np.nan, "<f4").view(np.uint8), "a covariance is NaN"),
         ("data", np.full(64 * 32, -1.0, "<f4").view(np.uint8), "a variance is negative"),
     ],

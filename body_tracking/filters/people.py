@@ -16,7 +16,7 @@ from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters.person import FilterSettings, PersonFilter
 from body_tracking.fusion.people import People
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, HeldSubject
+from body_tracking.pipeline.people import ALL, SubjectSelector
 from body_tracking.pipeline.stage import Port
 
 _AWAY = NANOSECONDS
@@ -42,7 +42,7 @@ class PeopleFilter:
         self._publish = publish
         self._filtered: list[Skeleton] = []
         self._last_ns: dict[int, int] = {}
-        self._wearer = HeldSubject(settings.people.hold)
+        self._wearer = SubjectSelector(settings.people.hold)
         self.people: People | None = None
         if first.alignment is not None:
             self.people = People(settings.sensors, settings.people, first.alignment.reference, self._gone)

@@ -15,7 +15,7 @@ from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.tracking import InertialTracker
 from body_tracking.messages.codecs import Field, Orientation, Reading, Skeletons
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, HOLD, PEOPLE, HeldSubject, SubjectSelector
+from body_tracking.pipeline.people import ALL, HOLD, PEOPLE, SubjectSelector
 from body_tracking.pipeline.shared import (
     REFERENCE,
     RELIABLE,
@@ -75,7 +75,7 @@ class ImuStage(Stage):
         self._fields: dict[str, tuple[int, FloatArray]] = {}
         self._refused: Counter[str] = Counter()
         # of several people, the one nearest to the reference sensor is the wearer
-        self._wearer = HeldSubject(HOLD) if values["subject"] == ALL else SubjectSelector()
+        self._wearer = SubjectSelector(HOLD if values["subject"] == ALL else 0.0)
         reference = str(values["reference"]) or next(iter(names_in(values["sensors"])), "")
         self._reference = graph.skeleton_topic(reference) if reference else ""
         qos = skeleton_qos(values)

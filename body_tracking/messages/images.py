@@ -34,12 +34,18 @@ def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
     if channels is None:
         stamp_ns, _, pixels = image_to_array(message)
         return stamp_ns, pixels, False
-    height, width, step, size = int(message.height), int(message.width), int(message.step), len(message.data)
-    if not 0 < height * width <= MAX_PIXELS or step < width * channels or size != step * height:
-        raise MessageError(f"{width} x {height} pixels of {message.encoding}, {step} bytes a row and {size} in all")
-    rows = np.frombuffer(memoryview(message.data), np.uint8).reshape(height, step)[:, : width * channels]
-    total = rows.reshape(height, width, channels)[..., :3].sum(axis=2, dtype=np.uint16)
+    rows = _rows(message, channels)
+    total = rows.reshape(len(rows), -1, channels)[..., :3].sum(axis=2, dtype=np.uint16)
     return to_nanoseconds(message.header.stamp), ((total + 1) // 3).astype(np.uint8), True
+
+
+def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
+    """(height, width * pixel_bytes) bytes of the pixels; MessageError where sizes contradict each other."""
+    height, width, step, size = int(message.height), int(message.width), int(message.step), len(message.data)
+    if not 0 < height * width <= MAX_PIXELS or step < width * pixel_bytes or size != step * height:
+        what = f"{width} x {height} pixels of {message.encoding}"
+        raise MessageError(f"{what}, {step} bytes a row and {size} in all")
+    return np.frombuffer(memoryview(message.data), np.uint8).reshape(height, step)[:, : width * pixel_bytes]
 
 
 def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> tuple[int, str, NDArray[Any]]:
@@ -52,15 +58,11 @@ def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> t
     Raises:
         MessageError: another encoding, as of a colour image; sizes that contradict each other.
     """
-    encoding, height, width = str(message.encoding), int(message.height), int(message.width)
+    encoding = str(message.encoding)
     if encoding not in encodings:
         raise MessageError(f"encoding {encoding!r}, expected one of {', '.join(encodings)}")
     kind = np.dtype(encodings[encoding]).newbyteorder(">" if message.is_bigendian else "<")
-    step, size = int(message.step), len(message.data)
-    if not 0 < height * width <= MAX_PIXELS or step < width * kind.itemsize or size != step * height:
-        raise MessageError(f"{width} x {height} pixels of {encoding}, {step} bytes a row and {size} in all")
-    rows = np.frombuffer(memoryview(message.data), np.uint8).reshape(height, step)[:, : width * kind.itemsize]
-    pixels = np.ascontiguousarray(rows).view(kind)
+    pixels = np.ascontiguousarray(_rows(message, kind.itemsize)).view(kind)
     return to_nanoseconds(message.header.stamp), str(message.header.frame_id), pixels.astype(kind.newbyteorder("="))
 
 

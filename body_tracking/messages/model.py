@@ -9,9 +9,10 @@ import numpy as np
 
 from body_tracking.core.body_model import BodyModel
 from body_tracking.core.estimate import ModelEstimate
-from body_tracking.core.message_types import IMAGE, JOINT_STATE, SEGMENTS
+from body_tracking.core.message_types import JOINT_STATE, SEGMENTS
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_transform
+from body_tracking.messages.images import array_to_image, image_to_array
 
 
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
@@ -102,16 +103,7 @@ def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:
     """``sensor_msgs/Image`` of 2 nv rows of nv: the covariance of the coordinates, then that of the rates."""
     nv = len(estimate.velocity)
     rows = np.concatenate([estimate.covariance[:nv, :nv], estimate.covariance[nv:, nv:]]).astype("<f4")
-    return types.make(
-        IMAGE,
-        header=to_header(estimate.stamp_ns, estimate.frame_id, types),
-        height=rows.shape[0],
-        width=rows.shape[1],
-        encoding=COVARIANCE_ENCODING,
-        is_bigendian=0,
-        step=4 * rows.shape[1],
-        data=types.octets(rows.tobytes()),
-    )
+    return array_to_image(rows, estimate.stamp_ns, estimate.frame_id, types, COVARIANCE_ENCODING)
 
 
 def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray]:
@@ -120,23 +112,19 @@ def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray
     The cross covariance of coordinates and rates is not in the message, and zero here.
 
     Raises:
-        MessageError: another encoding or size, big-endian numbers, a NaN, a negative variance.
+        MessageError: another encoding or size, a NaN, a negative variance.
     """
-    height, width, nv = int(message.height), int(message.width), model.nv
-    if str(message.encoding) != COVARIANCE_ENCODING or message.is_bigendian:
-        order = "big-endian " if message.is_bigendian else ""
-        raise MessageError(f"{order}encoding {str(message.encoding)!r}, expected {COVARIANCE_ENCODING}")
-    if (height, width, int(message.step)) != (2 * nv, nv, 4 * nv) or len(message.data) != 8 * nv * nv:
-        size = f"{height} x {width} with {message.step} bytes a row and {len(message.data)} in all"
-        raise MessageError(f"covariance of {size}, expected {2 * nv} x {nv} float32")
-    rows = np.frombuffer(memoryview(message.data), "<f4").reshape(2 * nv, nv).astype(np.float64)
+    nv = model.nv
+    stamp_ns, _, rows = image_to_array(message, {COVARIANCE_ENCODING: "f4"})
+    if rows.shape != (2 * nv, nv):
+        raise MessageError(f"covariance of {rows.shape[0]} x {rows.shape[1]}, expected {2 * nv} x {nv}")
     covariance = np.zeros((2 * nv, 2 * nv))
     covariance[:nv, :nv], covariance[nv:, nv:] = rows[:nv], rows[nv:]
     if np.isnan(covariance).any():
         raise MessageError("a covariance is NaN")
     if (covariance.diagonal() < 0.0).any():
         raise MessageError("a variance is negative")
-    return to_nanoseconds(message.header.stamp), covariance
+    return stamp_ns, covariance
 
 
 def segments_to_joint_state(

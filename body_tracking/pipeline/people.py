@@ -63,50 +63,32 @@ def people_from(values: Mapping[str, Value]) -> PeopleParameters:
 
 
 class SubjectSelector:
-    """Picks one body per frame of one sensor: the last picked number, else the body nearest to the sensor."""
-
-    def __init__(self) -> None:
-        self.body: int | None = None
-
-    def pick(self, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The subject among skeletons of one instant, in the sensor's frame; None where none has a valid joint."""
-        seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
-        if not seen:
-            return None
-        subject = next((skeleton for skeleton in seen if skeleton.body == self.body), None)
-        if subject is None:
-            subject = min(seen, key=_distance)
-            self.body = subject.body
-        return subject
-
-    def reset(self) -> None:
-        """Forget the picked body."""
-        self.body = None
-
-
-class HeldSubject:
-    """Picks one of several people, who may come in separate messages.
+    """Picks one body per instant: the one with the last picked number, else the body nearest to the frame's origin.
 
     Args:
-        hold: seconds without the picked person after which the one nearest to the frame's origin is picked.
+        hold: seconds for which nobody else is picked while the picked one is absent, such as in a message of its own.
     """
 
-    def __init__(self, hold: float) -> None:
+    def __init__(self, hold: float = 0.0) -> None:
         self._hold_ns = round(hold * NANOSECONDS)
         self.body: int | None = None
         self._seen_ns = 0
 
     def pick(self, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The subject among skeletons of one instant; None where it is not among them."""
+        """The subject among skeletons of one instant; None where none has a valid joint, or the subject is held."""
         seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
         subject = next((skeleton for skeleton in seen if skeleton.body == self.body), None)
         if subject is None and seen:
-            if self.body is not None and 0 <= seen[0].stamp_ns - self._seen_ns <= self._hold_ns:
+            if self.body is not None and 0 <= seen[0].stamp_ns - self._seen_ns < self._hold_ns:
                 return None
             subject = min(seen, key=_distance)
         if subject is not None:
             self.body, self._seen_ns = subject.body, subject.stamp_ns
         return subject
+
+    def reset(self) -> None:
+        """Forget the picked body."""
+        self.body = None
 
 
 def _distance(skeleton: Skeleton) -> float:

@@ -27,7 +27,7 @@ SYSTEM = System(
         Command("up", "body_tracking.ros.up", "run the live graph: sensors or a bag in, joint angles out"),
         Command(
             "doctor",
-            "body_tracking.ros.doctor.command",
+            "body_tracking.ros.doctor",
             "why nothing comes: what is wrong with the shell, the graph or a bag, and what to do",
         ),
         Command("compile", "body_tracking.compilation", "compile the loops over images ahead of the first one"),

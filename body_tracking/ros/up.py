@@ -33,6 +33,7 @@ from body_tracking.core.signals import signals_held
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
@@ -155,21 +156,15 @@ def all_parameters(
     result = parameters_for(specs, file, defaults, all_nodes_for(options))
     for spec in specs:
         given = result[spec.name]
-        if (
-            spec.executable == "kinect_skeleton"
-            and not given.get("file")
-            and given.get("backend") in (None, "recording")
-        ):
+        without_backend = given.get("backend") in (None, "recording") and not given.get("file")
+        if spec.executable == "kinect_skeleton" and without_backend:
             raise UpError(
                 f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
             )
-    for spec in specs:
         if spec.executable == "bag_player":
-            count, played = subscribers(specs, result), result[spec.name]["topics"]
-            waited = (
-                [f"{topic}:{count[topic]}" for topic in played if topic in count] if isinstance(played, tuple) else []
-            )
-            result[spec.name]["wait_for_subscribers"] = tuple(waited)
+            count = subscribers(specs, result)
+            waited = (f"{topic}:{count[topic]}" for topic in names_in(given["topics"]) if topic in count)
+            given["wait_for_subscribers"] = tuple(waited)
     return result
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from body_tracking import cli
 from body_tracking.recording.rosbag2 import BagReader, BagWriter
-from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, environment
-from body_tracking.ros.doctor.bags import bag
+from body_tracking.ros import doctor
+from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, bag
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
@@ -39,24 +39,22 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
     ],
 )
 def test_variables_that_separate_nodes_are_named(variables: dict[str, str], level: str, reported: str) -> None:
-    found = worst(environment.environment(variables))
+    found = worst(doctor.environment(variables))
     assert found[0] == level
     assert reported in found[1]
 
 
 def test_missing_libraries_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "OPTIONAL", {"numpy": ("", ""), "absent_too": ("no page", "sudo apt install x")})
-    assert list(environment.libraries()) == [
-        Finding(WARNING, "absent_too is not installed: no page", "sudo apt install x")
-    ]
-    monkeypatch.setattr(environment, "NEEDED", ("mcap", "absent"))
-    assert next(environment.libraries()) == Finding(PROBLEM, "not installed: absent", "pip install absent")
+    monkeypatch.setattr(doctor, "OPTIONAL", {"numpy": ("", ""), "absent_too": ("no page", "sudo apt install x")})
+    assert list(doctor.libraries()) == [Finding(WARNING, "absent_too is not installed: no page", "sudo apt install x")]
+    monkeypatch.setattr(doctor, "NEEDED", ("mcap", "absent"))
+    assert next(doctor.libraries()) == Finding(PROBLEM, "not installed: absent", "pip install absent")
 
 
 def test_a_clock_in_the_past_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert environment.clock().level in (OK, WARNING)  # this machine's may be synchronised or not
-    monkeypatch.setattr(environment.time, "time", lambda: 0.0)
-    assert environment.clock().level == PROBLEM
+    assert doctor.clock().level in (OK, WARNING)  # this machine's may be synchronised or not
+    monkeypatch.setattr(doctor.time, "time", lambda: 0.0)
+    assert doctor.clock().level == PROBLEM
 
 
 def test_a_bag_that_was_cut_off_is_played_in_part(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
-from body_tracking.pipeline.people import HeldSubject, SubjectSelector
+from body_tracking.pipeline.people import SubjectSelector
 
 
 def body(number: int, distance: float, state: int = 2) -> Skeleton:
@@ -32,7 +32,7 @@ def test_the_nearest_with_a_joint_is_picked_and_kept_until_gone() -> None:
 
 
 def test_one_of_several_is_held_through_messages_without_that_one() -> None:
-    held = HeldSubject(1.0)
+    held = SubjectSelector(1.0)
 
     def pick(seconds: float, *numbers: tuple[int, float]) -> int | None:
         stamp_ns = round(seconds * NANOSECONDS)

@@ -23,9 +23,9 @@ from body_tracking.core.qos import RELIABLE, SENSOR_DATA  # noqa: E402
 from body_tracking.core.skeleton import N_JOINTS, Skeleton  # noqa: E402
 from body_tracking.messages.base import RosMessages  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
+from body_tracking.ros import doctor_live as live  # noqa: E402
 from body_tracking.ros.bag_topics import to_profile  # noqa: E402
-from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, live  # noqa: E402
-from body_tracking.ros.doctor.environment import client_library  # noqa: E402
+from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, client_library  # noqa: E402
 
 NOW = 1.8e9
 """A time in seconds, in this decade."""

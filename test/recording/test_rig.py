@@ -13,7 +13,7 @@ from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, BagWriter, RawMessage
 from body_tracking.ros.doctor import PROBLEM
-from body_tracking.ros.doctor.bags import bag as examined
+from body_tracking.ros.doctor import bag as examined
 
 
 def copied(bag: Path, folder: Path, *namespaces: str) -> Path:

@@ -26,8 +26,7 @@ from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.ros.bag_topics import message_class
-from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding
-from body_tracking.ros.doctor.bags import LEAST_RATE
+from body_tracking.ros.doctor import LEAST_RATE, OK, PROBLEM, WARNING, Finding
 
 PATIENCE = 10.0
 """Seconds for a required sensor to begin."""

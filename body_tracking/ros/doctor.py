@@ -1,0 +1,185 @@
+"""``body_tracking doctor``: finds out why no data arrive, and states a remedy.
+
+The checks of the shell and of a bag are here, those of the ROS domain in ``doctor_live``; each yields findings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final, Literal
+
+from body_tracking.core import names
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.pipeline import graph
+
+OK: Final = "OK"
+WARNING: Final = "warning"
+PROBLEM: Final = "problem"
+
+NEEDED = ("filterpy", "vqf", "mcap", "lz4", "zstandard", "rosbags")
+"""Required libraries that no ROS install contains."""
+OPTIONAL = {
+    "viser": ("no live page", "pip install 'body_tracking[viewer]'"),
+    "ezc3d": ("no import of C3D files", "pip install 'body_tracking[c3d]'"),
+    "tf2_msgs": ("no /tf, so no frames in RViz", "sudo apt install ros-jazzy-tf2-msgs"),
+    "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "sudo apt install ros-jazzy-hri-msgs"),
+}
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_FAST_DDS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_REMEDIES = {
+    "No module named 'rclpy'": "pip install 'body_tracking[ros]', or . /opt/ros/jazzy/setup.bash",
+    "RMW": "unset RMW_IMPLEMENTATION, or install the middleware that it names",
+    "shared object file": "unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH, in a shell without another ROS",
+}
+"""By a part of the client library's error message."""
+LEAST_RATE = {POINT_CLOUD: 20.0, JOINT_STATE: 20.0, IMU: 50.0}
+"""Hertz: a Kinect has 30, and 15 in the dark; with less than 50 the orientation of an IMU drifts."""
+GAP = 0.5
+"""Seconds without a frame after which calibration and filter have lost the person."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of a check, with a remedy; a problem keeps the graph from working."""
+
+    level: Literal["OK", "warning", "problem"]
+    found: str
+    remedy: str = ""
+
+
+# --- the shell
+
+
+def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
+    """Contradictory variables, and domain and discovery range, which must be the same on all computers."""
+    domain = variables.get("ROS_DOMAIN_ID") or "0"
+    if not (domain.isdecimal() and int(domain) <= 232):  # those beyond have no UDP ports
+        yield Finding(PROBLEM, f"ROS_DOMAIN_ID is {domain!r}, expected 0 to 232", "export ROS_DOMAIN_ID=0")
+    reach = "LOCALHOST" if variables.get("ROS_LOCALHOST_ONLY") == "1" else variables.get(_RANGE) or "SUBNET"
+    if reach not in ("SUBNET", "LOCALHOST", "SYSTEM_DEFAULT"):
+        yield Finding(PROBLEM, f"{_RANGE} is {reach!r}: nodes do not find each other", f"export {_RANGE}=SUBNET")
+    else:
+        peers = variables.get("ROS_STATIC_PEERS") or ("none" if reach == "LOCALHOST" else "those of the network")
+        yield Finding(OK, f"ROS domain {domain}, discovery range {reach}, other machines: {peers}")
+    for name in ("ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER", *_FAST_DDS):
+        if variables.get(name):
+            remedy = f"unset {name}, or set it alike in every shell"
+            yield Finding(WARNING, f"{name}={variables[name]} limits which nodes find each other", remedy)
+
+
+def client_library() -> Finding:
+    """Whether a node can be made; in a child process, because a broken client library may end it."""
+    code = "import rclpy; rclpy.init(); rclpy.create_node('doctor'); print(rclpy.get_rmw_implementation_identifier())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if done.returncode == 0:
+        return Finding(OK, f"rclpy works, on {done.stdout.strip()}")
+    reason = [f"exit code {done.returncode}", *(line for line in done.stderr.splitlines() if line[:1].strip())][-1]
+    remedy = next((remedy for part, remedy in _REMEDIES.items() if part in reason), "see docs/troubleshooting.md")
+    return Finding(PROBLEM, f"no ROS node can be made: {reason}", remedy)
+
+
+def libraries() -> Iterator[Finding]:
+    """Libraries that are not installed."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        yield Finding(PROBLEM, f"not installed: {', '.join(missing)}", f"pip install {' '.join(missing)}")
+    for name, (lack, remedy) in OPTIONAL.items():
+        if find_spec(name) is None:
+            yield Finding(WARNING, f"{name} is not installed: {lack}", remedy)
+
+
+def clock() -> Finding:
+    """The real-time clock, which stamps messages."""
+    if time.time() < Path(__file__).stat().st_mtime:
+        return Finding(PROBLEM, f"the clock is in the past: {time.ctime()}", "sudo timedatectl set-ntp true")
+    if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(1024)) == 5:  # TIME_ERROR
+        remedy = "sudo timedatectl set-ntp true, where sensors are on several machines"
+        return Finding(WARNING, "the clock is not synchronised", remedy)
+    return Finding(OK, "the clock is synchronised")
+
+
+# --- a recording
+
+
+def bag(path: Path) -> Iterator[Finding]:
+    """Findings on a folder or a single mcap file."""
+    from body_tracking.recording.info import bag_info  # needs libraries whose absence the doctor has to name
+
+    recover = f"body_tracking bag recover {path}"
+    try:
+        info = bag_info(path)
+    except BodyTrackingError as error:
+        yield Finding(PROBLEM, str(error), recover if path.is_dir() else "give the folder that the recorder made")
+        return
+    yield Finding(OK, f"{path}: {info.messages} messages in {info.duration_s:.1f} s")
+    for warning in info.warnings:
+        yield Finding(WARNING, warning, f"{recover}; its whole messages are played as it is, too")
+    namespace = names.rig_namespace(topic.name for topic in info.topics)
+    clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
+    sensors = graph.sensors_among(names.within(name, namespace) or name for name in clouds)
+    if not sensors:
+        found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
+        yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")
+    skeletons = {names.resolved(graph.skeleton_topic(sensor), namespace) for sensor in sensors}
+    for topic in info.topics:
+        if topic.name in skeletons or topic.type == IMU:
+            rate, gap = topic.rate or 0.0, topic.longest_gap or 0.0
+            text, remedy = f"{topic.name}: {topic.count} messages, {rate:.1f} Hz, longest gap {gap:.2f} s", ""
+            if gap > GAP:
+                remedy = "keep the person in view: in a gap angles are predicted, then lost"
+            elif rate < LEAST_RATE[topic.type]:
+                remedy = "more light, USB 3, the driver's settings: at this rate estimates are less certain"
+            yield Finding(WARNING if remedy else OK, text, remedy)
+
+
+# --- the command
+
+
+def examine(args: argparse.Namespace) -> Iterator[Finding]:
+    """All findings; modules that need ROS are imported only after the libraries were found."""
+    if args.bag is not None:
+        yield from bag(args.bag)
+        return
+    yield from environment(os.environ)
+    yield clock()
+    needed = [*libraries(), client_library()]
+    yield from needed
+    if all(each.level != PROBLEM for each in needed):
+        from body_tracking.ros.doctor_live import domain
+
+        yield from domain([each for each in args.sensors.split(",") if each])
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``doctor`` to the ``body_tracking`` command."""
+    parser = subparsers.add_parser(
+        "doctor",
+        description="Why nothing comes: looks at this shell's ROS environment, libraries, clock, and who publishes "
+        "what in the ROS domain, or at a recording; says what to do. Exit code 0 without a problem, 1 with one.",
+    )
+    parser.add_argument("--bag", type=Path, metavar="BAG", help="look at this recording instead")
+    parser.add_argument("--sensors", default="", metavar="A,B", help="these must be there; in a namespace: NAMESPACE/A")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """``body_tracking doctor``."""
+    counts = Counter[str]()
+    for finding in examine(args):
+        counts[finding.level] += 1
+        print(f"{finding.level:8} {finding.found}", flush=True)
+        if finding.remedy:
+            print(f"      -> {finding.remedy}")
+    print(f"\n{counts[PROBLEM]} problems, {counts[WARNING]} warnings, {counts[OK]} OK")
+    return 1 if counts[PROBLEM] else 0
