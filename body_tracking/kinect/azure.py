@@ -3,16 +3,10 @@
 Microsoft's ROS driver (Azure_Kinect_ROS_Driver, both for ROS 1 and 2) publishes ``body_tracking_data``, a
 ``visualization_msgs/MarkerArray`` with a sphere per joint and body, whose id is ``100 body + joint`` with the joint of
 ``k4abt_joint_id_t``, in the frame of the depth camera (metres, x right, y down, z forward: already an optical frame),
-stamped with the capture time. The message lacks the SDK's confidence, and the SDK places occluded joints too, so seen
-and guessed joints cannot be distinguished.
+stamped with the capture time. It lacks the SDK's confidence: seen and guessed joints cannot be distinguished.
 
-Two of the 25 joints have no counterpart: the Kinect v2's SpineMid lies between the SDK's navel and chest, and its
-SpineShoulder between the inner ends of the clavicles; both are computed as midpoints. Nose, eyes and ears of the SDK
-are left out. The two systems place joints of one name at slightly different points of the body (Albert et al. 2020,
-Sensors 20:5104), which no mapping corrects.
-
-REP-155 (``hri_msgs``) is not read: its ``Skeleton2D`` holds image coordinates only, and its three-dimensional body is a
-URDF with joint angles and frames in TF, of about 14 links without spine, hands and feet.
+SpineMid and SpineShoulder have no counterpart and are computed as midpoints; nose, eyes and ears are left out. Joints
+of one name lie at slightly different points of the body (Albert et al. 2020, Sensors 20:5104): no mapping corrects it.
 """
 
 from __future__ import annotations

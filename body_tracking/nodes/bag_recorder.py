@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
@@ -65,11 +65,11 @@ PARAMETERS = (
 _DEPTH = 1000  # messages of a topic that may wait while the disk is slow
 _EARLY_S = 1.0
 """With simulated time, messages received within this time before the first ``/clock`` get its time; older ones are
-dropped."""
-_EARLY_LATCHED = 256
-"""Latched messages wait for ``/clock`` without a limit of time, but at most so many."""
+dropped, except for latched ones."""
 _EARLY_BYTES = 16 << 20
 """Limit of all waiting messages."""
+_MESSAGE_BYTES = 250
+"""Approximate memory of a waiting message without its content."""
 
 
 class BagRecorder(GraphNode):
@@ -96,8 +96,8 @@ class BagRecorder(GraphNode):
         self.writer: BagWriter | None = None
         self.inputs: dict[str, tuple[Qos, Any]] = {}
         self.refused: dict[str, str] = {}
-        self.early: deque[tuple[float, str, bytes]] = deque()
-        self.early_latched: deque[tuple[str, bytes]] = deque()
+        self.early: list[tuple[float, str, bytes]] = []
+        """Messages from before the first ``/clock``: until when each is kept (steady seconds), topic and CDR bytes."""
         self.before_the_clock = 0
         self.error = ""
         self.written = self.lost = self.n_bytes = 0
@@ -137,7 +137,8 @@ class BagRecorder(GraphNode):
         for topic in tuple(self.inputs):
             self.forget(topic)
         if self.simulated and self.now_ns() == 0:
-            self.drop_early()
+            self.before_the_clock += len(self.early)
+            self.early = []
         self.write_early()
         writer, self.writer = self.writer, None
         if writer is not None:
@@ -237,37 +238,28 @@ class BagRecorder(GraphNode):
 
     def wait_for_clock(self, topic: str, cdr: bytes) -> None:
         """Keep a message from before the first ``/clock``: time 0 would put it years before the rest of the bag."""
-        if topic in self.inputs and self.inputs[topic][0].durability == LATCHED.durability:
-            self.early_latched.append((topic, cdr))
-        else:
-            self.early.append((time.monotonic(), topic, cdr))
+        latched = topic in self.inputs and self.inputs[topic][0].durability == LATCHED.durability
+        self.early.append((math.inf if latched else time.monotonic() + _EARLY_S, topic, cdr))
         self.forget_early()
 
     def forget_early(self) -> None:
-        """Drop waiting messages that are too old or too many."""
-        now = time.monotonic()
-        size = sum(len(cdr) for _, _, cdr in self.early) + sum(len(cdr) for _, cdr in self.early_latched)
-        while self.early and (now - self.early[0][0] > _EARLY_S or size > _EARLY_BYTES):
-            size -= len(self.early.popleft()[-1])
-            self.before_the_clock += 1
-        while self.early_latched and (len(self.early_latched) > _EARLY_LATCHED or size > _EARLY_BYTES):
-            size -= len(self.early_latched.popleft()[-1])
-            self.before_the_clock += 1
-
-    def drop_early(self) -> None:
-        """Drop all waiting messages."""
-        self.before_the_clock += len(self.early) + len(self.early_latched)
-        self.early.clear()
-        self.early_latched.clear()
+        """Drop waiting messages that are too old; of too many the oldest, latched ones last."""
+        now, size = time.monotonic(), 0
+        kept: list[tuple[float, str, bytes]] = []
+        for message in sorted(self.early[::-1], key=lambda each: each[0], reverse=True):  # newest first
+            size += len(message[-1]) + _MESSAGE_BYTES
+            if message[0] < now or size > _EARLY_BYTES:
+                break
+            kept.append(message)
+        self.before_the_clock += len(self.early) - len(kept)
+        self.early = kept[::-1]
 
     def write_early(self) -> None:
-        """Write the messages from before the first ``/clock``."""
-        if self.early or self.early_latched:
+        """Write the messages from before the first ``/clock``, latched ones first."""
+        if self.early:
             self.forget_early()
-            early = [*self.early_latched, *((topic, cdr) for _, topic, cdr in self.early)]
-            self.early.clear()
-            self.early_latched.clear()
-            for topic, cdr in early:
+            early, self.early = self.early, []
+            for _, topic, cdr in sorted(early, key=lambda each: each[0] < math.inf):
                 self.write(topic, cdr, self.now_ns())
 
     def write(self, topic: str, cdr: bytes, received_ns: int, sent_ns: int | None = None) -> None:
