@@ -246,7 +246,8 @@ class BagRecorder(GraphNode):
         """Drop waiting messages that are too old; of too many the oldest, latched ones last."""
         now, size = time.monotonic(), 0
         kept: list[tuple[float, str, bytes]] = []
-        for message in sorted(self.early[::-1], key=lambda each: each[0], reverse=True):  # newest first
+        self.early.sort(key=lambda each: each[0])
+        for message in reversed(self.early):
             size += len(message[-1]) + _MESSAGE_BYTES
             if message[0] < now or size > _EARLY_BYTES:
                 break
