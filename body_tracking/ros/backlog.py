@@ -2,8 +2,7 @@
 
 A queue that becomes empty now and then only absorbs bursts; a standing queue is only delay. So frames are dropped when
 the oldest one has waited for longer than a target throughout an interval (controlled delay: Nichols and Jacobson 2012,
-"Controlling queue delay"). In addition a batch is limited to what can be done in a given time, by the measured cost of
-a frame.
+"Controlling queue delay").
 """
 
 from __future__ import annotations
@@ -19,9 +18,6 @@ TARGET = 0.1
 INTERVAL = 1.0
 """Seconds for which frames may wait longer: a single delay does not mean that the node is too slow."""
 
-AT_ONCE = 0.5
-"""Longest work on one batch, seconds; the queues of the subscriptions hold the frames of this time."""
-
 _AGAIN = 10.0
 """Seconds after a drop during which only the share ``_SOONER`` of the interval is needed for the next one."""
 _SOONER = 0.1
@@ -32,9 +28,6 @@ delay of the later nodes it is below the age up to which a robot follows angles 
 
 _RECOVERY = 1.0
 """Seconds after a standstill in which older messages may still arrive."""
-
-_SMOOTHING = 0.3
-"""Weight of the last batch in the cost of a frame."""
 
 
 class Backlog:
@@ -48,8 +41,6 @@ class Backlog:
         self.dropped: Counter[str] = Counter()
         self._above_since_ns: int | None = None
         self._dropped_ns: int | None = None
-        self._cost_ns = 0.0
-        self._taken, self._taken_ns = 0, 0
 
     def late(self, arrived: Sequence[tuple[str, int]], now_ns: int) -> list[int]:
         """The waiting frames to be dropped.
@@ -61,23 +52,18 @@ class Backlog:
         Returns:
             Their indices in ``arrived``; never that of a topic's newest frame.
         """
-        late: list[int] = []
-        if arrived:
-            if self._too_slow(now_ns - min(at_ns for _, at_ns in arrived), now_ns):
-                late = self._beyond(arrived, TARGET, now_ns - round(TARGET * NANOSECONDS))
-            elif len(arrived) * self._cost_ns > AT_ONCE * NANOSECONDS:
-                late = self._beyond(arrived, AT_ONCE)
+        if not self._too_slow(now_ns - min((at_ns for _, at_ns in arrived), default=now_ns), now_ns):
+            return []
+        newest = {arrived[place][0]: place for place in sorted(range(len(arrived)), key=lambda each: arrived[each][1])}
+        late = [
+            place
+            for place, (topic, at_ns) in enumerate(arrived)
+            if now_ns - at_ns > TARGET * NANOSECONDS and place != newest[topic]
+        ]
         if late:
             self.dropped.update(arrived[place][0] for place in late)
             self._dropped_ns = now_ns
-        self._taken, self._taken_ns = len(arrived) - len(late), now_ns
         return late
-
-    def done(self, now_ns: int) -> None:
-        """Update the cost of a frame after the others have been handled."""
-        if self._taken:
-            cost = max(0.0, (now_ns - self._taken_ns) / self._taken)
-            self._cost_ns += _SMOOTHING * (cost - self._cost_ns)
 
     def _too_slow(self, waited_ns: int, now_ns: int) -> bool:
         """Whether the oldest frame has been above the target throughout the interval."""
@@ -88,18 +74,6 @@ class Backlog:
             self._above_since_ns = now_ns
         again = self._dropped_ns is not None and now_ns - self._dropped_ns < _AGAIN * NANOSECONDS
         return now_ns - self._above_since_ns >= INTERVAL * NANOSECONDS * (_SOONER if again else 1.0)
-
-    def _beyond(self, arrived: Sequence[tuple[str, int]], work: float, since_ns: int = 0) -> list[int]:
-        """All frames but each topic's newest and the newest ones that fit into ``work`` seconds."""
-        kept: list[int] = []
-        topics: set[str] = set()
-        for place in sorted(range(len(arrived)), key=lambda each: arrived[each][1], reverse=True):
-            topic, at_ns = arrived[place]
-            fits = (len(kept) + 1) * self._cost_ns <= work * NANOSECONDS and at_ns >= since_ns
-            if topic not in topics or fits:
-                topics.add(topic)
-                kept.append(place)
-        return sorted(set(range(len(arrived))) - set(kept))
 
 
 class Standstill:

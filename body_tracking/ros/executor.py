@@ -39,9 +39,6 @@ class BatchNode(Node):
     def batch_done(self) -> None:
         """Called after the callbacks of a batch."""
 
-    def work_done(self) -> None:
-        """Called after :meth:`batch_done`."""
-
 
 class LeanExecutor(SingleThreadedExecutor):
     """Runs one node's callbacks in the thread that calls :meth:`spin`; its callbacks are no coroutines.
@@ -161,7 +158,6 @@ class LeanExecutor(SingleThreadedExecutor):
                     subscription.callback(*(taken[:1] if only_message else taken))
                 if messages:
                     self._batch_done()
-                    node.work_done()
                 executed = len(messages) + _execute_timers(timers)
                 if self._changed or not _others_ready(wait_set, waitables if whole else []):
                     ready_since_ns = None

@@ -424,11 +424,6 @@ class GraphNode(BatchNode):
             self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
         return [each for place, each in enumerate(messages) if place not in late] if late else messages
 
-    def work_done(self) -> None:
-        """Note the duration of the work on a batch; called by the executor."""
-        if self._droppable:
-            self.backlog.done(time.time_ns())
-
     def time_jumped_back(self, topic: str) -> None:
         """Reset the state, because the stamps of an input jumped back."""
 
