@@ -14,10 +14,9 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from body_tracking.core.csv_file import CsvError, CsvFile
-from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, FloatArray, IntArray, Skeleton, TrackingState
+from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, TrackingState
 from body_tracking.core.sources import NOT_FINITE, RecordedFrame, SensorNameError, check_sensor_name, optical_frame
 from body_tracking.kinect.axes import camera_space_to_optical
 
@@ -26,22 +25,9 @@ BACKWARDS = "stamps that run backwards"
 IGNORED = "columns that were not read"
 
 _AXES = ("x", "y", "z")
+_COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in _AXES]
 _BLOCK_LINES = 1024
 _MAX_BODY = 2**16 - 1  # the message numbers bodies in 16 bits
-
-
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """Indices of the columns; None for those that the file lacks."""
-
-    names: tuple[str, ...]
-    stamp: int
-    sensor: int | None
-    received: int | None
-    person: int | None
-    positions: IntArray  # (75,) x, y, z of each joint in SDK order
-    states: IntArray  # (n,) the states that the file has
-    state_joints: IntArray  # (n,) the joints they belong to
 
 
 @dataclass(slots=True)
@@ -91,24 +77,26 @@ class CsvRecording:
     def __iter__(self) -> Iterator[RecordedFrame]:
         file = self._file = CsvFile(self.path)
         counts: Counter[str] = Counter()
-        columns: _Columns | None = None
+        names: list[str] = []
         pending: dict[str, _Frame] = {}
         self._names.clear()
         n_rows = n_lines = 0
         lines = file.lines()
         while block := list(islice(lines, _BLOCK_LINES)):
-            cells = file.rows(n_lines + 1, block)
-            if columns is None:
-                columns = self._columns(cells[0])
-                cells[0] = []
-                counts[IGNORED] = len(columns.names) - sum(_is_known(name) for name in columns.names)
-            if not block[-1].endswith("\n") and 0 < len(cells[-1]) < len(columns.names):
-                cells.pop()
+            rows = file.rows(n_lines + 1, block)
+            if not names:
+                names, rows[0] = self._checked_names(rows[0]), []
+                counts[IGNORED] = sum(not _is_known(name) for name in names)
+            if not block[-1].endswith("\n") and 0 < len(rows[-1]) < len(names):
+                rows.pop()
                 file.cut = "the last line is cut off"
-            rows = {n_lines + index: row for index, row in enumerate(cells, 1) if row}
-            n_lines += len(block)
-            n_rows += len(rows)
-            for sensor, received_ns, skeleton in self._parse(list(rows), list(rows.values()), columns, counts):
+            for line, row in enumerate(rows, n_lines + 1):
+                if not row:
+                    continue
+                n_rows += 1
+                if len(row) != len(names):
+                    raise file.error(line, f"{len(row)} columns, expected {len(names)}")
+                sensor, received_ns, skeleton = self._row(line, dict(zip(names, row, strict=True)), counts)
                 frame = pending.get(sensor)
                 if frame is None or skeleton.stamp_ns != frame.stamp_ns or skeleton.body in frame.skeletons:
                     if frame is not None:
@@ -117,129 +105,75 @@ class CsvRecording:
                         yield frame.finished()
                     frame = pending[sensor] = _Frame(sensor, skeleton.stamp_ns, received_ns)
                 frame.skeletons[skeleton.body] = skeleton
-            self.problems = {name: count for name, count in counts.items() if count}
-        if columns is None:
+            n_lines += len(block)
+        if not names:
             raise CsvError(f"{self.path}: {file.cut or 'the file is empty'}")
         self.warnings = file.check_whole(n_rows, self._partial)
+        self.problems = dict(+counts)
         for frame in sorted(pending.values(), key=lambda each: each.received_ns):
             yield frame.finished()
-        self.problems = {name: count for name, count in counts.items() if count}
 
-    # --- the header
-
-    def _columns(self, names: list[str]) -> _Columns:
-        names = [name.strip() for name in names]
-        place = {name: index for index, name in enumerate(names)}
-        if len(place) < len(names):
-            twice = next(name for name, count in Counter(names).items() if count > 1)
+    def _checked_names(self, header: list[str]) -> list[str]:
+        """The names of the columns."""
+        names = [name.strip() for name in header]
+        twice = next((name for name, count in Counter(names).items() if count > 1), None)
+        if twice is not None:
             raise self._file.error(1, f"column {twice!r} is there twice")
-        wanted = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in _AXES]
-        missing = [name for name in ("stamp", *wanted) if name not in place]
+        missing = [name for name in ("stamp", *_COORDINATES) if name not in names]
         strange = [name for name in names if not _is_known(name) and _looks_like_a_joint(name)]
         if missing or strange:
             # Both together: a misspelt column is usually also a missing one.
             parts = [_listing("missing column", missing), _listing("unknown joint column", strange)]
             raise self._file.error(1, "; ".join(part for part in parts if part))
-        state_joints = [joint for joint in range(N_JOINTS) if f"{JOINT_NAMES[joint]}_state" in place]
-        return _Columns(
-            names=tuple(names),
-            stamp=place["stamp"],
-            sensor=place.get("sensor"),
-            received=place.get("received"),
-            person=place.get("person"),
-            positions=np.array([place[name] for name in wanted], dtype=np.intp),
-            states=np.array([place[f"{JOINT_NAMES[joint]}_state"] for joint in state_joints], dtype=np.intp),
-            state_joints=np.array(state_joints, dtype=np.intp),
-        )
+        return names
 
-    # --- rows
-
-    def _parse(
-        self, where: list[int], rows: list[list[str]], columns: _Columns, counts: Counter[str]
-    ) -> list[tuple[str, int, Skeleton]]:
-        """Sensor, time of receipt and skeleton of each row.
-
-        Args:
-            where: the line of each row.
-            rows: their cells.
-            columns: of the file.
-            counts: of problems, updated in place.
-        """
-        if not rows:
-            return []
-        width = len(columns.names)
-        for line, row in zip(where, rows, strict=True):
-            if len(row) != width:
-                raise self._file.error(line, f"{len(row)} columns, expected {width}")
-        cells = np.array(rows)
-        positions = self._numbers(where, cells, columns.positions, columns).reshape(-1, N_JOINTS, 3)
-        states = np.full((len(rows), N_JOINTS), TrackingState.TRACKED, dtype=np.uint8)
-        if columns.states.size:
-            given = self._numbers(where, cells, columns.states, columns)
-            wrong = np.argwhere(~np.isin(given, [state.value for state in TrackingState]))
-            if wrong.size:
-                row, column = wrong[0]
-                name = columns.names[columns.states[column]]
-                text = rows[row][columns.states[column]]
-                raise self._file.error(where[row], f"{name}: tracking state {text!r}, expected 0, 1 or 2")
-            states[:, columns.state_joints] = given.astype(np.uint8)
-        lost = ~np.isfinite(positions).all(axis=2)
-        positions[lost] = np.nan
-        states[lost] = TrackingState.NOT_TRACKED
+    def _row(self, line: int, cells: dict[str, str], counts: Counter[str]) -> tuple[str, int, Skeleton]:
+        """Sensor, time of receipt and skeleton of a row."""
+        sensor = self._sensor_of(line, cells.get("sensor"))
+        stamp_ns = self._file.time_ns(line, cells["stamp"], "stamp")
+        received_ns = self._file.time_ns(line, cells["received"], "received") if "received" in cells else stamp_ns
+        body = self._number(line, cells, "person") if "person" in cells else 0.0
+        if not (body.is_integer() and 0 <= body <= _MAX_BODY):
+            raise self._file.error(line, f"person: {cells['person']!r}, expected a whole number from 0 to {_MAX_BODY}")
+        points = np.array([self._number(line, cells, name) for name in _COORDINATES]).reshape(N_JOINTS, 3)
+        states = np.array([self._state(line, cells, f"{joint}_state") for joint in JOINT_NAMES], dtype=np.uint8)
+        lost = ~np.isfinite(points).all(axis=1)
+        points[lost], states[lost] = np.nan, TrackingState.NOT_TRACKED
         counts[NOT_FINITE] += int(lost.sum())
-        positions = camera_space_to_optical(positions)
-        found = []
-        for line, row, sensor, points, own in zip(
-            where, rows, self._sensors(where, rows, columns), positions, states, strict=True
-        ):
-            stamp_ns = received_ns = self._file.time_ns(line, row[columns.stamp], "stamp")
-            if columns.received is not None:
-                received_ns = self._file.time_ns(line, row[columns.received], "received")
-            person = 0 if columns.person is None else self._person(line, row[columns.person])
-            found.append((sensor, received_ns, Skeleton(stamp_ns, optical_frame(sensor), points, own, person)))
-        return found
+        frame_id = optical_frame(sensor)
+        return sensor, received_ns, Skeleton(stamp_ns, frame_id, camera_space_to_optical(points), states, int(body))
 
-    def _numbers(self, where: list[int], cells: NDArray[np.str_], places: IntArray, columns: _Columns) -> FloatArray:
-        """(rows, places) numbers; NaN for an empty cell."""
-        texts = np.char.strip(cells[:, places])
-        texts[texts == ""] = "nan"
+    def _number(self, line: int, cells: dict[str, str], name: str) -> float:
+        """NaN for an empty cell."""
         try:
-            return texts.astype(np.float64)
+            return float(cells[name] or "nan")
         except ValueError:
-            for (row, column), text in np.ndenumerate(texts):
-                try:
-                    float(text)
-                except ValueError:
-                    name = columns.names[places[column]]
-                    raise self._file.error(where[row], f"{name}: {str(text)!r} is not a number") from None
-            raise
+            if not cells[name].strip():
+                return float("nan")
+            raise self._file.error(line, f"{name}: {cells[name]!r} is not a number") from None
 
-    def _person(self, line: int, text: str) -> int:
-        try:
-            number = float(text)
-        except ValueError:
-            number = float("nan")
-        if not (number.is_integer() and 0 <= number <= _MAX_BODY):
-            raise self._file.error(line, f"person: {text!r}, expected a whole number from 0 to {_MAX_BODY}")
-        return int(number)
+    def _state(self, line: int, cells: dict[str, str], name: str) -> int:
+        if name not in cells:
+            return TrackingState.TRACKED
+        state = self._number(line, cells, name)
+        if state not in tuple(TrackingState):
+            raise self._file.error(line, f"{name}: tracking state {cells[name]!r}, expected 0, 1 or 2")
+        return int(state)
 
-    def _sensors(self, where: list[int], rows: list[list[str]], columns: _Columns) -> list[str]:
-        if columns.sensor is None:
+    def _sensor_of(self, line: int, name: str | None) -> str:
+        if name is None:
             if self._sensor is None:
                 raise self._file.error(1, "no column 'sensor': give the sensor's name (--sensor NAME)")
-            return [self._sensor] * len(rows)
-        names = [row[columns.sensor].strip() for row in rows]
-        for name in dict.fromkeys(names):
-            try:
-                check_sensor_name(name)
-            except SensorNameError as error:
-                raise self._file.error(where[names.index(name)], str(error)) from error
+            return self._sensor
+        try:
+            self._names.add(check_sensor_name(name.strip()))
+        except SensorNameError as error:
+            raise self._file.error(line, str(error)) from error
         if self._sensor is None:
-            return names
-        self._names.update(names)
+            return name.strip()
         if len(self._names) > 1:
             raise CsvError(f"--sensor {self._sensor}: the file has several sensors ({', '.join(sorted(self._names))})")
-        return [self._sensor] * len(rows)
+        return self._sensor
 
 
 def sensor_column(path: Path | str) -> bool:

@@ -94,13 +94,15 @@ class OfflineRunner:
         while self._queue:
             topic, cdr = self._queue.popleft()
             decoded: dict[type, Any] = {}
+            malformed = False
             for number, stage, port in self._inputs.get(topic, ()):
                 kind = type(port.codec)
                 if kind not in decoded:
                     try:
                         decoded[kind] = port.codec.decode(cdr, self._wire)
                     except BodyTrackingError:
-                        self.counters[f"malformed {topic}"] += 1
+                        self.counters[f"malformed {topic}"] += not malformed
+                        malformed = True
                         stage.refused(topic)
                         continue
                 payload = decoded[kind]

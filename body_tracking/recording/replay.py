@@ -22,8 +22,7 @@ from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import DEFAULT_FILTER
-from body_tracking.messages.cdr import decode_skeletons
-from body_tracking.messages.skeletons import cloud_to_skeletons
+from body_tracking.messages.codecs import Skeletons
 from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
@@ -32,7 +31,7 @@ from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage, deserialize
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.systems import (
     STAGES,
     add_options,
@@ -155,35 +154,6 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
     return {graph.skeleton_topic(name): name for name in names}
 
 
-class _Frames:
-    """Decodes the frames of sensors, and counts unusable ones.
-
-    Args:
-        topics: sensor name by topic.
-        counters: counts malformed messages, time jumps and frames without a body.
-    """
-
-    def __init__(self, topics: Mapping[str, str], counters: Counter[str]) -> None:
-        self._topics, self._counters = topics, counters
-        self._last: dict[str, int] = {}
-
-    def skeletons(self, raw: RawMessage) -> tuple[Skeleton, ...] | None:
-        """The bodies in a frame; None for an unusable one."""
-        try:
-            skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
-        except BodyTrackingError:
-            self._counters[f"malformed {raw.topic}"] += 1
-            return None
-        stamp = skeletons[0].stamp_ns
-        if jumped_back(stamp, self._last.get(raw.topic)):
-            self._counters["time jumps"] += 1
-        self._last[raw.topic] = stamp
-        if not any(skeleton.valid.any() for skeleton in skeletons):
-            self._counters["frames without a body"] += 1
-            return None
-        return skeletons
-
-
 def skeletons_of(
     bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
 ) -> Iterator[tuple[str, Skeleton, int, bytes]]:
@@ -193,18 +163,22 @@ def skeletons_of(
     """
     subjects = {sensor: SubjectSelector() for sensor in topics.values()}
     last: dict[str, int] = {}
-    frames = _Frames(topics, counters)
     for raw in bag.messages(topics.keys()):
-        skeletons, sensor = frames.skeletons(raw), topics[raw.topic]
-        if skeletons is None:
+        sensor = topics[raw.topic]
+        try:
+            skeletons = Skeletons().decode(raw.cdr, BAG_WIRE)
+        except BodyTrackingError:
+            counters[f"malformed {raw.topic}"] += 1
             continue
         stamp = skeletons[0].stamp_ns
         if jumped_back(stamp, last.get(sensor)):
             subjects[sensor].reset()
         last[sensor] = stamp
         subject = subjects[sensor].pick(skeletons)
-        assert subject is not None  # a body is there
-        yield sensor, subject, raw.log_time_ns, raw.cdr
+        if subject is None:
+            counters["frames without a body"] += 1
+        else:
+            yield sensor, subject, raw.log_time_ns, raw.cdr
 
 
 def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bool = False) -> ReplayReport:
@@ -222,7 +196,6 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         CalibrationError: the calibration file belongs to other sensors.
     """
     began = time.perf_counter()
-    counters: Counter[str] = Counter()
     with RigReader(bag_path) as bag:
         topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors)
         settings = replace(settings, sensors=tuple(topics.values()))
@@ -245,11 +218,9 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         downstream = forked.start_downstream(job)
         try:
             runner = OfflineRunner(stages, BAG_WIRE, downstream.take)
-            progress, frames = Progress(bag.start_ns, bag.end_ns), _Frames(topics, counters)
+            progress = Progress(bag.start_ns, bag.end_ns)
             started = False
             for raw in bag.messages(kept):
-                if raw.topic in topics and frames.skeletons(raw) is None:
-                    continue
                 if not started and raw.topic in (topics or sources):
                     started = True
                     runner.start(raw.log_time_ns)
@@ -262,13 +233,13 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             downstream.abandon()
             raise
         progress.end()
-        counters.update(runner.counters)
+        counters = Counter(runner.counters)
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
             raise ReplayError(f"{bag_path}: no frame of {given} came through ({_listed(counters)})")
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
-        counters.update(written.counters)
+        counters |= Counter(written.counters)  # both halves may have counted the same message
         return ReplayReport(
             written.frames,
             (bag.end_ns - bag.start_ns) / NANOSECONDS,

@@ -25,7 +25,6 @@ class Monitor:
         self._window: Counter[str] = Counter()
         self._delays_ns: list[int] = []
         self._latencies_ns: list[int] = []
-        self._looks = 0
         self._last_stamp: dict[str, int] = {}
         self._since = time.monotonic()
 
@@ -64,11 +63,6 @@ class Monitor:
         if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
             self._latencies_ns.append(latency_ns)
 
-    def wants_latency(self) -> bool:
-        """Whether to measure the latency of this message: reading the clock costs time, so only of a few per second."""
-        self._looks += 1
-        return self._looks <= 5
-
     def values(self) -> dict[str, object]:
         """Rates since the last call, and totals."""
         now = time.monotonic()
@@ -77,7 +71,6 @@ class Monitor:
             f"rate {name}": f"{count / elapsed:.1f}" for name, count in sorted(self._window.items())
         }
         self._window = Counter(dict.fromkeys(self._window, 0))
-        self._looks = 0
         for name, samples in (("delay", self._delays_ns), ("latency", self._latencies_ns)):
             if samples:
                 values[f"{name} median ms"] = f"{np.median(samples) / 1e6:.2f}"

@@ -445,7 +445,7 @@ class GraphNode(BatchNode):
         self.monitor.message_out(
             publisher.topic_name,
             None if sent_ns is None else time.time_ns() - sent_ns,
-            None if stamp_ns is None or not self.monitor.wants_latency() else self.now_ns() - stamp_ns,
+            None if stamp_ns is None else self.now_ns() - stamp_ns,
         )
         return True
 
