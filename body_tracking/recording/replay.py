@@ -83,7 +83,8 @@ class ReplaySettings:
     def options(self) -> Options:
         """Options of the graph."""
         given: dict[str, Value] = {
-            "sensors": self.sensors or (() if self.more.get("marker_setup") or self.more.get("depth") else graph.DEFAULT_SENSORS),
+            "sensors": self.sensors
+            or (() if self.more.get("marker_setup") or self.more.get("depth") else graph.DEFAULT_SENSORS),
             "filter": self.filter_name,
             "convention": self.convention,
             "imus": self.imus,
