@@ -369,11 +369,12 @@ def test_backend_that_cannot_be_loaded_is_reported_in_one_line(tmp_path: Path, e
 
 NEVER_LEAVES = """\
 import threading
-from body_tracking.ros import node as common, main
+from body_tracking.pipeline.shared import RELIABLE
+from body_tracking.ros import main, node
 
-class Stuck(common.GraphNode):
+class Stuck(node.GraphNode):
     NAME = "stuck"
-    PARAMETERS = (common.RELIABLE,)
+    PARAMETERS = (RELIABLE,)
 
     def close(self):
         print("closed", flush=True)
@@ -383,7 +384,7 @@ class Stuck(common.GraphNode):
 
 main._LEAVE_S = 1.0
 print("here", flush=True)
-common.run(Stuck)
+main.run(Stuck)
 """
 
 
