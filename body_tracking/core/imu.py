@@ -8,9 +8,8 @@ orientation of the sensor in an earth frame with z up. An invalid reading raises
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -249,25 +248,6 @@ class RecordedAngles:
     received_ns: int
     names: tuple[str, ...]
     angles: FloatArray
-
-
-class ImuRecording(Protocol):
-    """A file of inertial readings.
-
-    Attributes:
-        problems: how often each kind of irregularity was read so far.
-        warnings: a line for each part that is missing.
-    """
-
-    problems: dict[str, int]
-    warnings: list[str]
-
-    def __iter__(self) -> Iterator[RecordedImu | RecordedAngles]:
-        """The readings, in the order of the file."""
-
-    @property
-    def progress(self) -> float:
-        """Share of the file that has been read, 0 to 1."""
 
 
 def imu_frame(sensor: str) -> str:

@@ -125,6 +125,11 @@ def number_field(default: float, doc: str, unit: str, low: float, high: float) -
     return result
 
 
+def described_field(default: Value, doc: str) -> Any:
+    """A field of a parameter dataclass of any type, without limits."""
+    return field(default=default, metadata={"doc": doc})
+
+
 def parameters_from(
     parameter_class: type[Any],
     *,

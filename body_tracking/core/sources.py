@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from body_tracking.core.errors import BodyTrackingError
 
@@ -42,8 +42,11 @@ class RecordedFrame:
     skeletons: tuple[Skeleton, ...]
 
 
-class Recording(Protocol):
-    """A file of recorded frames.
+_Item = TypeVar("_Item", covariant=True)
+
+
+class Recording(Protocol[_Item]):
+    """A file of recorded items, such as :class:`RecordedFrame`.
 
     Attributes:
         problems: how often each kind of irregularity was read so far, such as ``stamps that repeat``.
@@ -53,8 +56,8 @@ class Recording(Protocol):
     problems: dict[str, int]
     warnings: list[str]
 
-    def __iter__(self) -> Iterator[RecordedFrame]:
-        """The frames, in the order of the file."""
+    def __iter__(self) -> Iterator[_Item]:
+        """The items, in the order of the file."""
 
     @property
     def progress(self) -> float:

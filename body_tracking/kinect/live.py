@@ -7,11 +7,12 @@ A backend is a class with the methods of :class:`SkeletonSource`: ``recording`` 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Protocol
 
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.parameters import described_field, number_field
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.kinect_protocol import DEFAULT_PORT
 from body_tracking.pipeline.system import load
@@ -23,33 +24,41 @@ class SourceError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True)
 class SourceSettings:
-    """Settings for all backends; each uses those that concern it.
+    """Settings for all backends; each uses those that concern it. The fields' metadata describe them."""
 
-    Attributes:
-        sensor: the name under which its skeletons are published.
-        device: which of several devices, such as a serial number; empty for the only one.
-        file: played by ``recording``.
-        recorded_sensor: the sensor's name in that file; empty for the same name.
-        rate: seconds of the recording per second.
-        loop: begin again at the end.
-        start_time: wall time, seconds, at which the recording's first frame of any sensor plays; 0 for now.
-        address: IP address of this computer on which ``network`` listens.
-        port: on which ``network`` listens.
-        key_file: with the key that senders share; empty for none, on a loopback address.
-        least_delay: seconds, the sensor's shortest delay from capture until its frame can be sent.
-    """
-
-    sensor: str
-    device: str = ""
-    file: str = ""
-    recorded_sensor: str = ""
-    rate: float = 1.0
-    loop: bool = False
-    start_time: float = 0.0
-    address: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
-    key_file: str = ""
-    least_delay: float = 0.0
+    sensor: str = described_field(
+        "kinect1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"
+    )
+    device: str = described_field("", "network: the sensor's name at kinect_sender; empty for the same name")
+    file: str = described_field("", "recording: a .csv, .csv.gz or .skeleton file, or a bag")
+    recorded_sensor: str = described_field("", "recording: the sensor's name in the file; empty for the same name")
+    rate: float = number_field(1.0, "recording: seconds of it per second", "", 0.01, 100.0)
+    loop: bool = described_field(False, "recording: begin again at the end; time goes on")
+    start_time: float = number_field(
+        0.0,
+        "recording: wall time at which its first frame (of any sensor in it) plays; 0 for now. With the same time for "
+        "each, several sensors stay in step, and one that is started again goes on where it should be",
+        "s",
+        0.0,
+        1e11,
+    )
+    address: str = described_field(
+        "127.0.0.1",
+        "network: the IP address of this computer to listen on, 0.0.0.0 for all; other computers reach no loopback "
+        "address, and any other needs a key",
+    )
+    port: int = field(
+        default=DEFAULT_PORT,
+        metadata={"doc": "network: the UDP port to listen on; one per sensor", "min": 1, "max": 65535},
+    )
+    key_file: str = described_field("", "network: the file with the key that kinect_sender was given too")
+    least_delay: float = number_field(
+        0.0,
+        "network: least time of the sensor from capture until its frame can be sent, which cannot be measured",
+        "s",
+        0.0,
+        1.0,
+    )
 
 
 class SkeletonSource(Protocol):

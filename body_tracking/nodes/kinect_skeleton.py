@@ -11,7 +11,7 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import Parameter, fields_of
+from body_tracking.core.parameters import Parameter, fields_of, parameters_from
 from body_tracking.core.sources import RecordedFrame, check_sensor_name
 from body_tracking.kinect.live import SourceSettings, backends, described, open_source
 from body_tracking.kinect.ros_time import RosTime
@@ -22,44 +22,11 @@ from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.main import run
 from body_tracking.ros.node import GraphNode
 
-_DEFAULTS = SourceSettings("")
 _PROBLEM_PERIOD_S = 30.0
 
-PARAMETERS = (
-    Parameter("sensor", "kinect1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
-    Parameter("backend", "recording", "where skeletons come from", choices=backends()),
-    Parameter("device", "", "network: the sensor's name at kinect_sender; empty for the same name"),
-    Parameter("file", "", "recording: a .csv, .csv.gz or .skeleton file, or a bag"),
-    Parameter("recorded_sensor", "", "recording: the sensor's name in the file; empty for the same name"),
-    Parameter("rate", 1.0, "recording: seconds of it per second", min=0.01, max=100.0),
-    Parameter("loop", False, "recording: begin again at the end; time goes on"),
-    Parameter(
-        "start_time",
-        0.0,
-        "recording: wall time at which its first frame (of any sensor in it) plays; 0 for now. With the same time for "
-        "each, several sensors stay in step, and one that is started again goes on where it should be",
-        unit="s",
-        min=0.0,
-        max=1e11,
-    ),
-    Parameter(
-        "address",
-        _DEFAULTS.address,
-        "network: the IP address of this computer to listen on, 0.0.0.0 for all; other computers reach no loopback "
-        "address, and any other needs a key",
-    ),
-    Parameter("port", _DEFAULTS.port, "network: the UDP port to listen on; one per sensor", min=1, max=65535),
-    Parameter("key_file", "", "network: the file with the key that kinect_sender was given too"),
-    Parameter(
-        "least_delay",
-        _DEFAULTS.least_delay,
-        "network: least time of the sensor from capture until its frame can be sent, which cannot be measured",
-        unit="s",
-        min=0.0,
-        max=1.0,
-    ),
-    RELIABLE,
-)
+_SENSOR, *_SETTINGS = parameters_from(SourceSettings)
+_BACKEND = Parameter("backend", "recording", "where skeletons come from", choices=backends())
+PARAMETERS = (_SENSOR, _BACKEND, *_SETTINGS, RELIABLE)
 
 
 class KinectSkeleton(GraphNode):

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.imu import ImuRecording, RecordedAngles, RecordedImu
+from body_tracking.core.imu import RecordedAngles, RecordedImu
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
 from body_tracking.core.qos import RELIABLE, SENSOR_DATA, Qos
@@ -50,8 +50,8 @@ CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
 MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
 
-_Recording = Recording | ImuRecording | TrajectoryRecording
 _Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints
+_Recording = Recording[_Item]
 _Message = tuple[str, str, Qos, object]
 """Topic, its type and quality, message."""
 
@@ -115,7 +115,7 @@ class ImportReport:
         return json.dumps({**report, "problems": self.problems, "warnings": self.warnings}, indent=2)
 
 
-def open_recording(path: Path, sensor: str | None = None, partial: bool = False) -> Recording:
+def open_recording(path: Path, sensor: str | None = None, partial: bool = False) -> Recording[RecordedFrame]:
     """The reader for a file of skeletons, chosen by its suffix.
 
     Args:
