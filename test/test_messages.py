@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -134,7 +135,9 @@ def test_inertial_readings_round_trip(
 ) -> None:
     sample = ImuSample(stamp_ns, "wrist_link", *orientation, rate, force, magnetic)
     imu, field = sample_to_messages(sample, types)
-    back = message_to_sample(imu, None if field is None else message_to_magnetic_field(field)[2])
+    back = replace(
+        message_to_sample(imu), magnetic_field=None if field is None else message_to_magnetic_field(field)[2]
+    )
     for name in ImuSample.__slots__:
         np.testing.assert_array_equal(getattr(back, name), getattr(sample, name), err_msg=name)
     if sample.orientation is None:

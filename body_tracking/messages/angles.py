@@ -15,14 +15,10 @@ from body_tracking.messages.base import MessageError, MessageTypes, to_header, t
 def angles_to_joint_state(
     angles: JointAngles, body: str, frame_id: str, types: MessageTypes, *, stddev: bool = False
 ) -> Any:
-    """Values, or standard deviations, as ``sensor_msgs/JointState``.
+    """Values, or with ``stddev`` standard deviations, as ``sensor_msgs/JointState``.
 
-    Args:
-        angles: radians and radians per second.
-        body: the REP-155 body id; every name ends in ``_<body>``.
-        frame_id: of the header; ``joint_angles`` puts the convention here, because conventions share names of angles.
-        types: the family of message classes to build.
-        stddev: the standard deviations.
+    Every name ends in ``_<body>``, the REP-155 body id. ``frame_id`` is the convention, because conventions share names
+    of angles.
     """
     return types.make(
         JOINT_STATE,
@@ -42,11 +38,6 @@ def angles_to_joint_states(angles: JointAngles, body: str, frame_id: str, types:
 
 def joint_states_to_angles(values: Any, deviations: Any, body: str) -> JointAngles:
     """The inverse of :func:`angles_to_joint_states`.
-
-    Args:
-        values: ``sensor_msgs/JointState``.
-        deviations: the same, of the same stamp.
-        body: id of the person; the suffix ``_<body>`` of the names is removed.
 
     Raises:
         MessageError: different names, stamps or frames, a name without that suffix, sizes that do not match.

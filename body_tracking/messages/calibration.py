@@ -45,12 +45,7 @@ def transform_to_pose(message: Any) -> SensorPose:
 def clock_to_time_reference(sensor: str, clock: ClockModel, at_ns: int, types: MessageTypes) -> Any:
     """``sensor_msgs/TimeReference``: at ``header.stamp`` of the reference clock the sensor's clock showed ``time_ref``.
 
-    Args:
-        sensor: written into ``source``.
-        clock: the sensor's clock against the reference clock.
-        at_ns: the reference time from which the relation is valid, or from which the sensor's clock is not negative,
-            whichever is later.
-        types: the family of message classes to build.
+    The relation is valid from ``at_ns`` by the reference clock, or from when the sensor's clock is not negative.
     """
     at_ns = max(at_ns, clock.to_reference(0))
     return types.make(

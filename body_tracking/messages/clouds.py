@@ -69,9 +69,8 @@ def read_cloud(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str], mos
     if count > most:
         raise MessageError(f"{count} points, expected at most {most}")
     record = _described(cloud, wanted, needed)
-    if int(cloud.row_step) != int(cloud.width) * record.itemsize or len(cloud.data) != int(cloud.row_step) * int(
-        cloud.height
-    ):
+    row_step = int(cloud.width) * record.itemsize
+    if int(cloud.row_step) != row_step or len(cloud.data) != row_step * int(cloud.height):
         raise MessageError(
             f"{len(cloud.data)} bytes of data for {count} points of {record.itemsize} bytes (row_step {cloud.row_step})"
         )
@@ -80,14 +79,12 @@ def read_cloud(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str], mos
 
 def _described(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str]) -> np.dtype[Any]:
     """The numpy record that the message's own field table describes."""
-    names: list[str] = []
-    formats: list[str] = []
-    offsets: list[int] = []
+    found: dict[str, tuple[str, int]] = {}
     step = int(cloud.point_step)
     if step > len(cloud.data) and len(cloud.data):
         raise MessageError(f"point_step {step} of {len(cloud.data)} bytes of data")
     for field in cloud.fields:
-        if field.name not in wanted or field.name in names:
+        if field.name not in wanted or field.name in found:
             continue
         if field.datatype != wanted[field.name] or field.count != 1:
             raise MessageError(
@@ -95,13 +92,12 @@ def _described(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str]) -> 
             )
         if field.offset + np.dtype(_NUMPY[field.datatype]).itemsize > step:
             raise MessageError(f"field {field.name!r} at offset {field.offset} ends beyond point_step {step}")
-        names.append(field.name)
-        formats.append(_NUMPY[field.datatype])
-        offsets.append(int(field.offset))
-    missing = [name for name in needed if name not in names]
+        found[field.name] = _NUMPY[field.datatype], int(field.offset)
+    missing = [name for name in needed if name not in found]
     if missing:
         raise MessageError(f"missing field(s) {', '.join(missing)}")
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    formats, offsets = zip(*found.values(), strict=True)
+    return np.dtype({"names": [*found], "formats": formats, "offsets": offsets, "itemsize": step})
 
 
 def columns(points: Any, names: Sequence[str]) -> FloatArray:

@@ -16,16 +16,9 @@ MAX_VALUES, MAX_TEXT = 500, 1000
 def diagnostics(
     stamp_ns: int, name: str, hardware_id: str, level: int, text: str, values: Mapping[str, object], types: MessageTypes
 ) -> Any:
-    """One ``diagnostic_msgs/DiagnosticArray`` with one status.
+    """One ``diagnostic_msgs/DiagnosticArray`` with one status; see :class:`NodeStatus`.
 
-    Args:
-        stamp_ns: node time.
-        name: ``<node>: <subject>``, with the node's full name without the leading slash.
-        hardware_id: the sensor, or empty.
-        level: 0 OK, 1 warning, 2 error, 3 stale.
-        text: one line for people.
-        values: counters and rates.
-        types: the family of message classes to build.
+    ``name`` has the node's full name without the leading slash; ``stamp_ns`` is node time.
     """
     status = types.make(
         "diagnostic_msgs/msg/DiagnosticStatus",

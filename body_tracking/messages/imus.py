@@ -13,6 +13,9 @@ from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_vector
 
+_ABSENT = np.diag([-1.0, 0.0, 0.0])
+"""The covariance of a quantity that is not there (REP-145)."""
+
 
 def imu_to_message(
     stamp_ns: int,
@@ -26,16 +29,16 @@ def imu_to_message(
     """``sensor_msgs/Imu`` by REP-145.
 
     Args:
-        stamp_ns: capture time in the sensor's clock, nanoseconds.
+        stamp_ns: capture time in the sensor's clock.
         frame_id: of the sensor.
         angular_velocity: (3,) rad/s.
         linear_acceleration: (3,) m/s2, specific force.
         quat_xyzw: (4,) of the sensor in an east-north-up frame; None for raw data.
         covariances: (3, 3) each, of orientation, angular velocity and acceleration; -1 in [0, 0] where unknown.
-        types: the family of message classes to build.
+        types: see :class:`MessageTypes`.
     """
     x, y, z, w = (0.0, 0.0, 0.0, 1.0) if quat_xyzw is None else (float(value) for value in quat_xyzw)
-    orientation, angular, linear = (types.floats(covariance.reshape(-1)) for covariance in covariances)
+    orientation, angular, linear = (types.floats(covariance.flatten()) for covariance in covariances)
     return types.make(
         IMU,
         header=to_header(stamp_ns, frame_id, types),
@@ -65,8 +68,6 @@ def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any
 
     Absent quantities are marked by -1 (REP-145); an unknown covariance is zero.
     """
-    absent = np.zeros((3, 3))
-    absent[0, 0] = -1.0
     unknown = np.zeros((3, 3))
     stated = unknown if sample.orientation_covariance is None else sample.orientation_covariance
     imu = imu_to_message(
@@ -76,9 +77,9 @@ def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any
         np.zeros(3) if sample.acceleration is None else sample.acceleration,
         sample.orientation,
         (
-            absent if sample.orientation is None else stated,
-            absent if sample.angular_velocity is None else unknown,
-            absent if sample.acceleration is None else unknown,
+            _ABSENT if sample.orientation is None else stated,
+            _ABSENT if sample.angular_velocity is None else unknown,
+            _ABSENT if sample.acceleration is None else unknown,
         ),
         types,
     )
@@ -88,12 +89,8 @@ def sample_to_messages(sample: ImuSample, types: MessageTypes) -> tuple[Any, Any
     return imu, field
 
 
-def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) -> ImuSample:
+def message_to_sample(message: Any) -> ImuSample:
     """The reading in a ``sensor_msgs/Imu``; None for quantities whose covariance begins with -1 (REP-145).
-
-    Args:
-        message: of a ROS install or of a recording.
-        magnetic_field: (3,) tesla of the same instant, if there is one.
 
     Raises:
         MessageError: a covariance without nine elements.
@@ -114,7 +111,6 @@ def message_to_sample(message: Any, magnetic_field: FloatArray | None = None) ->
         stated if there["orientation"] and stated.any() else None,  # all zeros: unknown
         _array(message.angular_velocity) if there["angular_velocity"] else None,
         _array(message.linear_acceleration) if there["linear_acceleration"] else None,
-        magnetic_field,
     )
 
 
@@ -138,8 +134,6 @@ def orientation_to_message(measurement: SegmentOrientation, types: MessageTypes)
 
     The header's frame is the fixed frame, such as ``world``; the topic names the segment.
     """
-    absent = np.zeros((3, 3))
-    absent[0, 0] = -1.0
     rate = measurement.angular_velocity
     return imu_to_message(
         measurement.stamp_ns,
@@ -149,8 +143,8 @@ def orientation_to_message(measurement: SegmentOrientation, types: MessageTypes)
         so3.matrix_to_quat(measurement.rotation),
         (
             measurement.covariance,
-            absent if rate is None else measurement.angular_velocity_variance * np.eye(3),
-            absent,
+            _ABSENT if rate is None else measurement.angular_velocity_variance * np.eye(3),
+            _ABSENT,
         ),
         types,
     )

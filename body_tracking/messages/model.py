@@ -18,14 +18,8 @@ from body_tracking.messages.images import array_to_image, image_to_array
 def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
     """The coordinates of a body model as a ``sensor_msgs/JointState``.
 
-    Args:
-        estimate: of the model.
-        model: gives the names.
-        types: the family of message classes to build.
-
-    Returns:
-        Positions: the tangent vector from the neutral pose, in which a free rotation is a rotation vector;
-        velocities: the tangent velocity.
+    Positions are the tangent vector from the neutral pose, in which a free rotation is a rotation vector; velocities
+    the tangent velocity.
     """
     return _joint_state(estimate, model, model.difference(model.neutral(), estimate.q), estimate.velocity, types)
 
@@ -51,10 +45,6 @@ def _joint_state(
 
 def joint_state_to_model(message: Any, model: BodyModel) -> tuple[int, str, FloatArray, FloatArray]:
     """The inverse of :func:`estimate_to_joint_state`, without uncertainty and lengths.
-
-    Args:
-        message: ``sensor_msgs/JointState``.
-        model: that the message must be of.
 
     Returns:
         Stamp in nanoseconds, frame, (nq,) configuration, (nv,) tangent velocity; NaN where unknown.
@@ -130,14 +120,9 @@ def image_to_covariance(message: Any, model: BodyModel) -> tuple[int, FloatArray
 def segments_to_joint_state(
     estimate: ModelEstimate, names: Sequence[str], origins: FloatArray, quats_xyzw: FloatArray, types: MessageTypes
 ) -> Any:
-    """``sensor_msgs/MultiDOFJointState``: the pose of each segment in the estimate's frame.
+    """``sensor_msgs/MultiDOFJointState``: the poses of s segments in the estimate's frame.
 
-    Args:
-        estimate: for its stamp and frame.
-        names: s segments.
-        origins: (s, 3) metres.
-        quats_xyzw: (s, 4) unit quaternions.
-        types: the family of message classes to build.
+    ``origins`` are (s, 3) metres, ``quats_xyzw`` (s, 4) unit quaternions.
     """
     return types.make(
         SEGMENTS,

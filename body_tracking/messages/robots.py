@@ -20,12 +20,8 @@ def command_to_trajectory(
     Without velocities, because that controller refuses a trajectory that ends in motion (its parameter
     ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
 
-    Args:
-        joints: n names.
-        position: (n,) radians.
-        stamp_ns: when the trajectory starts; 0 for when it arrives.
-        from_start: seconds from then to the point.
-        types: the family of message classes to build.
+    The n joints are at ``position`` (n,), radians, ``from_start`` seconds after ``stamp_ns``, or after the message
+    arrives where that is 0.
     """
     sec, nanosec = divmod(round(from_start * NANOSECONDS), NANOSECONDS)
     none = types.floats(np.empty(0))

@@ -31,14 +31,9 @@ MAX_BODIES = 64
 
 
 def skeletons_to_cloud(skeletons: Sequence[Skeleton], types: MessageTypes) -> Any:
-    """Bodies seen at one instant as one ``sensor_msgs/PointCloud2``.
+    """Bodies seen at one instant as one ``sensor_msgs/PointCloud2``: a point per joint and body, in SDK order.
 
-    Args:
-        skeletons: at least one; all with the same stamp, frame and kind (covariances and velocities or not).
-        types: the family of message classes to build.
-
-    Returns:
-        The message; a point per joint and body, joints in SDK order.
+    There is at least one body; all have the same stamp, frame and kind (covariances and velocities or not).
     """
     first = skeletons[0]
     fields: Fields = _FIELDS
