@@ -21,7 +21,7 @@ from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cdr import stamp_of
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.recording.replay import Progress
+from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE
 
