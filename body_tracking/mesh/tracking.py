@@ -170,7 +170,7 @@ class MeshTracker:
             self.counters[self.problem] += 1
             self._forget(stamp_ns)
             return None
-        self.observation = observe(self._view, _without_flying(depth, mask), mask, self.parameters.points)
+        self.observation = observe_person(self._view, depth, mask, self.parameters.points)
         if len(self.observation.points) < self.parameters.points // 4:
             self.problem = "too few points of the person for a fit"
             self.counters[self.problem] += 1
@@ -262,6 +262,11 @@ class MeshTracker:
             "outside of the silhouette": round(fit.violations, 3),
             "residual, mm": round(1e3 * fit.rms, 1),
         }
+
+
+def observe_person(view: DepthCamera, depth: SingleArray, mask: BoolArray, count: int) -> Observation:
+    """What is fitted of a person, without flying pixels; arguments and errors as of :func:`observe`."""
+    return observe(view, _without_flying(depth, mask), mask, count)
 
 
 def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
