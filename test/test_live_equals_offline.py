@@ -24,6 +24,7 @@ from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.parameters import SECTION
 from body_tracking.core.times import NANOSECONDS
 from body_tracking.filters import FILTERS
+from body_tracking.mesh.topics import mesh_topic
 from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
@@ -40,6 +41,8 @@ ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / "bags"
 MARKERS, SETUP = "markers_arm", ROOT / "config" / "marker_setup"
 """The recording of image pairs, and what tracks the markers in it."""
+MESH = "mesh_reaching"
+"""The recording of depth images."""
 SAME = 1e-4
 """Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
 to the last bit while both have the same number of BLAS threads; with another number sums round differently (4e-5)."""
@@ -54,7 +57,8 @@ TICK_S = 0.05
 """Of ``/clock``: the recorder may have received one tick less than the publisher of a stamp."""
 HOLD_FROM_S = PATIENT["activation_delay"] + TICK_S
 """Calibration is stamped with the time from which on it holds."""
-OTHERS = {graph.DIAGNOSTICS_TOPIC, graph.CLOCK_TOPIC}
+OTHERS = {graph.DIAGNOSTICS_TOPIC, graph.CLOCK_TOPIC, mesh_topic("kinect1")}
+"""A node's own figures, the clock of a bag, and what is published only while there is a subscriber."""
 
 
 def parameters(folder: Path, **more: object) -> Path:
@@ -150,6 +154,7 @@ def inputs(bag: Path) -> set[str]:
 CASES = [
     ("wave", "ekf"),
     (MARKERS, ""),
+    (MESH, ""),
     *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name != MARKERS for each in FILTERS),
 ]
 
@@ -177,6 +182,9 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
             bag, file = beginning(bag, folder / "excerpt", 1.5), folder / "parameters.yaml"
             file.write_text(yaml.safe_dump({"/**": {SECTION: {"max_wait": 1.0, "deadline": 1.0}}}))
             arguments: tuple[str | Path, ...] = ("--marker-setup", SETUP, "--params-file", file)
+        elif name == MESH and not filter_name:
+            bag = beginning(bag, folder / "excerpt", 1.5)
+            arguments = ("--depth", "kinect1", "--params-file", parameters(folder))
         else:
             arguments = ("--filter", filter_name, "--params-file", parameters(folder))
         assert cli.main(["replay", str(bag), "-o", str(folder / "offline"), *map(str, arguments)]) == 0

@@ -21,7 +21,7 @@ from body_tracking.mesh.body_model import Body, Pose, PosedBody
 from body_tracking.mesh.energy import Matches, Observation
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
 
-SCALES: Final = (0.06, 0.03, 0.03)
+SCALES: Final = (0.05, 0.05)
 """Metres: robust scale of each step where the person was where they were expected."""
 WIDE: Final = (0.2, 0.2, 0.2, 0.06, 0.06, 0.03, 0.03)
 """Metres: the same from a rough start."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -271,9 +272,9 @@ def observe_person(view: DepthCamera, depth: SingleArray, mask: BoolArray, count
 
 def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
     """The image without pixels that lie on no surface, in the box about the mask."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     # the outermost pixels of a block have too few neighbours
-    box = slice(max(rows[0] - 2, 0), rows[-1] + 3), slice(max(columns[0] - 2, 0), columns[-1] + 3)
+    box = slice(max(top - 2, 0), top + height + 2), slice(max(left - 2, 0), left + width + 2)
     clean = depth.copy()
     block = np.ascontiguousarray(depth[box])
     clean[box] = np.where(supported(block, JUMP, LEAST), block, np.float32(0.0))
